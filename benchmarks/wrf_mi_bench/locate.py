@@ -72,12 +72,9 @@ class Cell:
 
 PHYSICS = partial(Cell, "physics, knows walls", "physics")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
-HYBRID = partial(Cell, "hybrid, knows walls", "hybrid", settings=("ingredients=physics,kriging,trees",))
 SEEDS = (0, 1, 2)
 CELLS = (
     *(kind(ROWS, seed) for seed in SEEDS for kind in (PHYSICS, KRIGING)),
-    HYBRID(ROWS),
-    KRIGING(None),
     PHYSICS(None),
 )
 
