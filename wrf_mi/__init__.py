@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .maps.api import radio_map
     from .maps.coverage import run_reliability
     from .maps.dataset import write_map
+    from .maps.locate import locate
     from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .runs.compare import compare
     from .runs.figures import spectrum_table
@@ -46,6 +47,7 @@ _HOME = {
     "evaluate_run": "runs.api",
     "fetch": "datasets",
     "load": "synthetic:load_record",
+    "locate": "maps.locate:locate",
     "make_scene": "scene.make",
     "make_splits": "datasets",
     "open_run": "runs.api",
@@ -76,6 +78,7 @@ __all__ = [
     "evaluate_run",
     "fetch",
     "load",
+    "locate",
     "make_scene",
     "make_splits",
     "open_run",

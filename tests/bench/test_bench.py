@@ -50,6 +50,7 @@ ON_PAGE = {
     "training": "speed.md",
     "stress": "numerics.md",
     "rooms": "correction.md",
+    "locate": "locate.md",
     "phase-error": "physics.md",
     "sentinels": "results.md",
 }

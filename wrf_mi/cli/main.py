@@ -24,7 +24,8 @@ from . import (
     edit,
     evaluate,
     export,
-    map
+    locate,
+    map,
     mesh,
     predict,
     sweep,
@@ -33,7 +34,25 @@ from . import (
 )
 from .options import Parser
 
-COMMANDS = (doctor, data, mesh, correct, edit, train, trace, sweep, evaluate, predict, map, compress, compare, export, bench, demo)
+COMMANDS = (
+    doctor,
+    data,
+    mesh,
+    correct,
+    edit,
+    train,
+    trace,
+    sweep,
+    evaluate,
+    predict,
+    map,
+    locate,
+    compress,
+    compare,
+    export,
+    bench,
+    demo,
+)
 
 
 def build_parser() -> Parser:

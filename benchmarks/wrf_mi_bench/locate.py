@@ -1,0 +1,220 @@
+"""Positions of the transmitter from signal strengths: likelihood over predictions beside k nearest neighbours.
+
+Every cell is a run of ``wrf-mi train`` on ``flat-ble``'s first run, whose second run is located. The form of the
+likelihood and k are chosen by training rows held out in space (`wrf_mi.maps.locate_calibration`). Consecutive rows of a
+run share their errors, so that intervals resample stretches of the run.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import Record
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.types import IntArray
+from wrf_mi.maps.locate import locate
+from wrf_mi.maps.locate_file import test_observations
+from wrf_mi.maps.locate_knn import COUNTS, METRICS, Neighbours
+from wrf_mi.runs.api import open_run, train
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.runs.folder import METRICS as FINISHED
+from wrf_mi.runs.folder import load_rows
+from wrf_mi.runs.timing import bootstrap
+
+from .bench import FLAT
+from .comparison import data_folder, kept, line
+from .table_plan import PARTS
+from .tables import scene_of
+
+RUNS = Path("runs/bench/locate")
+STRETCH = 20
+"""Consecutive test rows that are resampled together: the robot moves 3 m in them."""
+INSIDE = (0.85, 0.95)
+"""Limits of the share of true positions inside the 90 % regions."""
+ROWS = 64
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A fitted model.
+
+    Attributes:
+        title: label in the table.
+        model: name of the model.
+        n_train: number of training rows; None: all.
+        seed: seed of their draw and of the fit.
+        scene: whether the model knows the walls.
+        settings: ``key=value`` of the model.
+        intervals: whether its standard deviations are calibrated by held-out rows, as it states none.
+    """
+
+    title: str
+    model: str
+    n_train: int | None
+    seed: int = 0
+    scene: bool = True
+    settings: tuple[str, ...] = ()
+    intervals: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name for files and progress."""
+        return f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
+
+
+PHYSICS = partial(Cell, "physics, knows walls", "physics")
+KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
+SEEDS = (0, 1, 2)
+CELLS = (
+    *(kind(ROWS, seed) for seed in SEEDS for kind in (PHYSICS, KRIGING)),
+    PHYSICS(None),
+)
+
+
+def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
+    """Errors in metres of a cell, of nearest neighbours, and whether regions hold the true positions, by test row."""
+    if not (folder / FINISHED).exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        more: dict[str, Any] = {"scene": scene if cell.scene else None, "settings": cell.settings}
+        given: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
+        train(FLAT, folder, cell.model, **given, **more)
+    run = open_run(folder)
+    given_rows = test_observations(run)
+    assert given_rows.true_m is not None
+    found = locate(run, given_rows.value_dbm, on_progress=_show(cell.name))
+    record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
+    best = best_neighbours(record, rows, given_rows.value_dbm, given_rows.true_m)
+    near = found.neighbours_error_m(given_rows.true_m)
+    assert near is not None
+    return {
+        "error_m": found.error_m(given_rows.true_m).tolist(),
+        "neighbours_error_m": near.tolist(),
+        "best_neighbours_error_m": best.tolist(),
+        "inside": found.covers(given_rows.true_m).tolist(),
+        "area_m2": found.area_m2.tolist(),
+        "radius_m": found.radius_m.tolist(),
+        "calibration": asdict(found.calibration),
+    }
+
+
+def best_neighbours(record: Record, rows: IntArray, observed_dbm: FloatArray, true_m: FloatArray) -> FloatArray:
+    """Errors of nearest neighbours with the k and the distance that are best on the test rows themselves."""
+    errors = [
+        np.linalg.norm(Neighbours(count, metric).locate(record, rows, observed_dbm)[:, :2] - true_m, axis=1)
+        for metric in METRICS
+        for count in COUNTS
+    ]
+    return np.asarray(min(errors, key=lambda one: float(one.mean())), float)
+
+
+def stretches(values: Sequence[float] | FloatArray) -> FloatArray:
+    """Means of stretches of `STRETCH` consecutive rows; the last has up to twice as many."""
+    every = np.asarray(values, float)
+    return np.array([part.mean() for part in np.split(every, range(STRETCH, len(every) - STRETCH + 1, STRETCH))])
+
+
+def row_of(cell: Cell, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Row of the table."""
+    error, near = (np.asarray(found[key], float) for key in ("error_m", "neighbours_error_m"))
+    best = np.asarray(found["best_neighbours_error_m"], float)
+    gain, over_best = (bootstrap(stretches(other - error), np.mean) for other in (near, best))
+    inside = bootstrap(stretches(found["inside"]), np.mean)
+    figures = {
+        "median_m": float(np.median(error)),
+        "mean_m": float(error.mean()),
+        "neighbours_median_m": float(np.median(near)),
+        "neighbours_mean_m": float(near.mean()),
+        "best_neighbours_mean_m": float(best.mean()),
+        "gain_m": [gain.value, gain.low, gain.high],
+        "gain_over_best_m": [over_best.value, over_best.low, over_best.high],
+        "inside": [inside.value, inside.low, inside.high],
+        "area_m2": float(np.median(found["area_m2"])),
+        "radius_m": float(np.median(found["radius_m"])),
+    }
+    what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, seed {cell.seed}"
+    value = (
+        f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN {figures['neighbours_median_m']:.2f} m "
+    )
+    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside.value:.0%} inside"
+    asked = f"gain {gain.value:.2f} m ({gain.low:.2f} to {gain.high:.2f}), 85 to 95 % inside"
+    return {**line(what, value, asked), **figures, "likelihood": found["calibration"]["likelihood"], "cell": cell.name}
+
+
+def _show(name: str) -> Any:
+    last = [""]
+
+    def on_progress(stage: str, share: float, progress: Any = None, /) -> None:
+        if stage != last[0]:
+            last[0] = stage
+            print(f"locate: {name}: {stage}", file=sys.stderr, flush=True)
+
+    return on_progress
+
+
+def main() -> dict[str, Any]:
+    """Measure all cells, those that this code has measured before excepted; `InputError` where data are missing.
+
+    Returns:
+        ``rows``; ``cells``: errors and regions of every test row; ``failed`` where nearest neighbours are not clearly
+        worse with `ROWS` rows and the walls, or regions do not hold 85 to 95 % of the true positions.
+    """
+    data_folder(FLAT)
+    place = RUNS / fit_key(source_files())
+    scene = scene_of(next(part for part in PARTS if part.dataset == FLAT), place)[1]
+    rows, cells = [], {}
+    for number, cell in enumerate(CELLS, 1):
+        print(f"locate: {number} of {len(CELLS)}: {cell.name}", file=sys.stderr, flush=True)
+        found = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
+        rows.append(row_of(cell, found))
+        cells[cell.name] = found["calibration"]
+        print(f"locate: {rows[-1]['what']}: {rows[-1]['value']}; {rows[-1]['asked']}", file=sys.stderr, flush=True)
+    return {"rows": rows, "calibration": cells, **_verdict(rows)}
+
+
+def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    few = [row for row, cell in zip(rows, CELLS, strict=True) if cell.n_train == ROWS and cell.scene]
+    worse = [row["what"] for row in few if row["gain_m"][1] <= 0]
+    outside = [row["what"] for row in rows if not INSIDE[0] <= row["inside"][0] <= INSIDE[1]]
+    found: dict[str, Any] = {"not_clearly_better": worse, "coverage_outside": outside}
+    if worse or outside:
+        found["failed"] = (
+            f"not clearly better than kNN: {worse or 'none'}; coverage outside 85 to 95 %: {outside or 'none'}"
+        )
+    return found
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table: error, gain over nearest neighbours with its 95 % interval, and regions."""
+    head = (
+        "training rows, model, seed",
+        "error, median (mean), m",
+        "kNN, median (mean), m",
+        "gain on kNN, m",
+        "gain on kNN of the best k, m",
+        "inside 90 % regions",
+        "region, m²",
+        "radius, m",
+    )
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+    for row in rows:
+        gain, best = ("{:.2f} ({:.2f} to {:.2f})".format(*row[key]) for key in ("gain_m", "gain_over_best_m"))
+        cells = (
+            row["what"],
+            f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
+            f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
+            gain,
+            best,
+            "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
+            f"{row['area_m2']:.1f}",
+            f"{row['radius_m']:.1f}",
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)

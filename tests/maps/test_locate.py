@@ -1,0 +1,299 @@
+"""Positions of transmitters from signal strengths."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.stats import norm
+from scipy.stats import t as student_t
+from sklearn.neighbors import KNeighborsRegressor
+
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.datasets import write_ble_folder
+from wrf_mi.maps.grid import grid_over
+from wrf_mi.maps.locate import locate
+from wrf_mi.maps.locate_area import Candidates
+from wrf_mi.maps.locate_calibration import FILE, Located, Predicted, choose, fit_silence, widest
+from wrf_mi.maps.locate_file import read_observations
+from wrf_mi.maps.locate_knn import Neighbours
+from wrf_mi.maps.locate_likelihood import Likelihood, Silence
+from wrf_mi.maps.locate_posterior import densest, probabilities, region_of
+from wrf_mi.runs.api import train
+
+ROUNDING = 1e-9
+SINGLE = 1e-4
+"""Rounding of logarithms of densities whose means and standard deviations are stored in single precision."""
+CORNERS_M = np.array([[0.0, 0, 2], [6, 0, 2], [0, 6, 2]])
+UPRIGHT = np.array([0.0, 0, 0, 1])
+QUADRATURE = 2e-3
+"""Error of seven nodes for the offset of three residuals of heavy tails."""
+STEP_M = 0.25
+DRAWS = 400
+COVERED = 0.06
+"""Four standard errors of the coverage of `DRAWS` regions of 90 %."""
+
+
+def strengths(positions_m: np.ndarray) -> np.ndarray:
+    """Signal strengths [n_rx, n] by the path-loss law -40 dBm - 20 log10(d)."""
+    return -40 - 20 * np.log10(np.linalg.norm(positions_m - CORNERS_M[:, None], axis=2))
+
+
+def room() -> Candidates:
+    """Positions of a room of 6 m x 6 m."""
+    grid = grid_over(np.zeros(2), np.full(2, 6.0), STEP_M, 1.0)
+    return Candidates(grid, np.ones(len(grid.positions_m), bool))
+
+
+def law(candidates: Candidates, std_db: float) -> Predicted:
+    mean = strengths(candidates.positions_m)[None].astype(np.float32)
+    return Predicted(mean, np.full_like(mean, std_db))
+
+
+def record_of(tx_pos_m: np.ndarray, rssi_dbm: np.ndarray, train_rows: int) -> Record:
+    receivers = tuple(Receiver(f"anchor{number}", place, UPRIGHT) for number, place in enumerate(CORNERS_M))
+    rows = np.arange(len(tx_pos_m))
+    known = {"frequencies_hz": np.array([2.44e9]), "official": (rows[:train_rows], rows[train_rows:])}
+    return Record("made-up", "rssi", tx_pos_m, receivers, rssi_dbm.astype(np.float32), **known)
+
+
+@given(st.integers(0, 23), st.integers(0, 23))
+@settings(max_examples=20, deadline=None)
+def test_three_receivers_of_known_path_loss_recover_the_position(column: int, row: int) -> None:
+    candidates = room()
+    truth = row * len(candidates.grid.x_m) + column
+    predicted = law(candidates, 0.1)
+    log = Likelihood().log(strengths(candidates.positions_m[truth][None])[:, 0], predicted.mean_dbm, predicted.std_db)
+    found = region_of(probabilities(log), candidates.distance_m, candidates.positions_m, 0.9)
+    assert np.linalg.norm(found.estimate_m - candidates.positions_m[truth, :2]) < STEP_M
+    assert found.inside[truth]
+
+
+@pytest.mark.parametrize("form", [Likelihood(None), Likelihood(4.0, 1.3), Likelihood(None, offset_db=4.0)])
+def test_region_covers_as_stated_under_the_noise_of_the_model(form: Likelihood) -> None:
+    candidates, rng, inside, near = room(), np.random.default_rng(2), [], []
+    predicted = law(candidates, 4.0)
+    for truth in rng.integers(len(candidates.positions_m), size=DRAWS):
+        noise = rng.standard_t(form.degrees, 3) if form.degrees else rng.normal(size=3)
+        value = predicted.mean_dbm[0, :, truth] + 4 * form.scale * noise + form.offset_db * rng.normal()
+        probability = probabilities(form.log(value, predicted.mean_dbm, predicted.std_db))
+        found = region_of(probability, candidates.distance_m, candidates.positions_m, 0.9)
+        inside.append(found.inside[truth])
+        near.append(np.linalg.norm(found.estimate_m - candidates.positions_m[truth, :2]) <= found.radius_m)
+    # Cells are whole: regions hold a little more than stated.
+    assert abs(np.mean(inside) - 0.9) < COVERED
+    assert abs(np.mean(near) - 0.9) < COVERED
+
+
+def test_likelihood_is_the_density_of_scipy() -> None:
+    rng = np.random.default_rng(1)
+    mean, std = rng.normal(-60, 5, (2, 3, 7)).astype(np.float32), rng.uniform(2, 5, (2, 3, 7)).astype(np.float32)
+    value = np.array([-58.0, np.nan, -64.0])
+    for form, density in ((Likelihood(5.0, 1.2), student_t(5.0)), (Likelihood(None, 1.2), norm())):
+        scale = 1.2 * std[:, [0, 2]]
+        each = density.logpdf((value[[0, 2], None] - mean[:, [0, 2]]) / scale) - np.log(scale)
+        expected = np.logaddexp.reduce(each.sum(axis=1), axis=0) - np.log(2)
+        np.testing.assert_allclose(form.log(value, mean, std), expected, atol=SINGLE)
+
+
+def test_common_offset_is_the_normal_of_correlated_residuals() -> None:
+    mean, std = np.zeros((1, 3, 1), np.float32), np.full((1, 3, 1), 4.0, np.float32)
+    for offset_db, value in ((2.0, np.array([2.0, -1.0, 3.0])), (30.0, np.array([22.0, 19.0, 23.0]))):
+        covariance = 16 * np.eye(3) + offset_db**2 * np.ones((3, 3))
+        expected = -(value @ np.linalg.solve(covariance, value) + np.log(np.linalg.det(2 * np.pi * covariance))) / 2
+        assert Likelihood(None, offset_db=offset_db).log(value, mean, std)[0] == pytest.approx(expected, abs=SINGLE)
+        heavy = Likelihood(8.0, offset_db=offset_db).log(value, mean, std)[0]
+
+        def density(offset: float, value: np.ndarray = value, offset_db: float = offset_db) -> float:
+            return float(np.prod(student_t(8.0).pdf((value - offset) / 4) / 4) * norm(0, offset_db).pdf(offset))
+
+        assert heavy == pytest.approx(np.log(quad(density, -150, 150, points=[0, value.mean()])[0]), abs=QUADRATURE)
+
+
+def test_receivers_that_received_nothing_count_where_strength_decides_reception() -> None:
+    candidates, rng = room(), np.random.default_rng(3)
+    predicted = law(candidates, 3.0)
+    truth = rng.integers(len(candidates.positions_m), size=150)
+    value = predicted.mean_dbm[0][:, truth] + rng.normal(0, 3, (3, 150))
+    value[value < -54] = np.nan
+    keep = np.isfinite(value).any(axis=0)
+    places = candidates.positions_m[truth[keep]]
+    record = record_of(places, value[:, keep], len(places) - 1)
+    rows = np.array_split(np.arange(len(places)), 3)
+    parts = [Located(predicted, part, candidates.nearest(places[part])) for part in rows]
+    silence = choose(record, parts, candidates, lambda share: None).likelihood.silence
+    assert silence is not None
+    assert abs(silence.middle_dbm + 54) < 3
+    lost = value[:, keep].copy()
+    finite = rng.normal(-50, 5, lost.shape)
+    finite[rng.uniform(size=lost.shape) < 0.2] = np.nan
+    finite[0] = -50.0
+    at_random = choose(record_of(places, finite, len(places) - 1), parts, candidates, lambda share: None)
+    assert at_random.likelihood.silence is None
+
+
+def test_probability_of_silence_is_one_half_in_the_middle() -> None:
+    silence = Silence(-80.0, 0.5)
+    assert silence.received(np.array(-80.0)) == pytest.approx(0.5)
+    total = np.exp(silence.log_received(np.array([-90.0, -70]))) + np.exp(silence.log_silent(np.array([-90.0, -70])))
+    np.testing.assert_allclose(total, 1, atol=ROUNDING)
+    assert (
+        fit_silence(
+            record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1),
+            [Located(law(room(), 3.0), np.arange(2), np.arange(2))],
+        )
+        is None
+    )
+
+
+@given(st.lists(st.floats(0.01, 1), min_size=1, max_size=30), st.floats(0.05, 0.95))
+@settings(deadline=None)
+def test_densest_candidates_hold_the_level_and_no_fewer_do(weights: list[float], level: float) -> None:
+    probability = np.array(weights) / np.sum(weights)
+    inside = densest(probability, level)
+    assert probability[inside].sum() >= level - ROUNDING
+    assert probability[inside].sum() - probability[inside].min() < level + ROUNDING
+    assert inside.all() or probability[inside].min() >= probability[~inside].max()
+
+
+def test_nearest_neighbours_are_those_of_scikit_learn() -> None:
+    rng = np.random.default_rng(4)
+    places = rng.uniform(0, 6, (40, 3))
+    record = record_of(places, strengths(places), 30)
+    asked = strengths(rng.uniform(0, 6, (5, 3)))
+    expected = KNeighborsRegressor(4).fit(record.observation[:, :30].T, places[:30]).predict(asked.T)
+    for metric in ("euclidean", "nan_euclidean"):
+        np.testing.assert_allclose(Neighbours(4, metric).locate(record, np.arange(30), asked), expected)
+    asked[1] = np.nan
+    alone = record.at_receivers([0, 2])
+    expected = Neighbours(4).locate(alone, np.arange(30), asked[[0, 2]])
+    np.testing.assert_allclose(Neighbours(4, "nan_euclidean").locate(record, np.arange(30), asked), expected)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
+    """Run of the physics model on 40 rows, and its data."""
+    folder, rng = tmp_path_factory.mktemp("locate"), np.random.default_rng(5)
+    places = np.column_stack([rng.uniform(0.3, 5.7, (60, 2)), np.ones(60)])
+    record = record_of(places, strengths(places) + rng.normal(0, 1, (3, 60)), 40)
+    data = write_ble_folder(folder / "data", record)
+    return train(data, folder / "run", "physics").folder, record
+
+
+def observations(
+    path: Path, record: Record, names: tuple[str, ...] = ("anchor0_dbm", "rssi_1", "rssi_anchor2")
+) -> Path:
+    rows = zip(*record.observation[:, 40:], record.tx_pos_m[40:, 0], record.tx_pos_m[40:, 1], strict=True)
+    lines = [",".join(f"{value:.6f}" for value in row) for row in rows]
+    path.write_text("\n".join([",".join([*names, "x", "y"]), *lines]) + "\n")
+    return path
+
+
+def test_command_writes_positions_and_picture(
+    fitted: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, record = fitted
+    file, out = observations(tmp_path / "in.csv", record), tmp_path / "out.csv"
+    given = ["locate", run, "--input", file, "--out", out, "--posterior", tmp_path / "p.npz", "--json"]
+    status, printed, error = call(given, capsys)
+    assert status == 0, error
+    figures = json.loads(printed)
+    assert figures["n"] == 20
+    assert figures["error_m"]["median"] < 1.0
+    assert 0.5 < figures["held_out"]["inside"] <= 1
+    header, *lines = out.read_text().splitlines()
+    assert len(lines) == 20
+    row = dict(zip(header.split(","), map(float, lines[0].split(",")), strict=True))
+    assert np.hypot(row["x"] - row["true_x"], row["y"] - row["true_y"]) == pytest.approx(row["error_m"], abs=2e-4)
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    with np.load(tmp_path / "p.npz") as stored:
+        shape = (20, len(stored["y_m"]), len(stored["x_m"]))
+        assert stored["probability"].shape == shape
+        np.testing.assert_allclose(stored["probability"].sum(axis=(1, 2)), 1, atol=SINGLE)
+    # The choice is kept, and the test rows of the run are the default.
+    before = (run / FILE).stat().st_mtime_ns
+    status, printed, error = call(["locate", run, "--out", tmp_path / "again.csv", "--json"], capsys)
+    assert status == 0, error
+    assert (run / FILE).stat().st_mtime_ns == before
+    assert json.loads(printed)["error_m"]["median"] == pytest.approx(figures["error_m"]["median"], abs=1e-6)
+    _, printed, _ = call(["locate", run, "--out", tmp_path / "again.csv"], capsys)
+    assert "nearest neighbours (m)" in printed
+
+
+def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None:
+    run, record = fitted
+    value = record.observation[:, 40:45]
+    narrow, wide = (locate(run, value, offset_db=offset, step_m=0.25) for offset in (0.0, 10.0))
+    assert wide.area_m2.mean() > narrow.area_m2.mean()
+    moved = locate(run, value + 6, offset_db=10.0, step_m=0.25)
+    assert moved.error_m(record.tx_pos_m[40:45]).mean() < 1.5
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("anchor0_dbm,anchor1_dbm\n-50,-60\n", "no column of receiver anchor2; name one anchor2_dbm"),
+        ("rssi_0,rssi_1,rssi_2,rssi_9\n-5,-6,-7,-8\n", "rssi_9 names no receiver of the run"),
+        ("rssi_0,rssi_1,rssi_2,anchor2_dbm\n-5,-6,-7,-8\n", "anchor2_dbm and rssi_2 are of one receiver"),
+        ("rssi_0,rssi_1,rssi_2\n-5,-6,-7\n,,\n", "row 2: no receiver received anything"),
+        ("rssi_0,rssi_1,rssi_2\n-5,loud,-7\n", "row 1: rssi_1 is 'loud'"),
+        ("rssi_0,rssi_1,rssi_2,x\n-5,-6,-7,1\n", "column x alone is no position"),
+        ("rssi_0,rssi_1,rssi_2\n", "no rows below the header"),
+    ],
+)
+def test_bad_observations_are_refused_in_one_line(
+    fitted: tuple[Path, Record], tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "in.csv"
+    file.write_text(text)
+    message = f"{re.escape(str(file))}.*{re.escape(words)}"
+    refused(["locate", fitted[0], "--input", file, "--out", tmp_path / "out.csv"], message, capsys)
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_empty_fields_are_receivers_without_a_value(fitted: tuple[Path, Record], tmp_path: Path) -> None:
+    file = tmp_path / "in.csv"
+    file.write_text("ts,rssi_2,rssi_0,rssi_1\n7,-50,,-60\n")
+    found = read_observations(file, fitted[1].receivers)
+    np.testing.assert_array_equal(found.value_dbm, [[np.nan], [-60], [-50]])
+    assert found.true_m is None
+
+
+def test_bad_arguments_are_refused(
+    fitted: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, record = fitted
+    value = record.observation[:, :2]
+    with pytest.raises(InputError, match=r"give strengths \[3, m\]"):
+        locate(run, value[:2])
+    with pytest.raises(InputError, match="no receiver received transmitter 0"):
+        locate(run, np.full((3, 1), np.nan))
+    with pytest.raises(InputError, match="probability between 0 and 1"):
+        locate(run, value, level=90)
+    with pytest.raises(InputError, match="positive number of metres"):
+        locate(run, value, step_m=-1)
+    with pytest.raises(InputError, match="standard deviation of 0 or more"):
+        locate(run, value, offset_db=-1)
+    refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv", capsys)
+
+
+def test_model_without_standard_deviations_is_refused(fitted: tuple[Path, Record], tmp_path: Path) -> None:
+    record = fitted[1]
+    run = train(write_ble_folder(tmp_path / "data", record), tmp_path / "run", "idw")
+    with pytest.raises(InputError, match="train it with --intervals"):
+        locate(run.folder, record.observation[:, :2])
+
+
+def test_widest_form_within_a_standard_error_is_chosen() -> None:
+    rng, forms = np.random.default_rng(6), [Likelihood(None), Likelihood(8.0), Likelihood(8.0, 1.4)]
+    noise = rng.normal(size=(2, 100))
+    alike = [np.zeros(100), -0.01 + 0.5 * noise[0], -1 + 0.5 * noise[1]]
+    assert widest(forms, alike) == forms[1]
+    assert widest(forms, [np.zeros(100), np.full(100, -0.01), np.full(100, -1.0)]) == forms[0]

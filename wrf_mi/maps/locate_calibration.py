@@ -1,0 +1,279 @@
+"""Choice of the likelihood's form and of k nearest neighbours by training rows that are held out in space.
+
+The run's model is fitted again to the rest of each fold (`wrf_mi.models.held_out.hold_out_folds`), predicts at all
+candidate positions, and locates the fold's held-out rows. The form with the greatest mean logarithm of the posterior
+density at the true positions is chosen: a proper score (Gneiting and Raftery, "Strictly proper scoring rules,
+prediction, and estimation" (2007), JASA 102), which regions that are too narrow or too wide lower.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+from scipy.stats import t as student_t
+from sklearn.linear_model import LogisticRegression
+from threadpoolctl import threadpool_limits
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.types import IntArray
+from ..models import Fitted, Session
+from ..models.held_out import fit_model, hold_out_folds, labelled
+from ..models.model import Inputs
+from ..runs.folder import load_rows
+from ..runs.run import Run
+from .locate_area import Candidates
+from .locate_knn import Neighbours, choose_neighbours
+from .locate_likelihood import Likelihood, Silence
+from .locate_posterior import densest, probabilities, region_of
+
+logger = logging.getLogger(__name__)
+
+HEADINGS = 8
+"""Headings over which the likelihood is averaged."""
+DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
+"""Forms of the likelihood to choose from."""
+WIDE = 0.95
+"""Probability of the quantile by which the widths of distributions are compared."""
+MOST_ROWS = 300
+"""Most held-out rows that are located."""
+LEVEL = 0.9
+"""Probability of a region by default, and of those whose held-out coverage is stated."""
+FOLDER, FILE = "locate", "locate.json"
+"""Folder of finished folds in the run folder, and file of the choice."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Likelihood and nearest neighbours of a run, with what held-out rows say of them.
+
+    Attributes:
+        likelihood: form of the likelihood.
+        neighbours: nearest neighbours; None: the run has no training rows to compare with.
+        rows: number of located held-out rows; 0: the form is the default one, as nothing could be held out.
+        error_m: their mean distance from the estimate, metres.
+        inside: share of them inside the regions of probability `LEVEL`.
+        neighbours_error_m: mean held-out distance of nearest neighbours, metres.
+        scores: mean log posterior density at the true positions of each form that was tried, per square metre.
+    """
+
+    likelihood: Likelihood
+    neighbours: Neighbours | None = None
+    rows: int = 0
+    error_m: float = np.nan
+    inside: float = np.nan
+    neighbours_error_m: float = np.nan
+    scores: dict[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Predictions at all candidates: means and standard deviations [headings, n_rx, p], dBm and dB."""
+
+    mean_dbm: NDArray[np.float32]
+    std_db: NDArray[np.float32]
+
+
+def predict_candidates(
+    fitted: Fitted, record: Record, headings: int, candidates: Candidates, report: Callable[[float], None]
+) -> Predicted:
+    """Predictions of a fitted model for all receivers, at equally spaced headings where it uses them.
+
+    Raises:
+        InputError: the model states no standard deviation.
+    """
+    positions, count = candidates.positions_m, len(record.receivers)
+    mean, std = np.empty((2, headings, count, len(positions)), np.float32)
+    for number in range(headings):
+        turned = np.full(len(positions), 2 * np.pi * number / headings) if headings > 1 else None
+        for receiver in range(count):
+            found = fitted.predict(Inputs(positions, turned), receiver)
+            if found.std is None:
+                raise InputError("its model states no standard deviation; train it with --intervals")
+            mean[number, receiver], std[number, receiver] = found.mean, found.std
+            report((number * count + receiver + 1) / (headings * count))
+    return Predicted(mean, std)
+
+
+def headings_of(run: Run) -> int:
+    """Number of headings at which a run's model is evaluated; 1 where it does not use the heading."""
+    stated = run.fitted.uses_heading
+    uses = run.model.headings if stated is None else stated
+    return HEADINGS if uses and run.problem.record.tx_heading_rad is not None else 1
+
+
+@dataclass(frozen=True)
+class Located:
+    """Held-out rows of a fold: rows of the record [m], and the candidate nearest to each [m]."""
+
+    predicted: Predicted
+    rows: IntArray
+    truth: IntArray
+
+
+def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibration:
+    """The stored choice of a run for these candidates, else a new one, which is stored in the run folder.
+
+    Finished folds are kept until all are, so that a stopped choice goes on.
+
+    Raises:
+        InputError: a fold that the model cannot be fitted to.
+        Interrupted: stopped.
+    """
+    grid, file = candidates.grid, run.folder / FILE
+    key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}
+    key |= {"high_m": [float(grid.x_m[-1]), float(grid.y_m[-1])], "height_m": grid.height_m}
+    if file.exists():
+        with readable(file, f"{file}: missing", "remove it"):
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            if stored.pop("key") == key:
+                return _restored(stored)
+    record, split = run.problem.record, load_rows(run.folder, run.problem.record)
+    folds = hold_out_folds(record, split) if len(run.problem.rows(split)) else []
+    if not folds:
+        return Calibration(Likelihood())
+    parts, headings, place = [], headings_of(run), run.folder / FOLDER
+    for number, fold in enumerate(folds):
+        kept = place / f"fold{number}.npz"
+        label = f"calibrating, fold {number + 1} of {len(folds)}"
+        report = partial(session.report, f"{label}: map")
+        arrays = stored_arrays(kept) if kept.exists() else {}
+        if arrays.get("positions_m", np.zeros(0)).shape != candidates.positions_m.shape:
+            folder = place / f"fold{number}"
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            inner = labelled(replace(session, folder=folder, run=folder), label)
+            with threadpool_limits(1, "blas"):
+                fitted, _ = fit_model(run.model, run.problem.seen(fold), fold, inner)
+                found = predict_candidates(fitted, record, headings, candidates, report)
+            shutil.rmtree(folder)
+            arrays = {"mean": found.mean_dbm, "std": found.std_db, "positions_m": candidates.positions_m}
+            write_arrays(kept, arrays)
+        test = fold.test[np.isfinite(record.observation[:, fold.test]).any(axis=0)]
+        most = max(1, MOST_ROWS // len(folds))
+        test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
+        parts.append(Located(Predicted(arrays["mean"], arrays["std"]), test, candidates.nearest(record.tx_pos_m[test])))
+    neighbours, error_m = choose_neighbours(record, folds)
+    chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
+    chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
+    write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
+    shutil.rmtree(place)
+    return chosen
+
+
+def _restored(stored: dict[str, Any]) -> Calibration:
+    form = stored.pop("likelihood")
+    silence = form.pop("silence")
+    neighbours = Neighbours(**stored.pop("neighbours"))
+    return Calibration(
+        Likelihood(**form, silence=None if silence is None else Silence(**silence)), neighbours, **stored
+    )
+
+
+def choose(
+    record: Record, parts: Sequence[Located], candidates: Candidates, report: Callable[[float], None]
+) -> Calibration:
+    """The likelihood with the best score on held-out rows.
+
+    Degrees of freedom and scale are chosen together (`widest`), then the common offset. That and a probability of
+    receiving nothing (`Silence`), each fold scored by the other folds', are kept where they raise the score by more
+    than the standard error.
+    """
+    forms = [Likelihood(degrees, scale) for degrees in DEGREES for scale in SCALES]
+    steps = len(forms) + len(OFFSETS_DB) + 1
+    scores: dict[str, float] = {}
+
+    def score(likelihoods: Sequence[Likelihood]) -> FloatArray:
+        found = [_scores(record, part, one, candidates) for part, one in zip(parts, likelihoods, strict=True)]
+        report((len(scores) + 1) / steps)
+        return np.concatenate(found)
+
+    def scored(tried: Sequence[Likelihood]) -> list[FloatArray]:
+        found = []
+        for one in tried:
+            found.append(score([one] * len(parts)))
+            scores[_words(one)] = float(found[-1].mean())
+        return found
+
+    best = widest(forms, scored(forms))
+    shared = [replace(best, offset_db=offset) for offset in OFFSETS_DB]
+    plain, *others = scored(shared)
+    gains = [0.0, *(_clear_gain(other - plain) for other in others)]
+    best = shared[int(np.argmax(gains))]
+    silences = [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
+    if (whole := fit_silence(record, parts)) is not None:
+        gain = score([replace(best, silence=one) for one in silences]) - score([best] * len(parts))
+        scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
+        if _clear_gain(gain) > 0:
+            best = replace(best, silence=whole)
+    errors, inside = [], []
+    for part in parts:
+        for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
+            found = probabilities(best.log(_strengths(record, row), part.predicted.mean_dbm, part.predicted.std_db))
+            region = region_of(found, candidates.distance_m, candidates.positions_m, LEVEL)
+            errors.append(np.linalg.norm(region.estimate_m - place[:2]))
+            inside.append(densest(found, LEVEL)[truth])
+    report(1.0)
+    return Calibration(best, None, len(errors), float(np.mean(errors)), float(np.mean(inside)), scores=scores)
+
+
+def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelihood:
+    """The form with the widest residuals among those whose scores [m] are within a standard error of the best.
+
+    Held-out rows share the conditions of the training rows, and few of them tell forms apart by chance; the rows to be
+    located have errors of another day (Breiman et al., "Classification and regression trees" (1984), section 3.4.3: the
+    rule of one standard error).
+    """
+    best = scores[int(np.argmax([one.mean() for one in scores]))]
+    able = [form for form, one in zip(forms, scores, strict=True) if _clear_gain(best - one) <= 0]
+    return max(
+        able, key=lambda form: form.scale * (norm() if form.degrees is None else student_t(form.degrees)).ppf(WIDE)
+    )
+
+
+def _clear_gain(difference: FloatArray) -> float:
+    """Mean of differences [m] where it exceeds its standard error, else 0."""
+    mean = float(difference.mean())
+    return mean if mean > difference.std() / np.sqrt(len(difference)) else 0.0
+
+
+def _strengths(record: Record, row: int) -> FloatArray:
+    """Signal strengths [n_rx] of a row of the record."""
+    return np.asarray(record.observation[:, row], float)
+
+
+def _words(form: Likelihood) -> str:
+    shape = "normal" if form.degrees is None else f"Student-t of {form.degrees:g} degrees"
+    offset = f", common offset of {form.offset_db:g} dB" if form.offset_db else ""
+    return f"{shape}, {form.scale:g} standard deviations{offset}"
+
+
+def _scores(record: Record, part: Located, form: Likelihood, candidates: Candidates) -> FloatArray:
+    """Log posterior density [m] at the true positions of held-out rows, per square metre."""
+    found = []
+    for row, truth in zip(part.rows, part.truth, strict=True):
+        log = form.log(_strengths(record, row), part.predicted.mean_dbm, part.predicted.std_db)
+        found.append(log[truth] - np.logaddexp.reduce(log))
+    return np.asarray(found) - np.log(candidates.cell_m2 or 1.0)
+
+
+def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
+    """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
+    mean = np.concatenate([part.predicted.mean_dbm[:, :, part.truth].mean(axis=0).ravel() for part in parts])
+    received = np.concatenate([np.isfinite(record.observation[:, part.rows]).ravel() for part in parts])
+    if received.all() or not received.any():
+        return None
+    middle, spread = float(mean.mean()), float(mean.std()) or 1.0
+    fit = LogisticRegression().fit((mean[:, None] - middle) / spread, received)
+    slope, intercept = float(fit.coef_[0, 0]), float(fit.intercept_[0])
+    return Silence(middle - intercept / slope * spread, slope / spread) if slope > 0 else None

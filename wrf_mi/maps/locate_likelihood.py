@@ -1,0 +1,112 @@
+"""Likelihood of received signal strengths at candidate positions of the transmitter.
+
+The residual of receiver r, observation minus predicted mean, has the scale a s_r, where s_r is the standard deviation
+that the model states at the candidate position, and a Student-t distribution, whose tails are heavier than those of the
+normal distribution: people, doors and furniture move. An offset that all receivers share, of a transmitter whose power
+differs from that of the training rows, is normal with mean zero and integrated by adaptive quadrature. Given
+position, heading and offset the receivers are independent. The heading is unknown and uniform: the likelihood is
+averaged over headings jointly for all receivers, as one body shadows them.
+
+Source: Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989), JASA 84; Liu
+and Pierce, "A note on Gauss-Hermite quadrature" (1994), Biometrika 81 (the offset).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, gammaln, log_expit, logsumexp
+
+from ..core.angles import FloatArray
+
+OFFSET_NODES = 7
+"""Nodes of the quadrature over the common offset."""
+
+
+@dataclass(frozen=True)
+class Silence:
+    """Probability that a receiver reports nothing, logistic in the predicted mean.
+
+    Attributes:
+        middle_dbm: predicted mean at which half of the rows are received.
+        slope_per_db: logit of the reception per decibel, above 0.
+    """
+
+    middle_dbm: float
+    slope_per_db: float
+
+    def log_received(self, mean_dbm: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Logarithm of the probability of reception, of the shape of the predicted mean."""
+        return np.asarray(log_expit(self.slope_per_db * (mean_dbm - self.middle_dbm)))
+
+    def log_silent(self, mean_dbm: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Logarithm of the probability that nothing is received, likewise."""
+        return np.asarray(log_expit(-self.slope_per_db * (mean_dbm - self.middle_dbm)))
+
+    def received(self, mean_dbm: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Probability of reception, likewise."""
+        return np.asarray(expit(self.slope_per_db * (mean_dbm - self.middle_dbm)))
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Form of the likelihood.
+
+    Attributes:
+        degrees: degrees of freedom of the Student-t distribution; None: normal.
+        scale: factor of the stated standard deviations.
+        offset_db: standard deviation of the offset that all receivers share.
+        silence: probability of receiving nothing; None: receivers without a value are left out.
+    """
+
+    degrees: float | None = 8.0
+    scale: float = 1.0
+    offset_db: float = 0.0
+    silence: Silence | None = None
+
+    def log(
+        self, observed_dbm: NDArray[np.floating], mean_dbm: NDArray[np.floating], std_db: NDArray[np.floating]
+    ) -> FloatArray:
+        """Logarithm of the likelihood [p] of an observation at p candidate positions.
+
+        Args:
+            observed_dbm: received strengths [n_rx], NaN where nothing was received.
+            mean_dbm: predicted means [headings, n_rx, p]; a single heading where the model does not use it.
+            std_db: their standard deviations, of the same shape.
+        """
+        known = np.isfinite(observed_dbm)
+        scale = self.scale * std_db[:, known]
+        error = observed_dbm[known, None].astype(mean_dbm.dtype) - mean_dbm[:, known]
+        found = self._with_offset(error, scale) if self.offset_db > 0 else self._density(error, scale)
+        if self.silence is not None:
+            found = found + self.silence.log_received(mean_dbm[:, known]).sum(axis=1)
+            found = found + self.silence.log_silent(mean_dbm[:, ~known]).sum(axis=1)
+        return np.asarray(logsumexp(found, axis=0) - np.log(len(mean_dbm)), float)
+
+    def _with_offset(self, error: NDArray[np.floating], scale: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Logarithm of the density of residuals with a common normal offset, as `_density`.
+
+        The nodes of each candidate are those of the offset's distribution given normal residuals, for which the
+        quadrature is exact.
+        """
+        weight = 1 / scale**2
+        variance = 1 / (1 / self.offset_db**2 + weight.sum(axis=1))
+        middle = variance * (weight * error).sum(axis=1)
+        nodes, weights = np.polynomial.hermite_e.hermegauss(OFFSET_NODES)
+        terms = []
+        for node in nodes:
+            offset = middle + np.sqrt(variance) * node
+            prior = -((offset / self.offset_db) ** 2 - node**2 + np.log(self.offset_db**2 / variance)) / 2
+            terms.append(self._density(error - offset[:, None], scale) + prior)
+        return np.asarray(logsumexp(terms, axis=0, b=(weights / weights.sum())[:, None, None]))
+
+    def _density(self, error: NDArray[np.floating], scale: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Logarithm of the density [headings, p] of residuals [headings, received, p]."""
+        square = (error / scale) ** 2
+        if self.degrees is None:
+            return np.asarray(-(square / 2 + np.log(scale) + np.log(2 * np.pi) / 2).sum(axis=1))
+        n = self.degrees
+        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - np.log(n * np.pi) / 2
+        return np.asarray((constant - (n + 1) / 2 * np.log1p(square / n) - np.log(scale)).sum(axis=1))
