@@ -182,5 +182,7 @@ def _tree(places_m: FloatArray) -> FloatArray:
     length, other = cKDTree(places_m).query(places_m, k=min(NEIGHBOURS + 1, n), distance_upper_bound=REACH_M)
     near = np.isfinite(length) & (length > 0)
     row = np.broadcast_to(np.arange(n)[:, None], other.shape)
-    tree = minimum_spanning_tree(sparse.csr_array((length[near], (row[near], other[near])), shape=(n, n))).tocoo()
+    # The search takes 32-bit indices, and SciPy before 1.17.1 keeps the 64 bits of a sparse array.
+    ends = (row[near].astype(np.int32), other[near].astype(np.int32))
+    tree = minimum_spanning_tree(sparse.csr_array((length[near], ends), shape=(n, n))).tocoo()
     return np.stack([places_m[tree.row], places_m[tree.col]], axis=1)
