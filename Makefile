@@ -3,13 +3,16 @@
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo lint test test-gpu test-slow bench bench-quick clean
+.PHONY: help setup demo lint test test-gpu test-slow docs docs-quick package-test bench bench-quick clean
 
 help:
 	@echo "make demo       train on real spectra, or on a traced room where there are none"
 	@echo "make test       lint, types, import order, tests, notebooks"
 	@echo "make test-gpu   the tests that need a CUDA device"
 	@echo "make test-slow  the tests that take minutes"
+	@echo "make docs       the documentation site with executed notebooks; minutes, then seconds for what has changed"
+	@echo "make docs-quick the same without executing notebooks"
+	@echo "make package-test  wheel and source distribution, tested in empty environments; minutes"
 	@echo "make bench      every stored figure, run time against error among them; hours"
 	@echo "make bench-quick  ratios of run times against the stored ones, numbers under stress; two minutes"
 	@echo "make setup      only the set-up that the others begin with"
@@ -44,6 +47,18 @@ test-slow: $(READY)
 test-gpu: $(READY)
 	$(BIN)/pytest -m gpu
 
+# Warnings are errors: missing pages, headings and files that a page refers to are warnings.
+docs: $(READY)
+	$(BIN)/sphinx-build -b html -W --keep-going docs docs/_build/html
+	@echo "site: docs/_build/html/index.html"
+
+docs-quick: $(READY)
+	$(BIN)/sphinx-build -q -b html -W --keep-going -D execute_notebooks=0 docs docs/_build/html
+	@echo "site: docs/_build/html/index.html"
+
+package-test: $(READY)
+	$(BIN)/python .ci/package_test.py
+
 bench: $(READY)
 	$(BIN)/wrf-mi bench
 
@@ -52,5 +67,5 @@ bench-quick: $(READY)
 	$(BIN)/wrf-mi bench stress --quick
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache docs/_build docs/notebooks docs/api
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,6 +10,11 @@ stop() {
     exit 1
 }
 
+begin=$(date +%s)
+step() {
+    echo "set-up: step $1 ($(($(date +%s) - begin)) s so far)" >&2
+}
+
 as_root() {
     if [ "$(id -u)" = 0 ]; then
         "$@"
@@ -30,6 +35,7 @@ new_enough() {
     "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 }
 
+step "1 of 4, Python and $venv: seconds"
 if ! { new_enough "$venv/bin/python" && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }; then
     python=
     for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
@@ -47,8 +53,21 @@ if ! { new_enough "$venv/bin/python" && "$venv/bin/python" -m pip --version >/de
     fi
     "$python" -m venv --clear "$venv"
 fi
-echo "set-up: installing the package and its dependencies into $venv (a minute or two)" >&2
-"$venv/bin/python" -m pip install -q -e '.[dev]'
+# pip's last line every five seconds: what it collects, downloads with size, builds or installs.
+step "2 of 4, the package and its dependencies, 1.5 GB on the disk: a minute or two after the downloads"
+"$venv/bin/python" -m pip install -e '.[dev]' >"$venv/pip.log" &
+pip=$!
+trap 'kill "$pip" 2>/dev/null; exit 130' INT TERM
+shown=
+while kill -0 "$pip" 2>/dev/null; do
+    line=$(tail -n 1 "$venv/pip.log" | cut -c 1-100)
+    [ "$line" = "$shown" ] || echo "set-up:   $(($(date +%s) - begin)) s $line" >&2
+    shown=$line
+    sleep 5
+done
+trap - INT TERM
+wait "$pip" || stop "pip could not install the package; see $venv/pip.log"
+step "3 of 4, libraries of Open3D: seconds"
 # Open3D, which `wrf-mi mesh` uses, is linked against what depth cameras and windows need.
 open3d_needs="libusb-1.0-0 libgl1 libegl1 libx11-6"
 if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
@@ -56,4 +75,5 @@ if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
     "$venv/bin/python" -c 'import open3d' 2>/dev/null ||
         stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y $open3d_needs"
 fi
+step "4 of 4, LLVM: seconds, a minute where it is installed"
 "$venv/bin/python" -m wrf_mi.cli doctor --install-llvm

@@ -26,7 +26,12 @@ from wrf_mi.training.config import TrainConfig
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 README = CHECKOUT / "README.md"
-DOCUMENTS = [README, *sorted((CHECKOUT / "docs").glob("*.md"))]
+PAGES = sorted(
+    page
+    for page in (CHECKOUT / "docs").rglob("*.md")
+    if page.relative_to(CHECKOUT / "docs").parts[0] not in {"_build", "api", "notebooks"}
+)
+DOCUMENTS = [README, *PAGES]
 HEIGHT, WIDTH, ROWS = 10, 16, 14
 
 
@@ -87,7 +92,7 @@ def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatc
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
 def test_commands_parse(path: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE))
     for line in commands(path):
@@ -113,7 +118,7 @@ def test_readme_shows_all_main_commands() -> None:
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
 def test_links_and_paths_exist(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]

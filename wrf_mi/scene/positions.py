@@ -182,5 +182,7 @@ def _tree(places_m: FloatArray) -> FloatArray:
     length, other = cKDTree(places_m).query(places_m, k=min(NEIGHBOURS + 1, n), distance_upper_bound=REACH_M)
     near = np.isfinite(length) & (length > 0)
     row = np.broadcast_to(np.arange(n)[:, None], other.shape)
-    tree = minimum_spanning_tree(sparse.csr_array((length[near], (row[near], other[near])), shape=(n, n))).tocoo()
+    # The search refuses 64-bit indices with SciPy 1.15.0 to 1.17.0 and NumPy 2.0.0.
+    ends = (row[near].astype(np.int32), other[near].astype(np.int32))
+    tree = minimum_spanning_tree(sparse.csr_array((length[near], ends), shape=(n, n))).tocoo()
     return np.stack([places_m[tree.row], places_m[tree.col]], axis=1)

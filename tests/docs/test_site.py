@@ -1,0 +1,117 @@
+"""Documentation site and packaging: pages, drawings, examples of the how-to pages, versions, workflows."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from documents import blocks
+
+import wrf_mi
+from wrf_mi import models
+from wrf_mi.graph import receivers
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+DOCS = CHECKOUT / "docs"
+WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))
+PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
+MINUTES = re.compile(r"^(wrf-mi train .+?) --out \S+\s+# ([\d.]+) min$", re.MULTILINE)
+SCENES = {"runs/room": "{lidar}"}
+"""Scenes of the page of the paper's figures and their names in stored commands."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site as `make docs-quick` builds it, without executing notebooks; a warning is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    command = ["-q", "-b", "html", "-W", "--keep-going", "-D", "execute_notebooks=0", str(DOCS), str(folder)]
+    done = subprocess.run([sys.executable, "-m", "sphinx", *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder
+
+
+def test_site_is_built_without_warnings_and_lists_every_page(site: Path) -> None:
+    """Sphinx warns of pages without a place in the table of contents, and of links to nothing."""
+    front = (site / "index.html").read_text(encoding="utf-8")
+    for page in (*DOCS.glob("*.md"), *(DOCS / "howto").glob("*.md")):
+        assert f'href="{page.relative_to(DOCS).with_suffix(".html")}"' in front or page.name == "index.md", page.name
+    for name in wrf_mi.__all__:
+        assert (site / "api" / f"wrf_mi.{name}.html").exists(), name
+
+
+def test_drawings_are_those_of_their_script() -> None:
+    sys.path.insert(0, str(DOCS / "_extensions"))
+    import stage_drawings
+
+    names = {path.stem for path in stage_drawings.TARGET.glob("*.svg")}
+    assert names == set(stage_drawings.DETAILS)
+    for name in names:
+        stored = (stage_drawings.TARGET / f"{name}.svg").read_text(encoding="utf-8")
+        assert stored == stage_drawings.drawing(name), f"{name}: run {stage_drawings.__file__}"
+
+
+def test_examples_of_how_to_pages_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = set(models.MODELS), set(receivers.RECEIVERS)
+    names: dict[str, Any] = {"__name__": "how_to_pages"}
+    module = type(sys)("how_to_pages")
+    monkeypatch.setitem(sys.modules, "how_to_pages", module)  # where a dataclass looks for its types
+    try:
+        for page in ("own-data", "model", "receiver", "benchmark"):
+            exec("\n".join(blocks(DOCS / "howto" / f"{page}.md", "python")), names)
+        run = wrf_mi.train("office", "run", "nearest")
+        assert wrf_mi.check_data("office").suspicions == ()
+        assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
+        assert run.metrics["abs_error_db"]["median"] < 5
+        kind = receivers.receiver_kind("power-pixel", "spectrum")
+        form = receivers.Form("power-pixel", (4, 8))
+        assert kind.make(form, run.record.receivers[0]).how == "power"
+        assert names["main"]()["rows"]
+    finally:
+        for registry, known in ((models.MODELS, before[0]), (receivers._RECEIVERS, before[1])):
+            for name in set(registry) - known:
+                del registry._known[name]
+
+
+def test_minutes_of_the_papers_figures_are_the_stored_ones() -> None:
+    stored = {}
+    for path in (CHECKOUT / "benchmarks" / "results" / "tables").glob("*-100-seed0.json"):
+        row = json.loads(path.read_text())
+        stored[row["command"]] = (row.get("train_seconds") or 0.0, row.get("wall_seconds") or 0.0)
+    found = MINUTES.findall((DOCS / "paper-figures.md").read_text(encoding="utf-8"))
+    assert len(found) >= 15
+    for command, minutes in found:
+        words = [SCENES.get(word, word) for word in shlex.split(command)]
+        trained, whole = stored[" ".join(words)]
+        # Ray tracing is not trained: its minutes are those of the command.
+        assert float(minutes) == round((whole if "ray-tracing" in words else trained) / 60, 1), command
+
+
+def test_versions_agree() -> None:
+    citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == wrf_mi.__version__
+    assert f"## {wrf_mi.__version__}\n" in (DOCS / "changelog.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_workflows_have_pinned_actions_few_rights_and_existing_targets(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    content = yaml.safe_load(text)
+    assert content["permissions"] == {"contents": "read"}
+    targets = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
+    for job in content["jobs"].values():
+        assert job["timeout-minutes"] > 0
+        for step in job["steps"]:
+            words = step.get("run", "").split()
+            assert not words or words[0] != "make" or set(words[1:]) <= set(targets), step
+            assert not words or not words[0].startswith(".ci/") or (CHECKOUT / words[0]).exists(), step
+    used = re.findall(r"uses: (.+)$", text, re.MULTILINE)
+    assert used
+    assert all(PINNED.fullmatch(action) for action in used), used
