@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from .. import __version__
 from ..core import BackendError, InputError
 from ..core.files import os_failure
-from . import bench, compare, compress, correct, data, demo, doctor, evaluate, mesh, predict, sweep, trace, train
+from . import bench, compare, compress, correct, data, demo, doctor, evaluate, mesh, predict, sweep, trace, train, view
 from .options import Parser
 
-COMMANDS = (doctor, data, mesh, correct, train, trace, sweep, evaluate, predict, compress, compare, bench, demo)
+COMMANDS = (doctor, data, mesh, correct, train, trace, sweep, evaluate, predict, compress, compare, view, bench, demo)
 
 
 def build_parser() -> Parser:

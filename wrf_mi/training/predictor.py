@@ -99,8 +99,13 @@ class Predictor:
             other.update(params)
 
     def gaussians(self, tx_pos_m: ArrayLike) -> Gaussians:
-        """The field's Gaussians for transmitter positions [m, 3] (metres), world frame."""
+        """The field's Gaussians for transmitter positions [m, 3] (metres), world frame.
+
+        Where rows have several carriers, they are those of the middle one.
+        """
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
+        if self.graph.form.carriers_hz is not None:
+            columns = np.vstack([columns, np.zeros_like(columns[:1])])
         if self._field is None:
             raise ValueError("paths alone: there are no Gaussians")
         return self._field.gaussians(self._params, to_tensor(columns)).spread()
