@@ -28,6 +28,7 @@ from wrf_mi.viewer.view import View
 
 ROUNDED = 0.51 / LARGEST
 """Largest error of a packed number as a share of the range: half a step, and rounding."""
+DATA = r'<script id="content" type="application/json">(.*?)</script>'
 
 
 def unpacked(stored: dict[str, Any]) -> np.ndarray:
@@ -38,7 +39,7 @@ def unpacked(stored: dict[str, Any]) -> np.ndarray:
 
 def data_of(text: str) -> dict[str, Any]:
     """Data in a page."""
-    found = re.search(r'<script id="content" type="application/json">(.*?)</script>', text, re.DOTALL)
+    found = re.search(DATA, text, re.DOTALL)
     assert found is not None
     return dict(json.loads(found[1]))
 
@@ -87,7 +88,9 @@ def test_page_holds_plotly_and_refers_to_nothing_else(text: str) -> None:
     assert text.count(plotly_js()) == 1
     assert re.search(r"plotly\.js v\d", text)
     own = text.replace(plotly_js(), "")
-    assert not re.search(r"https?:|[\"'(]//|@import|url\(", own)
+    assert not re.search(r"https?:", own)
+    own = re.sub(DATA, "", own, flags=re.DOTALL)  # base64 has slashes
+    assert not re.search(r"[\"'(]//|@import|url\(", own)
     loading = {"link", "iframe", "img", "object", "embed", "base", "video", "audio"}
     elements = Elements(own).found
     assert not [tag for tag, attributes in elements if tag in loading or {"src", "href"} & attributes.keys()]

@@ -312,8 +312,10 @@
     }];
   }
 
+  const meshOptions = () => [slider("Opacity of the mesh", 0.05, 1, 0.05, state.mesh, (v) => (state.mesh = v))];
+
   // --- mesh -----------------------------------------------------------------------------------------------------------
-  for (const mesh of data.meshes) {
+  for (const [place, mesh] of data.meshes.entries()) {
     const corners = unpack(mesh.corners).values;
     const surface = unpack(mesh.surface).values;
     const triangles = surface.length;
@@ -334,6 +336,7 @@
       name: mesh.ceiling ? `${mesh.material}, ceiling` : mesh.material,
       on: !mesh.ceiling,
       swatch: mesh.colour,
+      options: place === data.meshes.length - 1 ? meshOptions : null,
       traces: () => [{ ...trace, opacity: state.mesh }],
     });
   }
@@ -345,7 +348,6 @@
     addLayer({
       name: "edges",
       swatch: "#2b2d42",
-      options: data.meshes.length ? () => [slider("Opacity of the mesh", 0.05, 1, 0.05, state.mesh, (v) => (state.mesh = v))] : null,
       traces: () => [{ ...trace, line: { color: "#2b2d42", width: 1.5 } }],
     });
   }
@@ -429,7 +431,7 @@
       const colours = flipped ? [...data.scales[name]].reverse() : data.scales[name];
       const bar = element("div", { className: "bar" });
       bar.style.background = `linear-gradient(to right, ${colours.join(", ")})`;
-      const digits = Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(Math.max(high - low, 1e-6)))));
+      const digits = high > low ? Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(high - low)))) : 1;
       const ends = [number(low, digits), label, number(high, digits)].map((text) => element("span", { textContent: text }));
       layer.bar.replaceChildren(bar, element("div", { className: "ends" }, ...ends));
     }
