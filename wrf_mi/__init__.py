@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .tracing import TraceOptions
     from .training.config import TrainConfig
     from .training.trainer import Trainer
+    from .viewer.view import view
 
 __version__ = "0.2.0"
 
@@ -58,6 +59,7 @@ _HOME = {
     "scene_view": "runs.scene_view",
     "spectrum_table": "runs.figures",
     "train": "runs.api",
+    "view": "viewer.view",
     "with_settings": "core.settings",
     "write_map": "maps.dataset",
 }
@@ -89,6 +91,7 @@ __all__ = [
     "scene_view",
     "spectrum_table",
     "train",
+    "view",
     "with_settings",
     "write_map",
 ]

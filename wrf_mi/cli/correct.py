@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .options import DATASET, Arguments, add_command, add_n_train
-from .output import print_json
-
-if TYPE_CHECKING:
-    from ..correction.options import OnStage
+from .output import print_json, stages
 
 
 def add_parser(commands: Any) -> None:
@@ -57,7 +52,7 @@ def correct_command(a: Arguments) -> int:
     splits = make_splits(record, a.split, a.seed, a.n_train)
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
-    with _stages() as show:
+    with stages("correct") as show:
         found = correct_scene(a.scene, record, splits[0], options, a.material, show)
         facts = write_page(found, a.out, a.replace)
     if a.json:
@@ -70,23 +65,3 @@ def correct_command(a: Arguments) -> int:
     print(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
     print(f"scene: {a.out}\npage: {a.out}/correction.md")
     return 0
-
-
-@contextmanager
-def _stages() -> Iterator[OnStage]:
-    """What is done and how much of it, on standard error: a bar on a terminal, else a line for each stage."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0, visible=False)
-
-        def show(what: str, share: float) -> None:
-            if what != bar.tasks[0].description:
-                bar.reset(task, description=what, visible=True)
-                if bar.disable:
-                    print(f"correct: {what}", file=sys.stderr, flush=True)
-            bar.update(task, completed=share)
-
-        yield show

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from .. import __version__
 from ..core import BackendError, InputError
 from ..core.files import os_failure
+<<<<<<< HEAD
 from . import (
     bench,
     compare,
@@ -31,28 +32,11 @@ from . import (
     sweep,
     trace,
     train,
+    view,
 )
 from .options import Parser
 
-COMMANDS = (
-    doctor,
-    data,
-    mesh,
-    correct,
-    edit,
-    train,
-    trace,
-    sweep,
-    evaluate,
-    predict,
-    map,
-    locate,
-    compress,
-    compare,
-    export,
-    bench,
-    demo,
-)
+COMMANDS = (doctor, data, mesh, correct, edit, train, trace, sweep, evaluate, predict, map, locate, compress, compare, view, export, bench, demo)
 
 
 def build_parser() -> Parser:

@@ -7,6 +7,8 @@ import math
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -50,6 +52,27 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if folder is not None:
         print(f"results: {folder}")
     return 0
+
+
+@contextmanager
+def stages(command: str) -> Iterator[Callable[[str, float], None]]:
+    """Progress callback, stage and fraction done, shown on standard error: a bar on a terminal, else a line a stage.
+
+    Args:
+        command: name of the command, for the lines.
+    """
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=1.0, visible=False)
+
+        def show(stage: str, share: float) -> None:
+            if stage != bar.tasks[0].description:
+                bar.reset(task, description=stage, visible=True)
+                if bar.disable:
+                    print(f"{command}: {stage}", file=sys.stderr, flush=True)
+            bar.update(task, completed=share)
+
+        yield show
 
 
 class Watch:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ..core.settings import Positive, ShareBelow1
-from ..tracing.options import DISC, MAX_DEGREE, MAX_DEPTH, MAX_RAYS
+from ..tracing.options import DISC, MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
 
 EvaluationName = Literal["splatted", "traced"]
 """Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
@@ -72,6 +72,14 @@ class TracedConfig:
         first, last = name.partition(".")[0], name.rpartition(".")[2]
         rate: float = getattr(self, first if first in ("material", "pattern", "surface") else last)
         return rate
+
+    @property
+    def options(self) -> TraceOptions:
+        """Options of the search for paths."""
+        depth, reflections = self.depth, self.reflections
+        return TraceOptions(
+            transmission=self.transmission, max_depth=depth, max_reflections=reflections, rays=self.rays
+        )
 
     @property
     def moves_planes(self) -> bool:

@@ -17,7 +17,7 @@ from ..core import Prediction
 from ..core.angles import FloatArray
 from ..runs.figures import without_formulas
 from ..runs.run import Run
-from ..runs.scene_view import scene_parts
+from ..runs.scene_view import surfaces_of
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES, cut_lines
 from ..tasks import task_of
 from .variables import POWER
@@ -84,7 +84,7 @@ def _aspect(dataset: xarray.Dataset) -> float:
 def _walls(run: Run, height_m: float) -> Sequence[FloatArray]:
     """Cuts [n, 2, 2] of the surfaces of a run's scene at a height."""
     scene = run.problem.opened_scene
-    return [] if scene is None else [cut_lines(part, height_m) for part in scene_parts(scene)]
+    return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
 
 
 def _draw_plan(

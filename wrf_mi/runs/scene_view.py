@@ -41,9 +41,9 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     paths = found.paths.select(found.paths.tx == row)
     cloud = None
     if field is not None:
-        cloud = _cloud_of(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
+        cloud = gaussian_cloud(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
     return draw_scene(
-        scene_parts(scene),
+        surfaces_of(scene),
         paths=replace(paths, tx=np.zeros_like(paths.tx), n_tx=1),
         transmitters_m=transmitter,
         receivers_m=[receiver.position_m for receiver in found.receivers],
@@ -52,24 +52,24 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     )
 
 
-def scene_parts(scene: Any) -> list[Surface]:
+def surfaces_of(scene: Any) -> list[Surface]:
     """Objects of a ``sionna.rt.Scene`` as surfaces; the kind is the prefix of the name, else ``other``."""
     faces = scene_surfaces(scene)
     surfaces = []
     for index, name in enumerate(faces.names):
         triangles: FloatArray = faces.triangles[faces.first_face[index] : faces.first_face[index + 1]]
         kind: Kind = next((kind for kind in KINDS if name.startswith(kind)), "other")
-        corners = triangles.reshape(-1, 3)
-        surfaces.append(Surface(name, kind, corners, np.arange(len(corners)).reshape(-1, 3)))
+        vertices, vertex = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+        surfaces.append(Surface(name, kind, vertices, vertex.reshape(-1, 3)))
     return surfaces
 
 
-def _cloud_of(gaussians: Gaussians) -> GaussianCloud:
-    """Gaussians for a transmitter, coloured by opacity times signal, in dB."""
+def gaussian_cloud(gaussians: Gaussians) -> GaussianCloud:
+    """Gaussians for a transmitter, coloured by opacity times magnitude of all signals, in dB."""
     position, scale, rotation = (
         np.array(a, float).T for a in (gaussians.position, gaussians.scale, gaussians.rotation)
     )
-    strength = np.hypot(*np.array(gaussians.signal, float))
+    strength = np.sqrt(np.square(np.array(gaussians.signal, float)).sum(axis=0))
     if gaussians.opacity is not None:
         strength = strength * np.array(gaussians.opacity, float)
     return GaussianCloud(position, scale, rotation, 20 * np.log10(np.maximum(strength, WEAKEST)))

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.files import write_figure
@@ -47,6 +47,10 @@ CUT = 0.45
 TOP = 0.8
 """Level faces above this share of the height are taken off like a ceiling."""
 WHOLE_FACES = 50
+MOST_OUTLINED = 500
+"""Number of faces above which a surface is drawn without its free edges."""
+CREASE_RAD = 0.5
+"""Angle between the normals of two faces from which their common edge is a crease."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +184,47 @@ def _coloured(figure: Figure, strength: FloatArray, colours: str, label: str, al
     return shades.to_rgba(strength, alpha=alpha)
 
 
+def _unit_normals(corners: FloatArray) -> FloatArray:
+    normal = trimesh.triangles.cross(corners)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12))
+
+
+def _level(normal: FloatArray) -> NDArray[np.bool_]:
+    return np.abs(normal[:, 2]) > 0.9
+
+
+def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
+    """Faces [f] that hide the inside of a scene from above: ceilings, and level faces near the top.
+
+    Args:
+        surface: a surface of the scene.
+        low: lower corner of the scene [3], metres.
+        high: upper corner of the scene [3], metres.
+    """
+    if surface.kind in ("floor", "ceiling"):
+        return np.full(len(surface.faces), surface.kind == "ceiling")
+    corners = surface.vertices_m[surface.faces]
+    high_up = corners[..., 2].mean(axis=1) > low[2] + TOP * (high[2] - low[2])
+    return _level(_unit_normals(corners)) & high_up
+
+
+def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
+    """Edges [n, 2, 3] of a surface of few faces that bound one face; none of a larger surface.
+
+    Args:
+        surface: a surface of the scene whose faces share their vertices.
+        creases: with edges where two faces meet at more than `CREASE_RAD`.
+    """
+    if len(surface.faces) > MOST_OUTLINED:
+        return np.empty((0, 2, 3))
+    edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
+    found = edges[trimesh.grouping.group_rows(edges, require_count=1)]
+    if creases:
+        mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+        found = np.concatenate([found, mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_RAD]])
+    return np.asarray(surface.vertices_m[found], float).reshape(-1, 2, 3)
+
+
 def _draw_slant(
     axes: Any, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
 ) -> None:
@@ -191,11 +236,8 @@ def _draw_slant(
         if surface.kind == "ceiling":
             continue
         corners = surface.vertices_m[surface.faces]
-        normal = trimesh.triangles.cross(corners)
-        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-        level = np.abs(normal[:, 2]) > 0.9
-        centre = corners.mean(axis=1)
-        kept = ~(level & (centre[:, 2] > low[2] + TOP * (high[2] - low[2])) & (surface.kind != "floor"))
+        normal, centre = _unit_normals(corners), corners.mean(axis=1)
+        level, kept = _level(normal), ~ceiling_faces(surface, low, high)
         light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
         if surface.kind == "floor":
             front = np.zeros(len(corners), bool)
@@ -213,10 +255,7 @@ def _draw_slant(
             axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
     rims = [np.empty((0, 2, 3))]
-    for surface in surfaces:
-        if surface.kind != "ceiling" and len(surface.faces) <= 500:
-            edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
-            rims.append(surface.vertices_m[edges[trimesh.grouping.group_rows(edges, require_count=1)]])
+    rims += [free_edges(surface) for surface in surfaces if surface.kind != "ceiling"]
     if len(lines := np.concatenate(rims)):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
     axes.set_proj_type("ortho")

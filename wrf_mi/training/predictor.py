@@ -99,17 +99,17 @@ class Predictor:
         for other in self._others.values():
             other.update(params)
 
-    def gaussians(self, tx_pos_m: ArrayLike, log_carrier: float | None = None) -> Gaussians:
+    def gaussians(self, tx_pos_m: ArrayLike, log_carrier: float = 0.0) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame.
 
         ``log_carrier`` is the logarithm of the carrier over the middle one of training (`Graph.log_carrier`), for
-        fields that were trained on several carriers.
+        fields that were trained on several carriers; others ignore it.
         """
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
+        if self.graph.form.carriers_hz is not None:
+            columns = np.vstack([columns, np.full((1, columns.shape[1]), log_carrier, np.float32)])
         if self._field is None:
             raise ValueError("paths alone: there are no Gaussians")
-        if log_carrier is not None:
-            columns = np.vstack([columns, np.full((1, columns.shape[1]), log_carrier, np.float32)])
         return self._field.gaussians(self._params, to_tensor(columns)).spread()
 
     def static_geometry(self) -> StaticOperator:

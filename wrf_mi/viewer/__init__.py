@@ -1,0 +1,1 @@
+"""Interactive 3D views of scenes, runs and maps: one self-contained HTML file."""

@@ -1,0 +1,157 @@
+"""Content of a view from run folders, scenes and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from wrf_mi_scenes import scenes
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..runs.folder import CONFIG
+from ..runs.results import read_run
+from ..runs.run import Run, open_run
+from ..tasks.conditions import scene_carrier
+from .content import MapContent, ViewContent, ViewOptions
+from .map_layer import is_map, read_map, thinned
+from .run_layers import OnStage, gaussians_content, paths_content, rows_content, run_scene
+from .scene_layer import read_scene, scene_content, surfaces_in
+
+Source = str | Path | Run | Any
+"""A run, its folder, a scene by name, folder or file, a ``sionna.rt.Scene``, a map file or an ``xarray.Dataset``."""
+
+
+@dataclass
+class _Gathered:
+    """What is known of a view, source by source."""
+
+    options: ViewOptions
+    material: str | None
+    on_stage: OnStage
+    progress: bool
+    content: ViewContent = field(default_factory=lambda: ViewContent(""))
+    titles: list[str] = field(default_factory=list)
+    scene: tuple[Any, dict[str, str]] | None = None
+    stored_m: FloatArray | None = None
+
+    def add(self, source: Source) -> None:
+        """Add a source, by its kind."""
+        if isinstance(source, Run):
+            self._add_run(source)
+        elif hasattr(source, "data_vars"):
+            self._add_map(source)
+        elif hasattr(source, "mi_scene"):
+            self.titles.append("scene")
+            self._take_scene(*surfaces_in(source))
+        elif not Path(source).exists() and str(source) not in scenes():
+            known = ", ".join(scenes())
+            raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {known})")
+        elif (Path(source) / CONFIG).is_file():
+            self._add_run(open_run(source))
+        elif is_map(Path(source)):
+            self._add_map(source)
+        else:
+            self.on_stage("opening the scene", 0.0)
+            self.titles.append(Path(source).name)
+            self._take_scene(*read_scene(source, self.material))
+
+    def _add_map(self, source: Any) -> None:
+        found, notes = read_map(source)
+        self.content.maps.append(found)
+        self.content.notes += notes
+        self.titles.append(found.name)
+
+    def _take_scene(self, surfaces: Any, materials: dict[str, str]) -> None:
+        if self.scene is None:
+            self.scene = surfaces, materials
+
+    def _add_run(self, run: Run) -> None:
+        """Add what a run has and no earlier one: rows, scene, Gaussians, paths."""
+        content, results, record = self.content, read_run(run.folder), run.problem.record
+        self.titles.append(f"{results.name}: {run.config.model} on {record.name}")
+        first = content.rows is None
+        if first:
+            content.receivers = results.receivers
+            content.receivers_m = np.stack([receiver.position_m for receiver in record.receivers])
+            content.rows, notes = rows_content(results, self.options)
+            content.notes += notes
+        scene = None
+        if run.config.scene is not None:
+            self.on_stage("opening the scene", 0.0)
+            scene = run_scene(run, scene_carrier(record))
+            self._take_scene(*surfaces_in(scene))
+        if content.rows is None:
+            return
+        stored = content.rows.stored
+        numbers, positions = content.rows.row[stored], content.rows.tx_pos_m[stored]
+        if not first and not _has_rows(record, numbers, positions, content.receivers):
+            content.notes.append(f"{results.name}: of other data than the first run; only its scene is shown.")
+            return
+        if content.gaussians is None:
+            content.gaussians, notes = gaussians_content(run, positions, self.options, self.on_stage)
+            content.notes += notes
+        if content.paths is None:
+            self._add_paths(run, numbers, positions, scene)
+
+    def _add_paths(self, run: Run, numbers: IntArray, positions: FloatArray, scene: Any) -> None:
+        try:
+            found, notes = paths_content(
+                run, numbers, positions, scene, self.options, self.on_stage, progress=self.progress
+            )
+        except InputError as error:
+            # A transmitter inside a solid, for example, hides paths but nothing else.
+            found, notes = None, [f"Paths: not traced, {error}"]
+        self.content.paths = found
+        self.content.notes += notes
+
+
+def _has_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receivers: Sequence[str]) -> bool:
+    """Whether a record has rows of those numbers at those positions, and receivers of those names."""
+    same = [receiver.name for receiver in record.receivers] == list(receivers) and rows.max() < len(record)
+    return bool(same and np.array_equal(record.tx_pos_m[rows], tx_pos_m))
+
+
+def gather(
+    sources: Sequence[Source],
+    options: ViewOptions,
+    material: str | None = None,
+    on_stage: OnStage = lambda stage, share: None,
+    progress: bool = False,
+) -> ViewContent:
+    """Content of a view; each layer is that of the first source that has it, and all maps are shown.
+
+    Args:
+        sources: what to show, at least one.
+        options: limits.
+        material: radio material of a bare mesh.
+        on_stage: progress callback.
+        progress: show a bar on standard error where paths are traced.
+
+    Raises:
+        InputError: a source that is none of these or cannot be read.
+    """
+    found = _Gathered(options, material, on_stage, progress)
+    for source in sources:
+        found.add(source)
+    content = found.content
+    if found.scene is not None:
+        content.scene, note = scene_content(*found.scene)
+        content.notes += [note] if note else []
+    content.maps, notes = thinned(content.maps)
+    content.notes += notes
+    content.title = "; ".join(found.titles)
+    if not content.receivers:
+        content.receivers = _map_receivers(content.maps)
+        content.receivers_m = np.full((len(content.receivers), 3), np.nan)
+    if content.scene is None and content.rows is None and not content.maps:
+        raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")
+    return content
+
+
+def _map_receivers(maps: Sequence[MapContent]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for one in maps for name in one.receivers))

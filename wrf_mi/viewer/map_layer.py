@@ -1,0 +1,104 @@
+"""Maps of a view, from the files of ``wrf-mi map``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import InputError
+from ..core.files import readable
+from .content import MapContent
+
+NETCDF, ZARR = (".nc", ".nc4", ".netcdf"), ".zarr"
+MAP_NUMBERS = 900_000
+"""Values of all maps of a page, at most: 2.4 MB."""
+RECEIVER, POINT = "receiver", "point"
+"""Dimensions of receivers and of the points of a surface."""
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path has the name of a map."""
+    return path.suffix.lower() in (*NETCDF, ZARR)
+
+
+def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
+    """A map, and notes on variables that are not shown.
+
+    Args:
+        source: NetCDF file or Zarr folder of ``wrf-mi map``, or an ``xarray.Dataset`` of the same form: variables over
+            (receiver, y, x) or (y, x) with coordinates ``x`` and ``y`` in metres and a scalar ``height``, or over
+            (receiver, point) or (point) with ``x``, ``y`` and ``z``.
+
+    Raises:
+        InputError: a file that cannot be read or is no such map, or xarray is not installed.
+    """
+    if not isinstance(source, str | Path):
+        return _content(source, "map")
+    path = Path(source)
+    try:
+        xarray = import_module("xarray")
+    except ModuleNotFoundError:
+        raise InputError(f"{path}: maps need xarray; install it: pip install 'wrf-mi[view]'") from None
+    missing = f"{path}: no such file; give a map made by wrf-mi map"
+    opened = xarray.open_zarr if path.suffix.lower() == ZARR else xarray.open_dataset
+    with readable(path, missing, "make the map anew"), opened(path) as dataset:
+        return _content(dataset.load(), path.name)
+
+
+def _content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
+    points = POINT in dataset.dims
+    needed = ("x", "y", "z") if points else ("x", "y", "height")
+    if lacking := [axis for axis in needed if axis not in dataset.coords]:
+        raise InputError(f"{name}: no coordinate {', '.join(lacking)}, so no map of wrf-mi map; give one")
+    plane = (POINT,) if points else ("y", "x")
+    values, labels, skipped = {}, {}, []
+    for key, variable in dataset.data_vars.items():
+        if variable.dtype.kind not in "fiub" or set(variable.dims) not in (set(plane), {RECEIVER, *plane}):
+            skipped.append(str(key))
+            continue
+        given = variable if RECEIVER in variable.dims else variable.expand_dims(RECEIVER)
+        values[str(key)] = np.asarray(given.transpose(RECEIVER, *plane), np.float32)
+        units = str(variable.attrs.get("units", ""))
+        words = str(variable.attrs.get("long_name", key)).replace("_", " ")
+        labels[str(key)] = f"{words} ({units})" if units not in ("", "1") else words
+    if not values:
+        raise InputError(f"{name}: no numbers over {' and '.join(plane)} in it; give a map made by wrf-mi map")
+    receivers = tuple(str(one) for one in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
+    x_m, y_m = (np.asarray(dataset[axis], float) for axis in "xy")
+    z_m = np.asarray(dataset["z"], float) if points else None
+    height_m = None if points else float(dataset["height"])
+    notes = [f"Map {name}: {', '.join(skipped)} not shown, no numbers over {' and '.join(plane)}."] if skipped else []
+    return MapContent(name, height_m, x_m, y_m, z_m, receivers, values, labels), notes
+
+
+def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[MapContent], list[str]]:
+    """Maps with at most ``most`` values in all, of every k-th position along each axis, and a note where k > 1."""
+    step = 1
+    while sum(_size(one, step) for one in maps) > most:
+        step += 1
+    if step == 1:
+        return list(maps), []
+    every = slice(None, None, step)
+    found = []
+    for one in maps:
+        if one.z_m is None:
+            values = {name: v[:, every, every] for name, v in one.values.items()}
+            found.append(replace(one, x_m=one.x_m[every], y_m=one.y_m[every], values=values))
+        else:
+            part = slice(None, None, step * step)
+            values = {name: v[:, part] for name, v in one.values.items()}
+            found.append(replace(one, x_m=one.x_m[part], y_m=one.y_m[part], z_m=one.z_m[part], values=values))
+    return found, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
+
+
+def _size(one: MapContent, step: int) -> int:
+    """Number of values of a thinned map."""
+    thinner = step if one.z_m is None else step * step
+    shapes = [values.shape for values in one.values.values()]
+    return sum(math.prod((shape[0], *(-(-size // thinner) for size in shape[1:]))) for shape in shapes)

@@ -1,0 +1,47 @@
+"""Arrays in 16 bits as text, for pages that hold their data."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+LARGEST = 65534
+"""Number of steps of a range."""
+MISSING = 65535
+"""Code of a value that is not finite."""
+
+
+def packed(values: ArrayLike) -> dict[str, Any]:
+    """Numbers as 16-bit codes of equal steps over their range, for `unpack` of ``page.js``.
+
+    Args:
+        values: real numbers of any shape; integers over a range of at most `LARGEST` are exact, other numbers are
+            rounded to a 65534th of their range, and values that are not finite become NaN.
+
+    Returns:
+        ``shape``, ``low``, ``step`` and ``codes``: base64 of little-endian unsigned 16-bit integers c in the order of
+        the last axis, of values low + c * step.
+    """
+    array = np.asarray(values)
+    numbers = array.astype(float)
+    finite = np.isfinite(numbers)
+    known = numbers[finite]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    exact = array.dtype.kind in "iub" and high - low <= LARGEST
+    step = 1.0 if exact or high == low else (high - low) / LARGEST
+    codes = np.full(array.shape, MISSING, "<u2")
+    codes[finite] = np.round((known - low) / step)
+    return {
+        "shape": list(array.shape),
+        "low": low,
+        "step": step,
+        "codes": base64.b64encode(codes.tobytes()).decode("ascii"),
+    }
+
+
+def packed_bytes(count: int) -> int:
+    """Size in a page of that many packed numbers."""
+    return count * 8 // 3

@@ -1,0 +1,213 @@
+"""Layers of a view that show a run: held-out rows, observations, Gaussians and paths."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..core.angles import FloatArray
+from ..core.paths import Paths
+from ..core.types import IntArray
+from ..models.gaussian.model import FittedField
+from ..models.ray_tracing import CORRECTED, PATHS
+from ..runs.folder import SPLIT
+from ..runs.results import Results
+from ..runs.run import Run
+from ..runs.scene_view import gaussian_cloud
+from ..tasks import TASKS
+from ..tracing import TraceOptions, TraceResult, load_trace, open_scene, trace_paths
+from .content import GaussiansContent, PathsContent, RowsContent, ViewOptions
+from .pack import packed
+
+IMAGE_BYTES = 4_000_000
+"""Bytes of a page for observations that are images, at most."""
+PATH_NUMBERS = 1_000_000
+"""Coordinates of all paths of a page, at most: 2.7 MB."""
+WEAKEST_GAIN = 1e-20
+KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
+"""Words for Sionna RT's ``InteractionType``."""
+OnStage = Callable[[str, float], None]
+"""Progress callback: stage and fraction done."""
+
+
+def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | None, list[str]]:
+    """Held-out rows of known positions with their observations, and notes."""
+    task = TASKS[results.task]
+    placed = np.flatnonzero(np.isfinite(results.tx_pos_m).all(axis=1))
+    if not len(placed):
+        return None, ["The positions of the held-out rows are not known."]
+    score = results.score[:, placed]
+    most = options.transmitters
+    if task.image:
+        height, width = results.truth.shape[-2:]
+        most = min(most, max(1, IMAGE_BYTES // (2 * len(results.receivers) * height * width * 4 // 3)))
+    chosen = placed[stored := representative(score, most)]
+    notes = []
+    if len(stored) < len(placed):
+        text = f"evenly over the order of their {task.label} (option --transmitters)"
+        notes.append(f"Transmitters: {len(stored)} of {len(placed)} held-out rows, {text}.")
+    observed = observations_of(results, chosen)
+    rows = results.row[placed], results.tx_pos_m[placed], score
+    words = task.label, task.digits, task.higher_is_better
+    return RowsContent(*rows, *words, stored, observed, task.quantity), notes
+
+
+def representative(score: FloatArray, count: int) -> IntArray:
+    """Indices, ascending, of at most ``count`` rows evenly over the order of their mean scores [n_rx, m].
+
+    Rows that nobody received come last in that order, and are taken only if all are.
+    """
+    received = np.isfinite(score)
+    total = np.where(received, score, 0.0).sum(axis=0)
+    mean = np.where(received.any(axis=0), total / np.maximum(received.sum(axis=0), 1), np.inf)
+    order = np.argsort(mean, kind="stable")
+    if count >= len(order):
+        return np.arange(len(order))
+    heard = order[: max(int(np.isfinite(mean).sum()), 1)]
+    return np.unique(heard[np.round(np.linspace(0, len(heard) - 1, min(count, len(heard)))).astype(int)])
+
+
+def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
+    """Measured and predicted observations of some test rows for the page.
+
+    Returns:
+        ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
+        receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
+    """
+    task = TASKS[results.task]
+    both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}
+    if task.image:
+        size = list(results.truth.shape[-2:])
+        return {"kind": "image", "size": size} | {
+            key: [[png(one) for one in part] for part in both[key]] for key in both
+        }
+    if task.axes == 0:
+        return {"kind": "level"} | {key: packed(values) for key, values in both.items()}
+    return {"kind": "curve"} | {key: packed(power_db(values)) for key, values in both.items()}
+
+
+def power_db(channels: NDArray[Any]) -> FloatArray:
+    """Power of channels [n_rx, m, k] or [n_rx, m, antennas, k] in dB, mean over antennas, [n_rx, m, k]."""
+    power = np.square(np.abs(channels)).reshape(*channels.shape[:2], -1, channels.shape[-1]).mean(axis=2)
+    return np.asarray(10 * np.log10(np.where(power > 0, power, np.nan)))
+
+
+def png(grey: NDArray[Any]) -> str | None:
+    """Data URI of a spectrum [H, W] in 0..1, its highest elevation at the top; None where it is not finite."""
+    if not np.isfinite(grey).all():
+        return None
+    image = Image.fromarray(np.round(255 * np.clip(grey[::-1], 0, 1)).astype(np.uint8), mode="P")
+    image.putpalette((255 * colormaps["viridis"](np.arange(256))[:, :3]).round().astype(np.uint8).tobytes())
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+
+
+def gaussians_content(
+    run: Run, tx_pos_m: FloatArray, options: ViewOptions, on_stage: OnStage
+) -> tuple[GaussiansContent | None, list[str]]:
+    """The strongest Gaussians of a run for some transmitters [t, 3], and notes; None where it has none."""
+    if not run.metrics.get("gaussians"):
+        return None, []
+    if not (run.folder / SPLIT).exists():
+        return None, [f"Gaussians: one field for each fold; view one of them, such as {run.folder / 'fold0'}."]
+    fitted = run.fitted
+    if not isinstance(fitted, FittedField) or fitted.form.features:
+        return None, ["Gaussians: their signals depend on the uplink, not on a transmitter's position."]
+    clouds = []
+    for index, position in enumerate(tx_pos_m):
+        on_stage("evaluating Gaussians", index / len(tx_pos_m))
+        clouds.append(gaussian_cloud(fitted.predictor.gaussians(position[None])))
+    strength = np.stack([cloud.strength_db for cloud in clouds])
+    order = np.argsort(-np.mean(10 ** (strength / 10), axis=0), kind="stable")[: options.gaussians]
+    scale, rotation = (
+        np.stack([getattr(cloud, name)[order] for cloud in clouds]) for name in ("scale_m", "rotation_xyzw")
+    )
+    if (scale == scale[:1]).all() and (rotation == rotation[:1]).all():
+        scale, rotation = scale[:1], rotation[:1]
+    total = strength.shape[1]
+    notes = []
+    if len(order) < total:
+        notes.append(
+            f"Gaussians: the {len(order)} of {total} of the largest mean power over the stored transmitters "
+            "(option --gaussians)."
+        )
+    return GaussiansContent(clouds[0].position_m[order], scale, rotation, strength[:, order], total), notes
+
+
+def run_scene(run: Run, frequency_hz: float) -> Any | None:
+    """The scene of a run at a carrier in Hz, as its calibration left it; None where it has none."""
+    corrected = run.folder / CORRECTED
+    return open_scene(corrected, frequency_hz) if corrected.is_dir() else run.problem.open_scene(frequency_hz)
+
+
+def paths_content(
+    run: Run,
+    rows: IntArray,
+    tx_pos_m: FloatArray,
+    scene: Any | None,
+    options: ViewOptions,
+    on_stage: OnStage,
+    progress: bool,
+) -> tuple[PathsContent | None, list[str]]:
+    """Paths of some rows at positions [t, 3], stored ones or traced in the run's scene, and notes."""
+    if (run.folder / PATHS).exists():
+        on_stage("reading paths", 0.0)
+        traced, source = load_trace(run.folder / PATHS).of_transmitters(rows), "as stored in the run"
+    elif scene is not None:
+        on_stage("tracing paths", 0.0)
+        traced = _traced(run, scene, tx_pos_m, progress)
+        depth = traced.options.max_depth
+        source = f"traced for this view in {run.config.scene}, at most {depth} interactions, {traced.rays} rays"
+    else:
+        return None, []
+    found = path_layer(traced, options.paths)
+    notes = [f"Paths: {source}."]
+    if len(found.tx) < len(traced.paths):
+        text = f"the strongest {len(found.tx)} of {len(traced.paths)}"
+        notes.append(f"Paths: {text}, at most {options.paths} of each transmitter to each receiver.")
+    return found, notes
+
+
+def _traced(run: Run, scene: Any, tx_pos_m: FloatArray, progress: bool) -> TraceResult:
+    """Paths by the options that the run's settings state, else by those of `wrf_mi.tracing`."""
+    settings, record = run.config.settings, run.problem.record
+    stated = getattr(settings, "traced", settings)
+    options = getattr(stated, "options", None)
+    options = options if isinstance(options, TraceOptions) else TraceOptions()
+    return trace_paths(scene, tx_pos_m, record.receivers, options, progress, tx_antenna=record.tx_antenna)
+
+
+def path_layer(traced: TraceResult, most: int) -> PathsContent:
+    """The strongest ``most`` paths of each transmitter to each receiver."""
+    paths = traced.paths
+    gain_db = 20 * np.log10(np.maximum(np.abs(paths.gain), WEAKEST_GAIN))
+    pair = paths.tx + paths.n_tx * paths.rx
+    order = np.lexsort((-gain_db, pair))
+    rank = np.arange(len(order)) - np.searchsorted(pair[order], pair[order])
+    kept = np.sort(order[rank < min(most, _affordable(paths))])
+    paths, gain_db = paths.select(kept), gain_db[kept]
+    bounces = paths.bounces
+    receivers_m = np.stack([receiver.position_m for receiver in traced.receivers])
+    corners = [np.zeros((0, 3))]
+    for index in range(len(paths)):
+        inside = paths.vertices_m[index, : int(bounces[index])]
+        ends = traced.tx_pos_m[paths.tx[index]], receivers_m[paths.rx[index]]
+        corners += [ends[0][None], inside, ends[1][None]]
+    codes, kind = np.unique(paths.interactions, axis=0, return_inverse=True)
+    words = tuple(", ".join(KINDS[int(code)] for code in row if code) or "line of sight" for row in codes)
+    return PathsContent(
+        paths.tx, paths.rx, bounces, kind.reshape(-1), words, gain_db, paths.length_m, np.concatenate(corners)
+    )
+
+
+def _affordable(paths: Paths) -> int:
+    """Number of paths of each pair of devices that a page has room for."""
+    return max(1, PATH_NUMBERS // (3 * (paths.interactions.shape[1] + 2) * max(1, paths.n_tx * paths.n_rx)))
