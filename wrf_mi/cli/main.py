@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from .. import __version__
 from ..core import BackendError, InputError
 from ..core.files import os_failure
-<<<<<<< HEAD
 from . import (
     bench,
     compare,
@@ -36,7 +35,26 @@ from . import (
 )
 from .options import Parser
 
-COMMANDS = (doctor, data, mesh, correct, edit, train, trace, sweep, evaluate, predict, map, locate, compress, compare, view, export, bench, demo)
+COMMANDS = (
+    doctor,
+    data,
+    mesh,
+    correct,
+    edit,
+    train,
+    trace,
+    sweep,
+    evaluate,
+    predict,
+    map,
+    locate,
+    compress,
+    compare,
+    view,
+    export,
+    bench,
+    demo,
+)
 
 
 def build_parser() -> Parser:
