@@ -8,7 +8,9 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["wrf_mi.checking.check", "wrf_mi.core.receivers", "wrf_mi.runs.api"])
+@pytest.mark.parametrize(
+    "name", ["wrf_mi.checking.check", "wrf_mi.core.receivers", "wrf_mi.runs.api", "wrf_mi.viewer.view"]
+)
 def test_examples_of_docstrings_run(name: str) -> None:
     results = doctest.testmod(importlib.import_module(name))
     assert results.attempted > 0

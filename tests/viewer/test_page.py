@@ -32,7 +32,7 @@ DATA = r'<script id="content" type="application/json">(.*?)</script>'
 
 
 def unpacked(stored: dict[str, Any]) -> np.ndarray:
-    """What ``unpack`` of page.js gives."""
+    """What ``unpack`` of tools.js gives."""
     codes = np.frombuffer(base64.b64decode(stored["codes"]), "<u2").reshape(stored["shape"])
     return np.where(codes == MISSING, np.nan, stored["low"] + codes * stored["step"])
 

@@ -15,7 +15,7 @@ MISSING = 65535
 
 
 def packed(values: ArrayLike) -> dict[str, Any]:
-    """Numbers as 16-bit codes of equal steps over their range, for `unpack` of ``page.js``.
+    """Numbers as 16-bit codes of equal steps over their range, for ``unpack`` of ``tools.js``.
 
     Args:
         values: real numbers of any shape; integers over a range of at most `LARGEST` are exact, other numbers are
@@ -40,8 +40,3 @@ def packed(values: ArrayLike) -> dict[str, Any]:
         "step": step,
         "codes": base64.b64encode(codes.tobytes()).decode("ascii"),
     }
-
-
-def packed_bytes(count: int) -> int:
-    """Size in a page of that many packed numbers."""
-    return count * 8 // 3

@@ -59,17 +59,19 @@ def page(content: ViewContent) -> str:
     Raises:
         InputError: plotly is not installed.
     """
-    parts = {name: files(__package__).joinpath(f"page.{name}").read_text("utf-8") for name in ("html", "css", "js")}
+    names = ("page.html", "page.css", "tools.js", "page.js")
+    template, style, tools, script = (files(__package__).joinpath(name).read_text("utf-8") for name in names)
     # No text of the data can end the element that holds it.
     data = json.dumps(page_data(content), allow_nan=False).replace("<", "\\u003c")
     fields = {
         "title": html.escape(content.title),
-        "style": parts["css"],
+        "style": style,
         "plotly": plotly_js(),
         "data": data,
-        "script": parts["js"],
+        "tools": tools,
+        "script": script,
     }
-    pieces = parts["html"].split("%%")  # texts at even places, names of fields at odd ones
+    pieces = template.split("%%")  # texts at even places, names of fields at odd ones
     return "".join(fields[piece] if index % 2 else piece for index, piece in enumerate(pieces))
 
 
