@@ -28,10 +28,12 @@ from scipy.constants import speed_of_light
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray, unit_vectors
 from ..core.antenna import DEVICE_TO_ARRAY
-from ..core.files import readable, stored_arrays, text_lines
+from ..core.array_files import stored_array, stored_arrays
+from ..core.files import readable, text_lines
 from ..core.types import IntArray
+from ..core.yaml_files import read_yaml
 from .deepmimo_params import ALL, BASE_STATIONS, CHANNEL_PARAMS, ChannelParams, channel_params
-from .folder_files import data_folder, numbers_of, read_official, read_yaml, shown
+from .folder_files import data_folder, numbers_of, read_official, shown
 
 PARAMS = "params.json"
 OLD_PARAMS = "params.mat"
@@ -225,7 +227,7 @@ def _matrix(folder: Path, key: str, pair: str) -> NDArray[Any]:
         raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
     with readable(file, "", "fetch the scenario again"):
         if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False)
+            values = stored_array(file)
         else:
             values = (loadmat(file) if file.suffix == ".mat" else stored_arrays(file)).get(key)
     if values is None or values.dtype.kind not in "fiu":

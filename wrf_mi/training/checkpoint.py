@@ -1,4 +1,4 @@
-"""Files of a training run in progress, each written atomically.
+"""Files of a training run in progress: whole at any moment, also on a full disk.
 
 checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
 log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_score, held_out, gaussians
@@ -7,6 +7,7 @@ log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,10 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError
-from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import append_line, readable, write_atomically
 
 if TYPE_CHECKING:
     from .loop import Progress, TrainingLoop
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 6
 """Version of ``checkpoint.npz``."""
@@ -30,7 +34,7 @@ CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 def write_checkpoint(folder: Path, loop: TrainingLoop, beside: Mapping[str, NDArray[Any]] | None = None) -> None:
     """Write ``checkpoint.npz``, with further arrays ``beside`` the loop's state."""
     header = {"format": np.asarray(FORMAT), "seconds": np.asarray(loop.seconds)}
-    write_arrays(folder / CHECKPOINT, {**loop.state.arrays(), **header, **(beside or {})})
+    write_arrays(folder / CHECKPOINT, {**loop.state.arrays(), **header, **(beside or {})}, checksum=True)
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
@@ -64,13 +68,26 @@ def append_log(folder: Path, progress: Progress) -> None:
     del entry["left_s"], entry["label"]
     if progress.validation_score is not None and math.isnan(progress.validation_score):
         entry["validation_score"] = None  # there are no validation rows, and JSON has no NaN
-    with (folder / LOG).open("a") as stream:
-        stream.write(json.dumps(entry) + "\n")
+    append_line(folder / LOG, json.dumps(entry))
 
 
 def cut_log(folder: Path, step: int) -> None:
-    """Drop lines after ``step``, the step of the checkpoint from which a run resumes."""
+    """Drop lines after ``step``, the step of the checkpoint from which a run resumes, and damaged ones (logged)."""
     path = folder / LOG
-    if path.is_file():
-        lines = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]
-        write_atomically(path, "".join(f"{line}\n" for line in lines))
+    if not path.is_file():
+        return
+    written = [line for line in path.read_bytes().splitlines() if line]
+    steps = [_step_of(line) for line in written]
+    if damaged := steps.count(None):
+        logger.warning("%s: %d damaged lines left out", path, damaged)
+    lines = [line + b"\n" for line, at in zip(written, steps, strict=True) if at is not None and at <= step]
+    write_atomically(path, b"".join(lines))
+
+
+def _step_of(line: bytes) -> int | None:
+    """Step of a line of the log; None if it is damaged."""
+    try:
+        at = json.loads(line)["step"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return at if isinstance(at, int) else None

@@ -29,7 +29,7 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from .adam import NonFiniteReport
 from .config import TrainConfig
-from .fields import field_of
+from .fields import check_memory, field_of
 from .initial import initial_gaussians
 from .loop import TrainingLoop
 from .predictor import Predictor
@@ -105,9 +105,12 @@ class Trainer(TrainingLoop):
         self.record, self.split, self.config = record, split, config
         self.targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, self.targets, known, scene is not None)
+        field = field or field_of(config, form)
+        if field is not None:
+            check_memory(config, field)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(
-            field or field_of(config, form),
+            field,
             receivers,
             form,
             scene,
