@@ -118,6 +118,7 @@ _OWN: Mapping[str, Check] = {
     "new-receivers": _here("receivers without measurements, and with few", "unmeasured:receivers", FLAT, resumes=True),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),
+    "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "sentinels": _here(
         "figures kept",
         "sentinels:main",

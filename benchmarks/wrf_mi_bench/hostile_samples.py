@@ -140,19 +140,33 @@ def warm() -> None:
         __import__(name)
 
 
+def prepare_spectra(folder: Path) -> Record:
+    """Write a folder of twelve small spectra."""
+    rng = np.random.default_rng(0)
+    receiver = Receiver("gateway1", np.array([0.0, 0, 1]), UP, array_m=np.array([[0.1, 0, 0], [-0.1, 0, 0]]))
+    record = Record(
+        "spectra",
+        "spectrum",
+        rng.uniform(1, 4, (12, 3)),
+        (receiver,),
+        rng.uniform(0, 1, (1, 12, 9, 36)).astype(np.float32),
+        official=(np.arange(8), np.arange(8, 12)),
+        frequencies_hz=np.array([CARRIER_HZ]),
+    )
+    write_spectrum_folder(folder, record)
+    return record
+
+
 def prepare(folder: Path) -> None:
     """Write all samples, if they are not there."""
     if (folder / "done").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
     rng = np.random.default_rng(0)
-    positions = rng.uniform(1, 4, (12, 3))
-    official = np.arange(8), np.arange(8, 12)
-    receiver = Receiver("gateway1", np.array([0.0, 0, 1]), UP, array_m=np.array([[0.1, 0, 0], [-0.1, 0, 0]]))
-    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": (receiver,), "official": official}
-    common["frequencies_hz"] = np.array([CARRIER_HZ])
-    spectra = rng.uniform(0, 1, (1, 12, 9, 36)).astype(np.float32)
-    write_spectrum_folder(folder / "spectra", Record("spectra", "spectrum", observation=spectra, **common))
+    made = prepare_spectra(folder / "spectra")
+    positions = made.tx_pos_m
+    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
+    common["frequencies_hz"] = made.frequencies_hz
     anchors = tuple(Receiver(f"anchor{k}", np.array([float(k), 0, 1]), UP) for k in (1, 2))
     strengths = Record("ble", "rssi", observation=rng.uniform(-80, -40, (2, 12)), **{**common, "receivers": anchors})
     write_ble_folder(folder / "ble", strengths)

@@ -254,7 +254,8 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        raise DataFault(path, f"{one_line(name)} is {shown(array)}; {remedy}")
+        found = shown(array if isinstance(array, dict) else str(array))
+        raise DataFault(path, f"{one_line(name)} is {found}; {remedy}")
     return elements
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,9 +13,10 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.array_files import stored_arrays
+from ..core.array_files import stored_array, stored_arrays
 from ..core.files import one_line
 from ..core.memory import require_memory
+from ..parallel import run_module
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -25,6 +27,8 @@ LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 MOST_LAZ = 1000
 """Largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred."""
+LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
+"""Address space of the process that reads LAZ beside its points, and the time that it has."""
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
 VOXEL_M = 0.03
@@ -136,19 +140,23 @@ def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray
 def _read_las(file: Path) -> Any:
     """Points of a LAS or LAZ file, whose header must not state more than the file can hold."""
     size = file.stat().st_size
-    try:
-        with lidar_package("laspy").open(file) as source:
-            header = source.header
-            needed = header.point_count * header.point_format.size
-            if needed > size * (MOST_LAZ if header.are_points_compressed else 1):
-                raise ValueError(f"states {header.point_count} points, and has {size} bytes")
-            require_memory(4 * needed, f"{file}: {header.point_count} points", "thin the cloud first")
+    laspy = lidar_package("laspy")
+    with laspy.open(file) as source:
+        header = source.header
+        packed, needed = header.are_points_compressed, header.point_count * header.point_format.size
+        if needed > size * (MOST_LAZ if packed else 1):
+            raise ValueError(f"states {header.point_count} points, and has {size} bytes")
+        require_memory(4 * needed, f"{file}: {header.point_count} points", "thin the cloud first")
+        if not packed:
             return source.read().xyz
-    except BaseException as error:
-        # Panics of the decompressor are no Exception.
-        if isinstance(error, Exception) or type(error).__name__ != "PanicException":
-            raise
-        raise ValueError(one_line(error)) from None
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "points.npy"
+        arguments = [str(file), str(out), str(LAZ_BYTES + 4 * needed)]
+        seconds = LAZ_S + size / LAZ_BYTES_PER_S
+        status, message = run_module("wrf_mi.scene.read_laz", arguments, quiet=True, most_s=seconds)
+        if status != 0:
+            raise ValueError(message if status == 1 else "its compressed points are damaged")
+        return stored_array(out)
 
 
 def _read(file: Path) -> Any:

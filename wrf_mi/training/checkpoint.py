@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 FORMAT = 6
 """Version of ``checkpoint.npz``."""
+GROUPS = ("param", "mean", "first", "second")
+"""Groups of arrays with equal names and shapes: parameters, their running mean, and Adam's moments."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
 
 
@@ -50,7 +52,26 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
         version = int(arrays["format"])
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    for lead in ("", "best/"):
+        _check_state(path, arrays, lead)
     return arrays
+
+
+def _check_state(path: Path, arrays: Mapping[str, NDArray[Any]], lead: str) -> None:
+    """Refuse parameters, means and moments that do not fit together or are not finite; keys begin with ``lead``."""
+    shapes = {}
+    for group in GROUPS:
+        start = f"{lead}{group}/"
+        held = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+        shapes[group] = {name: values.shape for name, values in held.items()}
+        for name, values in held.items():
+            if values.dtype != np.float32 or not np.isfinite(values).all():
+                raise InputError(f"{path}: {start}{name} is not finite in single precision; train the run anew")
+        if shapes[group] != shapes[GROUPS[0]]:
+            raise InputError(f"{path}: {start}* has other shapes than {lead}{GROUPS[0]}/*; train the run anew")
+    gaussians = shapes[GROUPS[0]].get("position", (3, 0))[-1]
+    if (norm := arrays.get(f"{lead}view_gradient_norm")) is not None and norm.shape != (max(gaussians, 1),):
+        raise InputError(f"{path}: {lead}view_gradient_norm has shape {norm.shape}; train the run anew")
 
 
 def checkpoint_seconds(folder: Path) -> float:

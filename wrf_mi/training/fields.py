@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend import init
 from ..core import InputError, Receiver
@@ -67,6 +69,32 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
         sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
     return FIELDS[model](encoding=encoding, components=components, **sizes)
+
+
+def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
+    """Refuse parameters of a file that are not those of a field: the backend ends the process on other shapes.
+
+    Args:
+        field: the field; None: paths alone.
+        params: parameters by name, those of paths included.
+        source: file, for messages.
+
+    Raises:
+        InputError: a parameter that is missing, of another shape, or not finite.
+    """
+    for name, values in params.items():
+        if values.ndim != 2 or values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise InputError(f"{source}: parameter {name} is not a matrix of finite numbers; train the run anew")
+    if field is None:
+        return
+    place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
+    count = params["position"].shape[1] if "position" in params else 0
+    for name, like in field.init(random_gaussians([place], 4, rng), rng).items():
+        wanted = (like.shape[0], count) if name in field.per_gaussian else like.shape
+        found = params[name].shape if name in params else "none"
+        if found != wanted or not count:
+            text = f"parameter {name} of shape {found}, where the settings need {wanted}"
+            raise InputError(f"{source}: {text}; train the run anew")
 
 
 def check_memory(config: TrainConfig, field: Field) -> None:
