@@ -237,7 +237,7 @@ def signals_and_pipes(training: Training) -> Iterator[str]:
 
         from wrf_mi.cli.output import Watch
 
-        Watch.on_progress = stop  # type: ignore[method-assign]
+        setattr(Watch, "on_progress", stop)  # noqa: B010
 
     wrong = training.one_line(training.train(out, impatient), INTERRUPTED) or training.finished(out)
     yield wrong and f"Ctrl-C twice: {wrong}"

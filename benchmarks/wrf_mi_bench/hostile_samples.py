@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,11 @@ def _load(folder: Path) -> None:
 
 
 def _of(reader: Callable[..., Any], group: str, *files: str) -> dict[str, Reader]:
-    return {file: Reader(group, file, lambda folder, f=file: reader(folder / f)) for file in files}
+    return {file: Reader(group, file, partial(_read_file, reader, file)) for file in files}
+
+
+def _read_file(reader: Callable[..., Any], file: str, folder: Path) -> Any:
+    return reader(folder / file)
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
@@ -168,7 +173,8 @@ def prepare(folder: Path) -> None:
     common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
     common["frequencies_hz"] = made.frequencies_hz
     anchors = tuple(Receiver(f"anchor{k}", np.array([float(k), 0, 1]), UP) for k in (1, 2))
-    strengths = Record("ble", "rssi", observation=rng.uniform(-80, -40, (2, 12)), **{**common, "receivers": anchors})
+    powers = rng.uniform(-80, -40, (2, 12)).astype(np.float32)
+    strengths = Record("ble", "rssi", observation=powers, **{**common, "receivers": anchors})
     write_ble_folder(folder / "ble", strengths)
     channels = (rng.normal(size=(1, 12, 2, 4)) + 1j * rng.normal(size=(1, 12, 2, 4))).astype(np.complex64)
     hz = CARRIER_HZ + 1e6 * np.arange(4)
@@ -243,11 +249,12 @@ def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None
         samples = rng.integers(-99, 99, (4, 2, 448, 2), dtype=np.int16)
         stored.create_dataset("Pilot_Samples", data=samples, compression="gzip")
         stored.attrs.update({"num_mob_ant": 2, "samples_per_user": 224, "measured_noise": 0})
+    numbers: Any = np.arange(2.0)
     ones: Any = np.ones((2, 3)) / np.sqrt(3)
     kinds, nowhere = np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3))
     rows = np.arange(2)
     paths = Paths(
-        rows, rows * 0, rows + 1j, rows + 1.0, ones, ones, kinds, nowhere, np.zeros((2, 0), np.int32), (), 2, 1
+        rows, rows * 0, numbers + 1j, numbers + 1.0, ones, ones, kinds, nowhere, np.zeros((2, 0), np.int32), (), 2, 1
     )
     save_paths(folder / "paths.npz", paths)
     save_split(folder / "split.npz", Split("own", 0, np.arange(6), np.arange(6, 8), np.arange(8, 12)))

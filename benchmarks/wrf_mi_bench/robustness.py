@@ -21,7 +21,8 @@ INPUTS, QUICK_INPUTS = 2000, 50
 """Inputs of each reader."""
 SLOW = {"points: cloud.laz": 0.1, "run: operator0.npz": 0.1, "scene: scene.xml": 0.25, "scene: floor.ply": 0.25}
 """Share of the inputs for readers that start a process, build an operator or open a scene."""
-QUICK_KILLS = 3
+QUICK_KILLS, TOGETHER = 3, 8
+"""Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")
 NEVER = "0 wrong"
 
@@ -72,9 +73,11 @@ def main() -> dict[str, Any]:
             total["failed"] += found["failed"]
         shutil.rmtree(folder, ignore_errors=True)
     files = []
-    for number, name in enumerate(READERS):
-        count = round(INPUTS * SLOW.get(name, 1))
-        files += kept(place / f"reader{number}.json", partial(run_readers, place / "files", [name], count))
+    fast = [name for name in READERS if name not in SLOW]
+    groups = [(fast[k : k + TOGETHER], INPUTS) for k in range(0, len(fast), TOGETHER)]
+    groups += [([name], round(INPUTS * share)) for name, share in SLOW.items()]
+    for number, (names, count) in enumerate(groups):
+        files += kept(place / f"readers{number}.json", partial(run_readers, place / "files", names, count))
     shutil.rmtree(place / "files", ignore_errors=True)
     return _result(trainings, files)
 

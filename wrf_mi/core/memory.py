@@ -30,7 +30,7 @@ def free_bytes() -> int:
         most, _ = resource.getrlimit(limit)
         if most != resource.RLIM_INFINITY:
             free.append(most - taken)
-    return max(min(free), 0)
+    return max(int(min(free)), 0)
 
 
 def _cgroup_bytes() -> Iterator[int]:

@@ -227,7 +227,7 @@ def _matrix(folder: Path, key: str, pair: str) -> NDArray[Any]:
         raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
     with readable(file, "", "fetch the scenario again"):
         if file.suffix == ".npy":
-            values = stored_array(file)
+            values: Any = stored_array(file)
         else:
             values = (loadmat(file) if file.suffix == ".mat" else stored_arrays(file)).get(key)
     if values is None or values.dtype.kind not in "fiu":

@@ -185,7 +185,7 @@ class _Unpickler(pickle.Unpickler):
 def _check_pickle(content: bytes) -> None:
     """Refuse a pickle that would take more memory than its size allows: Python makes room for what it states."""
     for code, argument, _ in pickletools.genops(content):
-        if code.name in ("PUT", "BINPUT", "LONG_BINPUT") and argument > len(content):
+        if code.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > len(content):
             raise ValueError(f"place {argument} in a list of at most {len(content)} objects")
 
 

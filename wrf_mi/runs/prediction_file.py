@@ -168,7 +168,7 @@ class PredictionSpool:
         if needed > SPOOLED_BYTES and needed > (free := shutil.disk_usage(self._folder).free):
             text = f"predictions take {needed / 2**30:.3g} GiB, and {free / 2**30:.3g} GiB of the disk are free"
             raise InputError(f"{self._folder}: {text}; predict fewer positions at a time, or choose another disk")
-        return tempfile.SpooledTemporaryFile(SPOOLED_BYTES, dir=self._folder)
+        return tempfile.SpooledTemporaryFile(SPOOLED_BYTES, dir=str(self._folder))
 
     def streams(self) -> dict[str, ArrayStream]:
         """``prediction`` and, if stated, ``std`` [receivers, positions, ...], for `wrf_mi.core.files.write_arrays`."""
