@@ -47,7 +47,8 @@ def hall(tmp_path: Path) -> Record:
 
 
 def names(record: Record) -> list[str]:
-    return [one.name for one in check_data(record).suspicions if one.name in ("walls", "inside-solids", "wall-vertices", "building")]
+    known = ("walls", "inside-solids", "wall-vertices", "building")
+    return [one.name for one in check_data(record).suspicions if one.name in known]
 
 
 def test_positions_within_the_hall_are_not_suspected(hall: Record) -> None:
