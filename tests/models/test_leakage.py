@@ -50,7 +50,7 @@ def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arra
     scene = None
     if MODELS[name].scene == "required":
         scene = str(folder / "room.ply")
-        trimesh.creation.box((8, 8, 3)).export(scene)
+        trimesh.creation.box((20, 20, 10)).export(scene)
     entry = MODELS[name].serving(record.task, scene is not None)
     given = {"model": name, "seed": 0, "deterministic": True}
     settings = default_settings(entry, SETTINGS.get(name, ()), given)
@@ -76,5 +76,6 @@ def test_test_rows_do_not_reach_the_fit(name: str, one_gateway: Record, flat_fol
         found.append(fitted_arrays(name, version, split, folder))
     clean, other = found
     assert clean.keys() == other.keys()
-    for key, values in clean.items():
+    for key in clean.keys() - {"trace_seconds"}:
+        values = clean[key]
         np.testing.assert_array_equal(np.asarray(values), np.asarray(other[key]), err_msg=key)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend import init
 from ..core import InputError, Receiver
 from ..core.memory import require_memory
 from ..gaussians import FIELDS, Encoding, random_gaussians
@@ -83,8 +83,8 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
         InputError: a parameter that is missing, of another shape, or not finite.
     """
     for name, values in params.items():
-        if values.ndim != 2 or values.dtype.kind != "f" or not np.isfinite(values).all():
-            raise InputError(f"{source}: parameter {name} is not a matrix of finite numbers; train the run anew")
+        if values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
     if field is None:
         return
     place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
@@ -117,6 +117,6 @@ def check_memory(config: TrainConfig, field: Field) -> None:
     pairs = count * config.batch
     if pairs * widest > MOST_NUMBERS:
         raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
-    if init().name == "llvm":
+    if not (mi.variant() or "").startswith("cuda"):
         step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
         require_memory(step + BYTES_PER_NUMBER * count * own, f"{what}a training step", remedy)
