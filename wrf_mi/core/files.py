@@ -13,6 +13,9 @@ from typing import Any
 
 from .errors import DataFault, InputError
 
+LONGEST = 300
+"""Most characters of another library's message: some hold the damaged content."""
+
 
 def one_line(error: object) -> str:
     """The message of another library's error on one line."""
@@ -118,7 +121,7 @@ def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[Non
     except InputError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
+        raise DataFault(path, f"not readable ({one_line(error)[:LONGEST]}); {remedy}") from None
 
 
 LEFTOVER = re.compile(r"\.(.+)\.(\d+)\.(part|old)")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-PICTURE_ERRORS = (OSError, SyntaxError, ValueError, struct.error, zlib.error, Image.DecompressionBombError)
+PICTURE_ERRORS = (MemoryError, OSError, SyntaxError, ValueError, struct.error, zlib.error, Image.DecompressionBombError)
 """What Pillow raises on damaged files."""
 
 

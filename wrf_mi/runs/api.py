@@ -277,7 +277,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
                 fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
-            (part / CHECKPOINT).unlink(missing_ok=True)
+        (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(Part(part, rows, *load_fitted(config, problem, part)))
         scores.append(score_part(folder, config, problem, parts[-1]))
     score_run(folder, config, parts, scores)
