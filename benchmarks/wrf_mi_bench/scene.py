@@ -13,7 +13,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.files import write_arrays
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
 from wrf_mi.scene.make import make_scene

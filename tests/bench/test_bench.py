@@ -38,6 +38,7 @@ NEEDS_NO_DATA = (
     "pareto",
     "rooms",
     "phase-error",
+    "robustness",
     "sentinels",
     "new-carriers",
 )

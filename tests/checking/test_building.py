@@ -47,7 +47,8 @@ def hall(tmp_path: Path) -> Record:
 
 
 def names(record: Record) -> list[str]:
-    return [one.name for one in check_data(record).suspicions if one.name in ("walls", "inside-solids", "building")]
+    known = ("walls", "inside-solids", "wall-vertices", "building")
+    return [one.name for one in check_data(record).suspicions if one.name in known]
 
 
 def test_positions_within_the_hall_are_not_suspected(hall: Record) -> None:
@@ -197,3 +198,14 @@ def test_checks_without_the_packages_for_plans_are_stated(tmp_path: Path, monkey
         "positions against layout.csv: scenes from scans need shapely: pip install 'wrf-mi[lidar]'",
     )
     assert any(line.startswith("not checked: positions against layout.csv") for line in report.lines())
+
+
+def test_a_receiver_at_a_vertex_of_the_plan_is_suspected(hall: Record) -> None:
+    first, *others = hall.receivers
+    on_corner = replace(first, position_m=np.array([12.0, 8.0, first.position_m[2]]))
+    found = [one for one in check_data(replace(hall, receivers=(on_corner, *others))).suspicions]
+    (text,) = [one.text for one in found if one.name == "wall-vertices"]
+    count = len(hall.receivers)
+    assert text.startswith(f"1 of {count} receivers are at vertices of walls in layout.csv: {first.name} at (12, 8);")
+    beside = replace(first, position_m=np.array([11.9, 7.9, first.position_m[2]]))
+    assert names(replace(hall, receivers=(beside, *others))) == []

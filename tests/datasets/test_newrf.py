@@ -222,3 +222,17 @@ def test_the_real_data(name: str, rows: int, held_out: int):
     distance = np.linalg.norm(record.tx_pos_m - record.receivers[0].position_m, axis=1)[direct]
     loss = speed_of_light / record.frequencies_hz[0] / (4 * np.pi * distance)
     np.testing.assert_allclose(np.abs(gain[start[direct]]), loss, rtol=1e-9)
+
+
+@pytest.mark.parametrize("strings", ["strings", "arrow"])
+def test_a_table_of_pandas_3_is_read(strings: str):
+    """Written by pandas 3.1.1, whose names of columns are arrays of texts, by NumPy or by Arrow."""
+    columns = read_pickled_table(Path(__file__).parent / "data" / f"pandas-3-{strings}.pkl")
+    np.testing.assert_array_equal(columns["TxID"], [1.0, 2.0])
+    np.testing.assert_array_equal(columns["TxPos"][1], [[1.0, 2.0, 3.0]])
+
+
+def test_a_pickle_that_asks_for_gigabytes_is_refused(tmp_path: Path):
+    (tmp_path / "bad.pkl").write_bytes(b"\x80\x02Nr\xff\xff\xff\x7f.")
+    with pytest.raises(InputError, match=r"place 2147483647 in a list of at most 9 objects"):
+        read_pickled_table(tmp_path / "bad.pkl")

@@ -75,7 +75,7 @@ def test_wrong_scenes_are_refused(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     refused("so not a scene folder", tmp_path / "empty")
     (tmp_path / "empty" / "scene.yml").write_text("xml: 3: 4")
-    refused("not readable", tmp_path / "empty")
+    refused("not YAML", tmp_path / "empty")
     xml = write_xml(tmp_path / "room", SHOEBOX)
     refused("leave out the material", xml, material="concrete")
     refused("not known at 0.1 GHz", xml, 1e8)

@@ -15,7 +15,7 @@ from wrf_mi.backend.probe import try_llvm
 from wrf_mi.cli import train as cli_train
 from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError, Record
-from wrf_mi.core.files import stored_arrays
+from wrf_mi.core.array_files import stored_arrays
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.api import Interrupted, resume, train
 from wrf_mi.scene.make import make_scene

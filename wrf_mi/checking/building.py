@@ -30,6 +30,8 @@ THICKEST_WALL_M = 0.4
 PARALLEL = np.cos(np.radians(5))
 DEEP_M = 0.03
 """Least depth within a wall or a solid: what hangs on a surface is at it, with the error of a tape measure."""
+AT_VERTEX_M = 1e-3
+"""Largest distance from a vertex of a plan that is no coincidence: positions are measured to a centimetre."""
 THICKEST_SOLID_M = 1.0
 """Bodies with all sides longer than this are rooms or buildings, whose inside is air."""
 
@@ -137,6 +139,21 @@ def inside_solids(record: Record, building: Building) -> Found:
         names = named_rows(found) if what == "transmitters" else ", ".join(record.receivers[k].name for k in found)
         text = f"{len(found)} of {len(places)} {what} lie inside walls or solids of {building.source.name}: {names}"
         yield "inside-solids", f"{text}; correct their positions, or the frame of the building"
+
+
+def at_vertices(record: Record, building: Building) -> Found:
+    """Receivers at the vertices of a plan: points of the drawing in place of measured positions."""
+    if not len(building.walls_m):
+        return
+    vertices = building.walls_m.reshape(-1, 2)
+    found = []
+    for receiver in record.receivers:
+        apart = np.linalg.norm(vertices - receiver.position_m[:2], axis=1)
+        if apart.min() <= AT_VERTEX_M:
+            found.append(f"{receiver.name} at ({receiver.position_m[0]:g}, {receiver.position_m[1]:g})")
+    if found:
+        text = f"{len(found)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
+        yield "wall-vertices", f"{text}: {', '.join(found)}; give the antenna's position, in front of the wall"
 
 
 def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:

@@ -11,7 +11,7 @@ from ..datasets.layouts import is_data
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
-from .building import building_file, inside_solids, need_packages, plan_against_walls, read_building
+from .building import at_vertices, building_file, inside_solids, need_packages, plan_against_walls, read_building
 from .directions import spectrum_axes
 from .distances import distance_law
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
@@ -28,6 +28,7 @@ SUSPICIONS = {
     "plan": "transmitters in a plan that is mirrored or turned against that of the receivers",
     "walls": "transmitters outside the building of the folder or across its walls",
     "inside-solids": "receivers or transmitters inside walls or solid bodies",
+    "wall-vertices": "receivers at the vertices of a plan's walls",
     "building": "a plan or mesh beside the data that cannot be read",
     "train-test": "test rows that are training rows too",
     "repeated-rows": "rows that repeat an earlier row",
@@ -122,4 +123,8 @@ def _of_building(record: Record, skipped: list[str]) -> Iterator[tuple[str, str]
         yield "building", f"{error}"
         return
     # Transmitters in another plan are in its walls, too.
-    yield from list(plan_against_walls(record, building)) or inside_solids(record, building)
+    if found := list(plan_against_walls(record, building)):
+        yield from found
+        return
+    yield from inside_solids(record, building)
+    yield from at_vertices(record, building)

@@ -33,7 +33,8 @@ def predict_command(a: Arguments) -> int:
     with open_scheduler(a.scheduler) as scheduler:
         positions = (inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
         workers = scheduler if a.scheduler else None
-        shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, inputs.uplink, inputs.carriers_hz)
+        given: dict[str, Any] = {"uplink": inputs.uplink, "carriers_hz": inputs.carriers_hz}
+        shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
     if a.json:
         print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
     else:

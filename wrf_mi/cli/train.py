@@ -9,10 +9,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ..backend import init
 from ..core import AntennaOptions, InputError
+from ..core.yaml_files import read_yaml
 from .options import Arguments, add_command, add_training
 from .output import Watch, show_metrics
 
@@ -73,8 +72,8 @@ def _resume(a: Arguments) -> int:
 def _is_deterministic(folder: Path) -> bool:
     """Whether a run's settings ask for determinism; read as plain YAML, since `read_config` chooses a backend."""
     try:
-        return bool(yaml.safe_load((folder / "config.yaml").read_text())["deterministic"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+        return bool(read_yaml(folder / "config.yaml").get("deterministic"))
+    except InputError:
         return False  # `read_config` reports the error
 
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .errors import DataFault, InputError
+
+LONGEST = 300
+"""Most characters of another library's message: some hold the damaged content."""
 
 
 def one_line(error: object) -> str:
@@ -65,6 +66,25 @@ def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
     return f"{text}; {remedy}" if remedy else text
 
 
+def inside(folder: Path, name: object, source: Path) -> Path:
+    """The path of a file that another file names, below its folder.
+
+    Args:
+        folder: folder that the file has to be in.
+        name: stated name.
+        source: file that states it, for the message.
+
+    Raises:
+        InputError: no name, or one that leaves the folder.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise DataFault(source, f"{one_line(repr(name))[:60]} is no name of a file; correct it")
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DataFault(source, f"{name[:60]!r} is outside its folder; copy the file there and name it so")
+    return path
+
+
 def text_lines(path: Path) -> list[str]:
     """The lines of a UTF-8 text file without line ends and trailing blank lines.
 
@@ -101,13 +121,44 @@ def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[Non
     except InputError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
+        raise DataFault(path, f"not readable ({one_line(error)[:LONGEST]}); {remedy}") from None
 
 
-def stored_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an ``.npz`` file; call it within `readable`."""
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-        return {key: stored[key] for key in stored.files}
+LEFTOVER = re.compile(r"\.(.+)\.(\d+)\.(part|old)")
+"""Name of a temporary file or folder: the name that it is to take or had, and the number of its process."""
+
+
+def _is_running(process: int) -> bool:
+    """Whether a process of that number runs; this one does not count, as it makes each temporary file once."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return process != os.getpid()
+
+
+def remove_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove temporary files and folders that killed processes left in a folder, at any depth.
+
+    A folder that was to be replaced, and had lost its name, takes it again.
+
+    Args:
+        folder: the folder.
+        name: only leftovers beside the file or folder of this name in ``folder``, not below it.
+    """
+    for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
+        found = LEFTOVER.fullmatch(path.name)
+        if found is None or (name is not None and found[1] != name) or _is_running(int(found[2])):
+            continue
+        with suppress(OSError):
+            if found[3] == "old" and not path.with_name(found[1]).exists():
+                os.replace(path, path.with_name(found[1]))
+            elif path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
 
 
 @contextmanager
@@ -133,6 +184,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     Raises:
         InputError: ``path`` exists and may not be replaced, or cannot be written.
     """
+    remove_leftovers(path.parent, path.name)
     if path.exists() and not replace:
         raise InputError(f"{path}: exists; remove it or choose another folder")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -159,16 +211,20 @@ def write_atomically(path: Path, content: bytes | str) -> Path:
     return path
 
 
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a text file; where the disk is full, the file stays as it was."""
+    with path.open("ab", buffering=0) as stream:
+        before, content = stream.tell(), f"{line}\n".encode()
+        try:
+            while content:
+                content = content[stream.write(content) :]
+        except OSError:
+            stream.truncate(before)
+            raise
+
+
 def write_figure(path: Path, figure: Any, dpi: int = 110) -> Path:
     """Write a Matplotlib figure as PNG atomically."""
     with atomic_file(path) as part:
         figure.savefig(part, format="png", dpi=dpi, metadata={"Software": None})
-    return path
-
-
-def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False) -> Path:
-    """Write an ``.npz`` file of plain arrays atomically."""
-    with atomic_file(path) as part, part.open("wb") as stream:
-        save: Any = np.savez_compressed if compressed else np.savez
-        save(stream, **arrays)
     return path

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import FloatArray
+from .array_files import stored_arrays, write_arrays
 from .errors import InputError
-from .files import readable, stored_arrays, write_arrays
+from .files import readable
 from .types import IntArray
 
 FORMAT = 1

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.antenna import UPRIGHT
+from ..core.array_files import MOST_DEFLATED
 from ..core.files import one_line
+from ..core.memory import require_memory
 from .faults import attempt
 from .folder_files import shown, single_file
 
@@ -38,6 +40,8 @@ TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
 ARGOS_START, ARGOS_SYMBOLS = 47, 2
 """First sample of the first pilot symbol in a user's slot, and number of symbols (RENEWLab, ``samps2csi``)."""
 FULL_SCALE = 2.0**15
+RECORD_BYTES = 2 * HALF * 8
+"""Bytes of a record for each frame, user and antenna."""
 CHUNK_SIZE = 1 << 26
 """Bytes of samples in a chunk."""
 
@@ -115,8 +119,8 @@ def read_argos(
 
 
 def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
-    for group in (stored, stored.get("Data")):
-        pilots = None if group is None or not hasattr(group, "get") else group.get(PILOTS)
+    for group in (stored, _local(file, stored, "Data")):
+        pilots = None if group is None or not hasattr(group, "get") else _local(file, group, PILOTS)
         if pilots is not None and hasattr(pilots, "shape"):
             try:
                 return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
@@ -124,6 +128,15 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
                 text = f"an attribute cannot be read ({one_line(error)})"
                 raise DataFault(file, f"{text}; write it again as a number or as text") from None
     raise DataFault(file, f"neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
+
+
+def _local(file: Path, group: Any, name: str) -> Any:
+    """What a name in a group means; `DataFault` where that is in another file."""
+    import h5py
+
+    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+        raise DataFault(file, f"{name} is a link to another file; give the file with the samples")
+    return group.get(name)
 
 
 def _open(
@@ -134,6 +147,11 @@ def _open(
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
         raise DataFault(file, f"{PILOTS} holds {pilots.dtype} {list(shape)}; whole numbers {need} are read")
+    if pilots.is_virtual or pilots.external:
+        raise DataFault(file, f"{PILOTS} is in other files; give the file with the samples")
+    size = file.stat().st_size
+    if pilots.nbytes > MOST_DEFLATED * size:
+        raise DataFault(file, f"{PILOTS} states {list(shape)} samples, and the file has {size} bytes; fetch it again")
     asked = range(shape[0])[frames or slice(None)]
     if not len(asked) or asked.step < 0:
         raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
@@ -142,6 +160,8 @@ def _open(
     if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
         text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
         raise DataFault(file, f"{text}; give start")
+    needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
+    require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
     if len(shape) == 5 and cell is None and shape[1] > 1:
         raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
     if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:

@@ -16,6 +16,7 @@ coefficient from the user to the base station, as in the other layouts.
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +29,14 @@ from scipy.constants import speed_of_light
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray, unit_vectors
 from ..core.antenna import DEVICE_TO_ARRAY
-from ..core.files import readable, stored_arrays, text_lines
+from ..core.array_files import stored_array, stored_arrays
+from ..core.files import readable, text_lines
 from ..core.types import IntArray
+from ..core.yaml_files import read_yaml
+from ..parallel import run_module
 from .deepmimo_params import ALL, BASE_STATIONS, CHANNEL_PARAMS, ChannelParams, channel_params
-from .folder_files import data_folder, numbers_of, read_official, read_yaml, shown
+from .folder_files import data_folder, numbers_of, read_official, shown
+from .read_mat import FAULT
 
 PARAMS = "params.json"
 OLD_PARAMS = "params.mat"
@@ -45,6 +50,8 @@ PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_e
 TEST_FRACTION = 0.2
 """Share of the users with a path in the official test rows."""
 SPLIT_SEED = 0
+MAT_S, MAT_BYTES_PER_S = 30.0, 1 << 20
+"""Time that the process which reads MAT files has."""
 VALUES_PER_CHUNK = 1 << 20
 """Complex values of the largest array in a chunk of users."""
 
@@ -192,15 +199,14 @@ def _of_station(
     positions, users, channels = [], [], []
     for user_set in scenario.user_sets:
         pair = f"t{station[0]:03}_tx{station[1]:03}_r{user_set:03}"
-        here = _matrix(scenario.folder, "tx_pos", pair)
+        paths = _matrices(scenario.folder, pair)
+        here, there = paths.pop("tx_pos"), paths.pop("rx_pos")
         if here.size != 3 or not np.isfinite(here).all():
             text = f"tx_pos_{pair} has shape {list(here.shape)} or is not finite"
             raise InputError(f"{scenario.folder}: {text}; it must be x, y, z in metres")
-        there = _matrix(scenario.folder, "rx_pos", pair)
         if there.ndim != 2 or there.shape[1] != 3 or not np.isfinite(there).all():
             text = f"rx_pos_{pair} has shape {list(there.shape)} or is not finite"
             raise InputError(f"{scenario.folder}: {text}; it must be [users, 3] in metres")
-        paths = {key: _matrix(scenario.folder, key, pair) for key in PATH_MATRICES}
         expected = (len(there), *paths["power"].shape[1:2])
         for key, values in paths.items():
             if values.ndim != 2 or values.shape != expected:
@@ -215,23 +221,45 @@ def _of_station(
     return positions[0], np.concatenate(users), np.concatenate(channels)
 
 
-def _matrix(folder: Path, key: str, pair: str) -> NDArray[Any]:
-    """A matrix of a pair of a base station and a set of users, in whichever format it is stored."""
-    from scipy.io import loadmat
+def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
+    """Matrices of a pair of a base station and a set of users, in whichever format each is stored."""
+    files = {}
+    for key in ("tx_pos", "rx_pos", *PATH_MATRICES):
+        stem = f"{key}_{pair}"
+        file = next((folder / f"{stem}{s}" for s in SUFFIXES if (folder / f"{stem}{s}").exists()), None)
+        if file is None:
+            raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
+        files[key] = file
+    of_mat = _mat_arrays({key: file for key, file in files.items() if file.suffix == ".mat"})
+    found = {}
+    for key, file in files.items():
+        with readable(file, "", "fetch the scenario again"):
+            if file.suffix == ".mat":
+                values = of_mat.get(key)
+                if fault := of_mat.get(f"{FAULT}{key}"):
+                    raise ValueError(str(fault))
+            else:
+                values = stored_array(file) if file.suffix == ".npy" else stored_arrays(file).get(key)
+        if values is None or values.dtype.kind not in "fiu":
+            what = f"no array {key}" if values is None else f"{key} holds {values.dtype}"
+            raise InputError(f"{file}: {what}; give real numbers by the name {key}")
+        found[key] = values
+    return found
 
-    stem = f"{key}_{pair}"
-    file = next((folder / f"{stem}{s}" for s in SUFFIXES if (folder / f"{stem}{s}").exists()), None)
-    if file is None:
-        raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
-    with readable(file, "", "fetch the scenario again"):
-        if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False)
-        else:
-            values = (loadmat(file) if file.suffix == ".mat" else stored_arrays(file)).get(key)
-    if values is None or values.dtype.kind not in "fiu":
-        found = f"no array {key}" if values is None else f"{key} holds {values.dtype}"
-        raise InputError(f"{file}: {found}; give real numbers by the name {key}")
-    return np.asarray(values)
+
+def _mat_arrays(files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
+    """Arrays of MAT files by their keys, and messages of those that cannot be read."""
+    if not files:
+        return {}
+    with tempfile.TemporaryDirectory() as place:
+        out = Path(place) / "arrays.npz"
+        stated = [f"{key}={file}" for key, file in files.items()]
+        seconds = MAT_S + sum(file.stat().st_size for file in files.values()) / MAT_BYTES_PER_S
+        status, _ = run_module("wrf_mi.datasets.read_mat", [str(out), *stated], quiet=True, most_s=seconds)
+        if status != 0:
+            first = next(iter(files.values()))
+            raise InputError(f"{first}: it, or a matrix beside it, is damaged; fetch the scenario again")
+        return stored_arrays(out)
 
 
 def _channels(

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..core import InputError
-from ..core.files import atomic_folder, one_line, write_arrays
+from ..core.array_files import write_arrays
+from ..core.files import atomic_folder, one_line
 from .newrf import KEYS, arrays_sha256, convert_newrf, read_arrays
 from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, known, locate, remote_files
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..core import Antenna, DataFault, InputError, Record
@@ -35,22 +34,6 @@ DIGITS = 18
 """Most digits of a whole number; more may not fit into 64 bits."""
 
 
-class _Loader(yaml.SafeLoader):
-    """Names the line of a value that looks like a date or a number and is none."""
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        try:
-            value = super().construct_object(node, deep)
-            if isinstance(value, int):
-                float(value)  # hundreds of digits are no quantity, and no array takes them
-        except yaml.YAMLError:
-            raise
-        except Exception as error:  # PyYAML's constructors raise a dozen kinds
-            text = f"no {node.tag.rpartition(':')[2]} ({one_line(error)})"
-            raise yaml.constructor.ConstructorError(None, None, text, node.start_mark) from None
-        return value
-
-
 def data_folder(path: str | Path, content: str) -> Path:
     """The path of a folder; an `InputError` that ends with ``content`` if it is none."""
     folder = Path(path)
@@ -68,20 +51,6 @@ def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
         names = ", ".join(file.name for file in found) or "none"
         raise DataFault(path, f"{what} is read at a time, found {names}; give the file itself")
     return found[0]
-
-
-def read_yaml(path: Path) -> dict[Any, Any]:
-    """The mapping of a YAML file; empty where it holds anything else.
-
-    Raises:
-        InputError: missing, not text, not YAML, or with an impossible date or number.
-    """
-    text = "\n".join(text_lines(path))
-    try:
-        content = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise DataFault(path, f"not YAML ({one_line(error)}); correct it") from None
-    return content if isinstance(content, dict) else {}
 
 
 def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from ..core.yaml_files import read_yaml
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
@@ -25,7 +26,6 @@ from .folder_files import (
     finite_numbers,
     read_csv,
     read_official,
-    read_yaml,
     shown,
 )
 

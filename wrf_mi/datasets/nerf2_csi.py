@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from ..core.array_files import stored_array
 from ..core.files import atomic_folder, readable
+from ..core.yaml_files import read_yaml
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     AXES,
@@ -33,7 +35,6 @@ from .folder_files import (
     read_antenna,
     read_columns,
     read_official,
-    read_yaml,
     refuse_unstated,
     shown,
     unit_quaternion,
@@ -141,7 +142,7 @@ def _read_channels(path: Path) -> NDArray[np.complex64]:
     """Complex coefficients [n, antennas, subcarriers] of a ``.npy`` file, finite in single precision."""
     missing = DataFault(path, "missing; give a file that exists, or complete its folder")
     with readable(path, missing, "write it again with numpy.save"):
-        values = np.load(path, allow_pickle=False)
+        values = stored_array(path)
     wanted = "give complex numbers [samples, antennas, subcarriers]"
     if not isinstance(values, np.ndarray) or values.ndim != 3 or 0 in values.shape:
         raise DataFault(path, f"shape {list(getattr(values, 'shape', ()))}; {wanted}")

@@ -7,7 +7,7 @@ are left out, as their ``loaders.py`` does.
 
 Python's pickle calls whatever a file names. Here every name becomes an inert object (`_Named`) that holds its
 arguments: nothing is looked up, imported or called. The columns are rebuilt from these objects, out of NumPy arrays
-of plain numbers. Format: pickle as of Python's ``pickletools``; a ``DataFrame`` as pandas 1.4 and later write it
+of plain numbers. Format: pickle as of Python's ``pickletools``; a ``DataFrame`` as pandas 1.4 to 3 write it
 (blocks of columns with their indices), arrays as NumPy writes them (``_reconstruct`` up to protocol 4,
 ``_frombuffer`` from protocol 5).
 """
@@ -15,9 +15,12 @@ of plain numbers. Format: pickle as of Python's ``pickletools``; a ``DataFrame``
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import pickle
+import pickletools
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,8 @@ from numpy.typing import NDArray
 
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.antenna import UPRIGHT
-from ..core.files import one_line, readable, stored_arrays
+from ..core.array_files import stored_arrays
+from ..core.files import one_line, readable
 from .faults import refuse, stop_at_faults
 from .folder_files import single_file
 
@@ -178,6 +182,13 @@ class _Unpickler(pickle.Unpickler):
         return type("_Named", (_Named,), {"name": f"{module}.{name}"})
 
 
+def _check_pickle(content: bytes) -> None:
+    """Refuse a pickle that would take more memory than its size allows: Python makes room for what it states."""
+    for code, argument, _ in pickletools.genops(content):
+        if code.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > len(content):
+            raise ValueError(f"place {argument} in a list of at most {len(content)} objects")
+
+
 def read_pickled_table(path: Path) -> dict[str, list[Any] | NDArray[Any]]:
     """The columns of a pickled ``DataFrame``: NumPy arrays of numbers, or lists of fields that are arrays.
 
@@ -188,8 +199,9 @@ def read_pickled_table(path: Path) -> dict[str, list[Any] | NDArray[Any]]:
         size = path.stat().st_size
         if size > LARGEST_BYTES:
             raise ValueError(f"{size / 2**20:.0f} MiB, where a table has {LARGEST_BYTES // 2**20} at most")
-        with path.open("rb") as stream:
-            return _columns(_Unpickler(stream).load())
+        content = path.read_bytes()
+        _check_pickle(content)
+        return _columns(_Unpickler(BytesIO(content)).load())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({one_line(error)}); fetch it again") from None
     except Exception as error:  # a damaged or hostile pickle raises nearly every kind
@@ -201,8 +213,8 @@ def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
     manager = _named(state.get("_mgr") if isinstance(state, dict) else None, "BlockManager")
     blocks, axes = _arguments(manager, 2)
     _, index = _arguments(_named(axes[0], "_new_Index"), 2)
-    names = _array(index.get("data")) if isinstance(index, dict) else np.zeros(0)
-    if not all(isinstance(name, str) for name in names):
+    names = _names(index.get("data")) if isinstance(index, dict) else []
+    if not names or not all(isinstance(name, str) for name in names):
         raise ValueError("columns without names")
     columns: dict[str, list[Any] | NDArray[Any]] = {}
     for block in blocks:
@@ -218,6 +230,22 @@ def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
             plain = row.dtype != object
             columns[names[number]] = row if plain else [f if isinstance(f, PLAIN) else _array(f) for f in row]
     return columns
+
+
+def _names(described: Any) -> list[Any]:
+    """Names of columns: an array of objects, or as of pandas 3 an array of texts, by NumPy or by Arrow."""
+    if _is(described, "__pyx_unpickle_NDArrayBacked"):
+        described = described.state[1]
+    if not _is(described, "ArrowStringArray"):
+        return list(_array(described))
+    kind, count, _, first, buffers, *_ = _named(described.state["_pa_array"], "_restore_array").args[0]
+    (alias,) = _arguments(_named(kind, "type_for_alias"), 1)
+    held = (_arguments(_named(buffer, "py_buffer"), 1)[0] for buffer in buffers[1:3])
+    bounds, text = (one.args[0] if _is(one, "bytearray") else one for one in held)
+    at = np.frombuffer(bounds, {"string": "<i4", "large_string": "<i8"}[alias])[first : first + count + 1].tolist()
+    if len(at) != count + 1:
+        raise ValueError(f"{count} names with {len(at)} bounds")
+    return [bytes(text[a:b]).decode() for a, b in itertools.pairwise(at)]
 
 
 def _array(described: Any) -> NDArray[Any]:

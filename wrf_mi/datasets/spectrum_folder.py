@@ -20,7 +20,10 @@ from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
+from ..core.memory import require_memory
+from ..core.pictures import PICTURE_ERRORS, open_picture
 from ..core.types import IntArray
+from ..core.yaml_files import read_yaml
 from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
@@ -32,7 +35,6 @@ from .folder_files import (
     read_antenna,
     read_official,
     read_positions,
-    read_yaml,
     refuse_runs,
     refuse_unstated,
     shown,
@@ -49,6 +51,10 @@ CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 GATEWAYS, FOLDS, TX_ANTENNA = "gateway_info.yml", "blocked_folds.txt", "tx_antenna"
 RESERVED = ("array", TX_ANTENNA)
 """Mappings of the file that are no receivers; receivers cannot have these names."""
+MOST_PIXELS = 1 << 22
+"""Most pixels of a spectrum: 2,048 elevations and as many azimuths."""
+MOST_ELEMENTS = 1 << 14
+"""Most elements of an array: 128 x 128."""
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -239,12 +245,17 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
             elements = np.array(array["elements_m"], float)
         else:
             rows, columns = (operator.index(array[key]) for key in ("rows", "columns"))
+            if rows * columns > MOST_ELEMENTS:
+                raise DataFault(path, f"{one_line(name)} has {rows} x {columns} elements; give {MOST_ELEMENTS} at most")
             elements = planar_array(rows, columns, float(array["spacing_m"]))
-    except (TypeError, ValueError, KeyError):
+    except InputError:
+        raise
+    except (TypeError, ValueError, KeyError, OverflowError):
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        raise DataFault(path, f"{one_line(name)} is {str(array)[:60]!r}; {remedy}")
+        found = shown(array if isinstance(array, dict) else str(array))
+        raise DataFault(path, f"{one_line(name)} is {found}; {remedy}")
     return elements
 
 
@@ -254,7 +265,7 @@ def _poses(path: Path, info: dict[Any, Any]) -> dict[str, dict[Any, Any]]:
     if not poses:
         raise DataFault(path, "no receiver in it; give gateway1 with position and orientation")
     for name in poses:
-        if not isinstance(name, str) or Path(name).name != name:
+        if not isinstance(name, str) or Path(name).name != name or name == ".." or not name.isprintable():
             refuse(DataFault(path, f"{name!r} cannot name a folder; call receivers gateway1, gateway2, ..."))
     return poses
 
@@ -295,26 +306,31 @@ def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> N
             if image not in present:
                 continue
             with recoverable():
-                grey = _read_grey(place / image, row)
+                grey = _read_grey(place / image, row, None if observation is None else observation.shape[2:])
                 if observation is None:
+                    what = f"{folder}: {len(poses) * rows} spectra of {grey.shape[1]} x {grey.shape[0]} pixels"
+                    require_memory(
+                        4 * len(poses) * rows * grey.size, what, "give images of fewer pixels, or fewer rows"
+                    )
                     observation = np.zeros((len(poses), rows, *grey.shape), np.float32)
-                (height, width), first = grey.shape, observation.shape[2:]
-                if grey.shape != first:
-                    text = f"{width} x {height} pixels, but the first image has {first[1]} x {first[0]}"
-                    fault = f"{text}; give all images one size"
-                    raise DataFault(place / image, fault, row=row, file_per_row=True)
                 observation[receiver, row - 1] = grey
     stop_at_faults()
     assert observation is not None
     return observation
 
 
-def _read_grey(path: Path, row: int) -> NDArray[np.float32]:
+def _read_grey(path: Path, row: int, size: tuple[int, ...] | None) -> NDArray[np.float32]:
     try:
-        with Image.open(path) as image:
+        with open_picture(path, MOST_PIXELS) as image:
             mode = image.mode
-            values = np.asarray(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            if size is not None and image.size != size[::-1]:
+                (width, height), (first_height, first_width) = image.size, size
+                text = f"{width} x {height} pixels, but the first image has {first_width} x {first_height}"
+                raise DataFault(path, f"{text}; give all images one size", row=row, file_per_row=True)
+            values = np.asarray(image) if mode in GREY_LEVELS else np.zeros(0)
+    except InputError:
+        raise
+    except PICTURE_ERRORS as error:
         text = f"unreadable ({one_line(error)}); replace the image"
         raise DataFault(path, text, row=row, file_per_row=True) from None
     if mode not in GREY_LEVELS:

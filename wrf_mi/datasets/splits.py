@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import ClusterError, kmeans2
 
 from ..core import InputError, Record, Split
-from ..core.files import readable, stored_arrays, write_arrays
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import readable
 from ..core.types import IntArray
 
 FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")

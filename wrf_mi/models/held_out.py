@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..core import Prediction, Record, Split
 from ..core.angles import FloatArray
-from ..core.files import stored_arrays, write_arrays
+from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import IntArray
 from ..datasets.splits import rows_left
 from ..training.loop import Progress

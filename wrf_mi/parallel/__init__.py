@@ -7,10 +7,11 @@
 """
 
 from .children import run_module
-from .scheduler import Scheduler, SchedulerFailed, open_scheduler, row_parts
+from .scheduler import PartsProgress, Scheduler, SchedulerFailed, open_scheduler, row_parts
 from .worker import worker_threads
 
 __all__ = [
+    "PartsProgress",
     "Scheduler",
     "SchedulerFailed",
     "open_scheduler",

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 
 from .worker import given_up, worker_threads
@@ -20,14 +21,17 @@ GRACE_S = 30.0
 """Time for a child that is stopped to finish its step and write a checkpoint."""
 
 
-def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None) -> tuple[int, str]:
+def run_module(
+    module: str, arguments: Sequence[str], quiet: bool | None = None, most_s: float | None = None
+) -> tuple[int, str]:
     """Run ``python -m module arguments`` and wait for it.
 
     In a worker the child computes with the worker's number of threads and prints nothing; it is stopped, as by Ctrl-C,
-    when the client cancels the part. Elsewhere it writes to this process's standard error unless ``quiet``.
+    when the client cancels the part. Elsewhere it writes to this process's standard error unless ``quiet``. After
+    ``most_s`` seconds it is killed.
 
     Returns:
-        The exit status, and the last line of a quiet child's standard error.
+        The exit status, that of a killed child negative, and the last line of a quiet child's standard error.
 
     Raises:
         KeyboardInterrupt: in this process; the child has ended then.
@@ -40,7 +44,7 @@ def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None)
         # In a separate process group: Ctrl-C on a terminal reaches this process alone, which passes it on once.
         child = subprocess.Popen(call, process_group=0, **streams)  # type: ignore[call-overload]
         try:
-            status = _wait(child)
+            status = _wait(child, None if most_s is None else time.monotonic() + most_s)
         except BaseException:
             _stop(child)
             raise
@@ -51,11 +55,13 @@ def run_module(module: str, arguments: Sequence[str], quiet: bool | None = None)
     return status, lines[-1] if lines else ""
 
 
-def _wait(child: subprocess.Popen[bytes]) -> int:
+def _wait(child: subprocess.Popen[bytes], until: float | None) -> int:
     while True:
         try:
             return child.wait(POLL_S)
         except subprocess.TimeoutExpired:
+            if until is not None and time.monotonic() > until:
+                child.kill()
             if given_up():
                 return _stop(child)
 

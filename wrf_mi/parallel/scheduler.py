@@ -105,6 +105,7 @@ class Scheduler:
         what: str = "computing",
         sizes: Sequence[int] | None = None,
         each: Callable[[int, Any], None] | None = None,
+        lines: bool | None = None,
     ) -> list[Any]:
         """``[function(part) for part in parts]``, or with an opener ``function(opener(), part)``.
 
@@ -114,8 +115,8 @@ class Scheduler:
             opener: opens what all parts need; called once in each process that computes some of them.
             what: present participle for the progress on standard error: a bar on a terminal, else a line at each tenth.
             sizes: rows in each part, for the progress; None: one each.
-            each: called with index and result of each part once it is computed, in any order; then no lines of
-                progress are printed.
+            each: called with index and result of each part once it is computed, in any order.
+            lines: print progress as lines where there is no terminal; None: without ``each``.
 
         Returns:
             A result for each part, in their order.
@@ -141,7 +142,7 @@ class Scheduler:
         try:
             for future in futures.values():
                 future.add_done_callback(lambda future: done.put(future.key))
-            with PartsProgress(what, sum(sizes), lines=each is None) as progress:
+            with PartsProgress(what, sum(sizes), lines=each is None if lines is None else lines) as progress:
                 while futures:
                     try:
                         key = done.get(timeout=POLL_S)

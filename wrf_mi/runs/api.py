@@ -47,6 +47,7 @@ from threadpoolctl import threadpool_limits
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
+from ..core.locks import alone_in_process, locked_folder
 from ..datasets import make_splits
 from ..datasets.observations import check_observations, place_of
 from ..models import MODELS, Model, Problem, Session, known_model
@@ -59,7 +60,17 @@ from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
 from ..training.trainer import check_rows
 from .evaluate import Part, score_other, score_part, score_run
-from .folder import FITTED, RunConfig, check_new, load_rows, run_parts, start_run, write_configs, write_fitted
+from .folder import (
+    FITTED,
+    RunConfig,
+    check_new,
+    clear_begun,
+    load_rows,
+    run_parts,
+    start_run,
+    write_configs,
+    write_fitted,
+)
 from .run import Run, load_fitted, open_run, predict_to_file
 
 Settings = Iterable[str] | object
@@ -145,6 +156,7 @@ def _check_scene(
         raise InputError(f"{model.name} on {record.name}: takes no antenna options: its channels are of isotropic ones")
 
 
+@alone_in_process()
 def train(
     dataset: str | Path | Record,
     out: str | Path,
@@ -209,16 +221,20 @@ def train(
     problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
     if config.deterministic:
         init("llvm", threads=1)
-    start_run(folder, config, splits)
-    try:
-        _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
-    except InputError:
-        if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
-            shutil.rmtree(folder)
-        raise
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked_folder(folder):
+        clear_begun(folder)
+        start_run(folder, config, splits)
+        try:
+            _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
+        except InputError:
+            if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
+                shutil.rmtree(folder)
+            raise
     return Run(folder, problem.record)
 
 
+@alone_in_process()
 def resume(
     folder: str | Path,
     on_progress: OnProgress = quiet,
@@ -230,7 +246,7 @@ def resume(
     """Continue a stopped run; fitted parts are only scored again. Arguments as those of `train` and `open_run`.
 
     Raises:
-        InputError: not a run folder, or one of version 0.1.
+        InputError: not a run folder, one of version 0.1, or one that another process writes into.
         Interrupted: ``stop`` ended the run once more.
         BackendError: as `train`.
     """
@@ -238,7 +254,8 @@ def resume(
     if run.config.deterministic:
         init("llvm", threads=1)
     session = Session(run.folder, run.folder, on_progress, stop, scheduler, progress)
-    _complete(run.folder, run.config, run.problem, session)
+    with locked_folder(run.folder):
+        _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
 
 
@@ -260,12 +277,13 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
                 fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
-            (part / CHECKPOINT).unlink(missing_ok=True)
+        (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(Part(part, rows, *load_fitted(config, problem, part)))
         scores.append(score_part(folder, config, problem, parts[-1]))
     score_run(folder, config, parts, scores)
 
 
+@alone_in_process()
 def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = True) -> dict[str, Any]:
     """Score a run again.
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
+from ..core.array_files import ArrayStream, write_arrays
 from ..core.carriers import FREQUENCY
-from ..core.files import write_arrays, write_atomically
+from ..core.files import write_atomically
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
@@ -234,9 +235,14 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
         The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
-    written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}
+    written = {k: _of_first(v) if single and k not in SHARED else v for k, v in arrays.items()}
     write_arrays(path, written, compressed=True)
     return written
+
+
+def _of_first(values: Any) -> Any:
+    """Values of the first receiver."""
+    return replace(values, shape=values.shape[1:]) if isinstance(values, ArrayStream) else values[0]
 
 
 def stored_metrics(folder: Path) -> dict[str, Any]:

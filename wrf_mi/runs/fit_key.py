@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
+
 from ..core import InputError
 from ..core.digest import content_digest, files_below
 from ..core.files import one_line
@@ -68,7 +71,7 @@ def scene_files(scene: str | Path) -> list[Path]:
     if path.suffix.lower() != ".xml":
         return [path]
     try:
-        stated = [node.get("value", "") for node in ElementTree.parse(path).iter("string")]
-    except (ElementTree.ParseError, OSError) as error:
+        stated = [node.get("value", "") for node in parse(path, forbid_dtd=True).iter("string")]
+    except (ElementTree.ParseError, DefusedXmlException, OSError) as error:
         raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
     return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]

@@ -16,6 +16,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -27,12 +28,17 @@ import yaml
 from .. import __version__
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
-from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import LEFTOVER, readable, write_atomically
+from ..core.locks import LOCK
 from ..core.settings import settings_from
+from ..core.yaml_files import read_yaml
 from ..datasets import load_split, save_split
+from ..datasets.folder_files import shown
 from ..models import Model, known_model
 from ..models.calibrated import with_intervals
 from ..models.model import Arrays
+from ..tasks import TASKS
 from ..training.trainer import check_rows
 
 FORMAT = 4
@@ -67,7 +73,7 @@ class RunConfig:
     dataset: str
     task: str
     split: str
-    n_train: float | None
+    n_train: int | float | None
     seed: int
     scene: str | None
     material: str | None
@@ -119,15 +125,18 @@ def read_config(folder: Path) -> RunConfig:
     path = folder / CONFIG
     missing = f"{folder}: no {CONFIG}, so not a run folder; give one made by train or trace"
     with readable(path, missing, "restore it"):
-        content = yaml.safe_load(path.read_text())
-        if not isinstance(content, dict):
+        if not path.exists():
+            raise InputError(missing)
+        content = read_yaml(path)
+        if not content:
             raise InputError(f"{path}: not readable (no settings in it); restore it")
         check_format(folder)
-        names = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material")
-        kept = {name: content[name] for name in names}
-        kept |= {"antennas": AntennaOptions(**content["antennas"])}
-        kept |= {name: bool(content.get(name)) for name in ("deterministic", "intervals")}
-        config = RunConfig(**kept, settings=None)
+        needed = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material", "antennas")
+        stated = {name: content[name] for name in needed}
+        stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
+        config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
+        if config.task not in TASKS or config.seed < 0:
+            raise InputError(f"{path}: task {shown(config.task)} with seed {config.seed}: not known; restore it")
         kind: Any = config.entry.settings
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))
 
@@ -135,10 +144,10 @@ def read_config(folder: Path) -> RunConfig:
 def check_format(folder: Path) -> None:
     """Refuse a run of version 0.1 or of another format by `InputError`; an unreadable configuration passes."""
     try:
-        content = yaml.safe_load((folder / CONFIG).read_text())
-    except (OSError, ValueError, yaml.YAMLError):
-        content = None
-    stated = content.get("format") if isinstance(content, dict) else FORMAT
+        content = read_yaml(folder / CONFIG)
+    except InputError:
+        content = {}
+    stated = content.get("format") if content else FORMAT
     if stated is None or any((folder / name).exists() for name in OLD):
         raise InputError(f"{folder}: a run of version 0.1; train it anew, or use version 0.1")
     if stated != FORMAT:
@@ -147,10 +156,29 @@ def check_format(folder: Path) -> None:
 
 
 def check_new(folder: Path) -> None:
-    """Refuse a file or a folder that is not empty by `InputError`."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    """Refuse a file, or a folder that is neither empty nor that of a run killed before its configuration was written.
+
+    Raises:
+        InputError: naming the folder.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not _is_begun(folder):
         remedy = f"choose another --out, or go on with train --resume {folder}"
         raise InputError(f"{folder}: exists and is not empty; {remedy}")
+
+
+def _is_begun(folder: Path) -> bool:
+    """Whether a run was killed here before it could be resumed: a lock and splits, but no configuration."""
+    if not (folder / LOCK).is_file() or (folder / CONFIG).exists():
+        return False
+    files = (path.name for path in folder.rglob("*") if not path.is_dir())
+    return all(name in (LOCK, SPLIT, CONFIG) or LEFTOVER.fullmatch(name) for name in files)
+
+
+def clear_begun(folder: Path) -> None:
+    """Remove what a killed run left in a folder that is locked now; `InputError` as of `check_new`."""
+    check_new(folder)
+    for path in [path for path in folder.iterdir() if path.name != LOCK]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def start_run(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
@@ -189,8 +217,8 @@ def load_rows(folder: Path, record: Record) -> Split:
 
 
 def write_fitted(folder: Path, arrays: Arrays, seconds: float) -> Path:
-    """Write ``model.npz``."""
-    return write_arrays(folder / FITTED, {VERSION: FORMAT, SECONDS: seconds, **arrays}, compressed=True)
+    """Write ``model.npz``, with a checksum."""
+    return write_arrays(folder / FITTED, {VERSION: FORMAT, SECONDS: seconds, **arrays}, compressed=True, checksum=True)
 
 
 def read_fitted(folder: Path) -> tuple[Arrays, float]:

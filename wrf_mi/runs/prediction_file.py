@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import csv
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core import InputError
+from ..core import InputError, Prediction
 from ..core.angles import FloatArray
+from ..core.array_files import ArrayStream, stored_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_atomically
 from ..datasets.folder_files import read_csv
@@ -25,6 +31,8 @@ HEADING = "heading_rad"
 """Column or array of headings."""
 POSITIONS, UPLINK = "tx_pos", "uplink"
 """Arrays of positions and of uplink channels."""
+SPOOLED_BYTES, PIECE_BYTES = 1 << 26, 1 << 22
+"""Size from which predictions are collected on the disk, and size of the pieces that are read from there."""
 
 
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
@@ -80,12 +88,13 @@ def _from_csv(path: Path) -> Inputs:
 
 def _from_npz(path: Path) -> Inputs:
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in (POSITIONS, HEADING, FREQUENCY, UPLINK) if name in stored}
+        arrays = stored_arrays(path, (POSITIONS, HEADING, FREQUENCY, UPLINK))
         uplink = arrays.get(UPLINK)
         if uplink is not None:
             arrays.setdefault(POSITIONS, np.full((len(uplink), 3), np.nan))
         numbers = {name: np.asarray(arrays[name], float) for name in (POSITIONS, HEADING, FREQUENCY) if name in arrays}
+    except InputError:
+        raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not readable as .npz ({one_line(error)}); write it with numpy.savez") from None
     if POSITIONS not in numbers:
@@ -113,6 +122,72 @@ def check_prediction_file(out: Path, run: Path) -> None:
         if TASKS[task].axes:
             remedy = f"give {out.with_suffix(NPZ).name}"
             raise InputError(f"{out}: {CSV} holds signal strengths (rssi), but {run} predicts {task}; {remedy}")
+
+
+class PredictionSpool:
+    """Predictions of all receivers, collected part by part: in memory while small, else in a temporary file.
+
+    The file has no name: nothing is left of it, however the process ends.
+
+    Args:
+        folder: folder of the temporary file.
+        receivers: number of receivers.
+        count: number of positions.
+    """
+
+    def __init__(self, folder: Path, receivers: int, count: int) -> None:
+        self._folder, self._lead = folder, (receivers, count)
+        self._files: dict[str, tuple[Any, NDArray[Any]]] = {}
+
+    def __enter__(self) -> Self:
+        """The spool."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Free memory and file."""
+        for file, _ in self._files.values():
+            file.close()
+
+    def write(self, rows: slice, receiver: int, found: Prediction) -> None:
+        """Add the predictions [rows, ...] of some rows at a receiver."""
+        std = None if found.std is None else found.std.astype(np.float32)
+        for name, values in (("prediction", found.mean), ("std", std)):
+            if values is None:
+                continue
+            if name not in self._files:
+                self._files[name] = self._file(values), values[:0]
+            file, like = self._files[name]
+            size = like.dtype.itemsize * math.prod(like.shape[1:])
+            file.seek(size * (receiver * self._lead[1] + rows.start))
+            file.write(np.ascontiguousarray(values, like.dtype).tobytes())
+
+    def _file(self, like: NDArray[Any]) -> Any:
+        """A temporary file for observations like [n, ...]; `InputError` if the disk has no room for it."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        needed = math.prod(self._lead) * like.dtype.itemsize * math.prod(like.shape[1:])
+        if needed > SPOOLED_BYTES and needed > (free := shutil.disk_usage(self._folder).free):
+            text = f"predictions take {needed / 2**30:.3g} GiB, and {free / 2**30:.3g} GiB of the disk are free"
+            raise InputError(f"{self._folder}: {text}; predict fewer positions at a time, or choose another disk")
+        return tempfile.SpooledTemporaryFile(SPOOLED_BYTES, dir=str(self._folder))
+
+    def streams(self) -> dict[str, ArrayStream]:
+        """``prediction`` and, if stated, ``std`` [receivers, positions, ...], for `wrf_mi.core.files.write_arrays`."""
+        return {
+            name: ArrayStream((*self._lead, *like.shape[1:]), like.dtype, self._pieces(file))
+            for name, (file, like) in self._files.items()
+        }
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The same in memory."""
+        return {
+            name: np.frombuffer(b"".join(stream.pieces), stream.dtype).reshape(stream.shape)
+            for name, stream in self.streams().items()
+        }
+
+    def _pieces(self, file: Any) -> Iterator[bytes]:
+        file.seek(0)
+        while piece := file.read(PIECE_BYTES):
+            yield piece
 
 
 def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: FloatArray | None) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import readable, stored_arrays, write_atomically
+from ..core.array_files import stored_arrays
+from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..tasks import TASKS, Task
 from ..training.checkpoint import LOG

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -15,19 +17,22 @@ from ..core import InputError, Prediction, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY, carriers_text
 from ..core.files import readable
+from ..core.memory import require_memory
 from ..core.receivers import receiver_index
 from ..datasets import load_split
 from ..models import Fitted, Inputs, Model, Problem
 from ..models.checks import check_inputs
 from ..models.gaussian.model import FittedField
 from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
-from ..parallel import Scheduler, row_parts
+from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
-from .prediction_file import check_prediction_file, write_prediction_file
+from .prediction_file import CSV, PredictionSpool, check_prediction_file, write_prediction_file
 
 PREDICTED_PER_CHUNK = 256
-"""Largest chunk of positions for a scheduler: 33 MB of spectra of 90 x 360 for each receiver."""
+"""Positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver."""
+MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
+"""Largest number of positions of small observations at a time, and bytes of their observations."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,36 @@ class Run:
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predict the observations of the receiver of an index; inputs and errors as those of `predict`."""
         self.check_inputs(inputs)
-        return self.fitted.predict(inputs, receiver)
+        means, stds = list[NDArray[Any]](), list[FloatArray | None]()
+        for rows, found in self.predicted_parts(inputs, receiver):
+            if not rows.start:
+                each = found.mean.nbytes + (0 if found.std is None else found.std.nbytes)
+                # Twice: parts, and the parts joined.
+                needed = 2 * each * len(inputs) / max(len(found.mean), 1)
+                what = f"{self.folder}: predictions at {len(inputs)} positions at once"
+                require_memory(needed, what, "predict fewer at a time, or into a file (predict_to_file)")
+            means.append(found.mean)
+            stds.append(found.std)
+        if len(means) == 1:
+            return Prediction(means[0], stds[0])
+        std = None if stds[0] is None else np.concatenate([part for part in stds if part is not None])
+        return Prediction(np.concatenate(means), std)
+
+    def predicted_parts(self, inputs: Inputs, receiver: int) -> Iterator[tuple[slice, Prediction]]:
+        """Predictions of the receiver of an index in chunks, with the rows of each: memory for a chunk at a time.
+
+        Raises:
+            InputError: as `predict`.
+        """
+        start, size = 0, PREDICTED_PER_CHUNK
+        while start < len(inputs) or not start:
+            rows = slice(start, min(start + size, len(inputs)))
+            found = self.fitted.predict(inputs.rows(rows) if len(inputs) > size else inputs, receiver)
+            yield rows, found
+            if rows.stop >= len(inputs):
+                return
+            row_bytes = max(found.mean.nbytes // len(found.mean), 1)
+            start, size = rows.stop, int(np.clip(CHUNK_BYTES // row_bytes, PREDICTED_PER_CHUNK, MOST_PER_CHUNK))
 
     def check_inputs(self, inputs: Inputs) -> None:
         """Refuse inputs that the model does not predict from.
@@ -217,8 +251,11 @@ def predict_to_file(
     operator: bool = True,
     uplink: NDArray[Any] | None = None,
     carriers_hz: FloatArray | None = None,
+    progress: bool = False,
 ) -> dict[str, tuple[int, ...]]:
     """Predict at new transmitter positions and write an ``.npz`` or ``.csv`` file.
+
+    Memory is needed for a chunk of the positions at a time; a temporary file beside ``out`` holds the others.
 
     Args:
         folder: run folder with one fitted model.
@@ -232,6 +269,7 @@ def predict_to_file(
         operator: learned fields predict by operator where they can.
         uplink: uplink channels [m, antennas, subcarriers], for models that predict from them.
         carriers_hz: carrier of each position [m], Hz, where the data have several; stored as ``frequency_hz``.
+        progress: show progress on standard error.
 
     Returns:
         Shape of each array that ``.npz`` has.
@@ -245,29 +283,40 @@ def predict_to_file(
     run = open_run(path, operator=operator)
     check_prediction_file(Path(out), path)
     run.check_inputs(asked)
-    if scheduler is None or not len(asked):
-        parts = [_predict_part(run, asked)]
-    else:
-        given = [asked.rows(rows) for rows in row_parts(len(asked), scheduler.workers, most=PREDICTED_PER_CHUNK)]
-        opener = partial(open_run, path, operator=operator)
-        parts = scheduler.map(_predict_part, given, opener, what="predicting", sizes=[len(chunk) for chunk in given])
-    means, stds, names = zip(*parts, strict=True)
-    arrays: dict[str, Any] = {
-        "row": np.arange(len(asked)),
-        "prediction": np.concatenate(means, axis=1),
-        "tx_pos": asked.tx_pos_m,
-        "receiver_name": np.asarray(names[0]),
-    }
-    if carriers_hz is not None:
-        arrays[FREQUENCY] = carriers_hz
-    if stds[0] is not None:
-        arrays["std"] = np.concatenate(stds, axis=1).astype(np.float32)
-    written = write_prediction_file(Path(out), arrays, tx_heading_rad)
+    receivers, count = run.receivers, len(asked)
+    with PredictionSpool(Path(out).parent, len(receivers), count) as spool:
+        if scheduler is None or not count:
+            total = len(receivers) * count
+            shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
+            with shown as bar:
+                for index in range(len(receivers)):
+                    for rows, found in run.predicted_parts(asked, index):
+                        spool.write(rows, index, found)
+                        if bar is not None:
+                            bar.add(rows.stop - rows.start, 1)
+        else:
+            parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
+
+            def each(part: int, found: list[Prediction]) -> None:
+                for index, one in enumerate(found):
+                    spool.write(parts[part], index, one)
+                found.clear()  # the scheduler keeps results to the end
+
+            opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
+            given = [asked.rows(rows) for rows in parts]
+            scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
+        arrays: dict[str, Any] = {
+            "row": np.arange(count),
+            "tx_pos": asked.tx_pos_m,
+            "receiver_name": np.asarray([receiver.name for receiver in receivers]),
+        }
+        if carriers_hz is not None:
+            arrays[FREQUENCY] = carriers_hz
+        arrays |= spool.arrays() if Path(out).suffix.lower() == CSV else spool.streams()
+        written = write_prediction_file(Path(out), arrays, tx_heading_rad)
     return {key: value.shape for key, value in written.items()}
 
 
-def _predict_part(run: Run, inputs: Inputs) -> tuple[NDArray[Any], NDArray[Any] | None, list[str]]:
-    """Observations [n_rx, m, ...], their standard deviations if the model states them, and the receivers' names."""
-    found = [run.predict_inputs(inputs, index) for index in range(len(run.receivers))]
-    stated = None if found[0].std is None else np.stack([prediction.stated_std for prediction in found])
-    return np.stack([prediction.mean for prediction in found]), stated, [receiver.name for receiver in run.receivers]
+def _predict_part(run: Run, inputs: Inputs) -> list[Prediction]:
+    """Predictions of all receivers."""
+    return [run.predict_inputs(inputs, index) for index in range(len(run.receivers))]

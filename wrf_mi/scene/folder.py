@@ -11,16 +11,19 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 import yaml
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
 from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, one_line, write_atomically
-from ..datasets.folder_files import read_yaml
+from ..core.files import atomic_folder, inside, one_line, write_atomically
+from ..core.yaml_files import read_yaml
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .surfaces import Surface
@@ -125,10 +128,8 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
     """
     folder = Path(folder)
     facts = read_yaml(folder / FACTS_FILE)
-    if "xml" not in facts:
-        raise InputError(f"{folder / FACTS_FILE}: no xml in it; write the scene anew")
+    xml = scene_file(folder, facts)
     materials = read_materials(folder / MATERIALS_FILE)
-    xml = folder / facts["xml"]
     meshes = {path.stem for path in (folder / "meshes").glob("*.ply")}
     if odd := sorted(meshes ^ set(materials.surfaces)):
         which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
@@ -141,7 +142,15 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         except OSError as error:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
-    return SceneFolder(folder, xml, full, facts.get("counts", {}))
+    counts = facts.get("counts")
+    return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {})
+
+
+def scene_file(folder: Path, facts: Mapping[Any, Any]) -> Path:
+    """The scene file of a folder by the content of its ``scene.yml``; `InputError` for none, or one elsewhere."""
+    if "xml" not in facts:
+        raise InputError(f"{folder / FACTS_FILE}: no xml in it; write the scene anew")
+    return inside(folder, facts["xml"], folder / FACTS_FILE)
 
 
 def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
@@ -154,14 +163,14 @@ def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, f
 def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
     """Material of each shape of a scene file by the shape's name, and constants of materials of its own."""
     try:
-        root = ElementTree.parse(xml).getroot()
+        root = parse(xml, forbid_dtd=True).getroot()
         own = {
             bsdf.get("id", "").removeprefix("mat-"): {
                 value.get("name", ""): float(value.get("value", "nan")) for value in bsdf.findall("float")
             }
             for bsdf in root.findall("bsdf[@type='radio-material']")
         }
-    except (OSError, ElementTree.ParseError, ValueError):
+    except (OSError, ElementTree.ParseError, ValueError, DefusedXmlException):
         return {}, {}
     own.pop(PERFECT, None)
     references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in root.findall("shape")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import trimesh
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.array_files import stored_names
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .plan_sources import PlanGrid, Row0, read_layout, read_plan
@@ -150,13 +152,12 @@ def is_plan(path: str | Path) -> bool:
         return True
     try:
         if suffix == ".npz":
-            with np.load(file, allow_pickle=False) as arrays:
-                return "log_odds" in arrays or "xy_m" in arrays
+            return bool(stored_names(file) & {"log_odds", "xy_m"})
         if suffix in (".xyz", ".txt"):
             with file.open(encoding="utf-8-sig") as stream:
                 rows = (line.split("#")[0].replace(",", " ").split() for line in stream)
                 return len(next((row for row in rows if row), [])) == 2
-    except (OSError, ValueError):
+    except (OSError, ValueError, BadZipFile, NotImplementedError):
         pass  # the reader of points raises
     return False
 

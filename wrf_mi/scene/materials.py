@@ -17,7 +17,6 @@ the law of ITU-R P.2040; a scene file holds it at f0:
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +28,8 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, PERFECT_THICKN
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 
 from ..core import InputError
-from ..datasets.folder_files import read_yaml
+from ..core.yaml_files import read_yaml
+from ..datasets.folder_files import SINGLE_MAX, shown
 from .surfaces import KINDS
 
 FILE = "materials.yml"
@@ -39,6 +39,8 @@ EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 STEEPEST = 5.0
 """Largest exponent; ITU-R P.2040 has 0 to 2.4."""
 NAME = re.compile(r"\w+", re.ASCII)
+SURFACE_NAME = re.compile(r"[\w.-]+")
+THICKEST_M = 1e3
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
 """Default slab thickness of every material, metres."""
 RULES: Mapping[str, str] = {
@@ -116,23 +118,37 @@ def read_materials(path: str | Path) -> Materials:
     def check(material: Any, where: str, also: Sequence[str] = own) -> None:
         if material not in (*also, *THICKNESS_M):
             known = ", ".join([*also, *THICKNESS_M])
-            raise InputError(f"{file}: {where}: unknown material {material!r}; known are {known}")
+            raise InputError(f"{file}: {where}: unknown material {shown(material)}; known are {known}")
 
     for kind, material in parts["rules"].items():
         if kind not in KINDS:
             raise InputError(f"{file}: rules: no kind {kind!r}; known are {', '.join(KINDS)}")
         check(material, f"rules: {kind}")
     for name, entry in parts["surfaces"].items():
+        if not isinstance(name, str) or not SURFACE_NAME.fullmatch(name):
+            raise InputError(f"{file}: surfaces: {shown(name)} names no mesh; use letters, digits, _, - and .")
         check(entry, f"surfaces: {name}", (*KINDS, *own))
-    for material, thickness in parts["thickness_m"].items():
-        check(material, "thickness_m", ())
-        if not _is_number(thickness) or thickness <= 0:
-            raise InputError(f"{file}: thickness_m: {material} is {thickness!r}; give metres above 0")
+    thicknesses(file, parts["thickness_m"])
     return Materials(**parts)
 
 
+def thicknesses(file: Path, stated: Any) -> dict[str, float]:
+    """Thicknesses in metres of materials by name; `InputError` for anything else in ``stated``, a part of a file."""
+    if not isinstance(stated, dict):
+        raise InputError(f"{file}: thickness_m is {shown(stated)}; it must be a mapping, such as {{itu_brick: 0.2}}")
+    for material, thickness in stated.items():
+        if material not in THICKNESS_M:
+            known = ", ".join(THICKNESS_M)
+            raise InputError(f"{file}: thickness_m: unknown material {shown(material)}; known are {known}")
+        if not _is_number(thickness) or not 0 < thickness <= THICKEST_M:
+            text = f"{file}: thickness_m: {material} is {shown(thickness)}"
+            raise InputError(f"{text}; give metres above 0, {THICKEST_M:g} at most")
+    return dict(stated)
+
+
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether a value is a number that is finite in single precision."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= SINGLE_MAX
 
 
 def _check_constants(file: Path, name: Any, values: Any) -> None:
@@ -146,7 +162,7 @@ def _check_constants(file: Path, name: Any, values: Any) -> None:
     least = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0, EXPONENT: -STEEPEST, CARRIER: 0.0}
     for key, value in values.items():
         if not _is_number(value) or value < least[key] or (key in ("thickness", CARRIER) and value <= 0):
-            raise InputError(f"{where}: {key} is {value!r}; give a number from {least[key]:g} upwards")
+            raise InputError(f"{where}: {key} is {shown(value)}; give a number from {least[key]:g} upwards")
     if abs(values.get(EXPONENT, 0)) > STEEPEST:
         raise InputError(f"{where}: {EXPONENT} is {values[EXPONENT]!r}; give -{STEEPEST:g} to {STEEPEST:g}")
 

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import one_line, stored_arrays, text_lines
+from ..core.array_files import stored_arrays
+from ..core.files import inside, one_line, text_lines
+from ..core.pictures import PICTURE_ERRORS, open_picture
+from ..core.yaml_files import read_yaml
 from ..datasets.folder_files import read_columns
 
 Mask = NDArray[np.bool_]
@@ -32,6 +33,10 @@ POINT_CELL_M = 0.05
 """Side of the cells that points are counted in, as usual for maps of indoor robots."""
 LARGEST_GRID_CELLS = 4_000_000
 """100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away."""
+
+
+LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
+"""Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,11 @@ def grid_from_probability(
         InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
     """
     p = np.asarray(probability, float)
+    if p.size > LARGEST_PICTURE:
+        raise InputError(f"{name}: {p.size:,} cells; give a plan of at most {LARGEST_PICTURE:,}, with larger cells")
     if p.ndim != 2 or not p.size:
         raise InputError(f"{name}: an occupancy grid has two axes (rows, columns), this one has shape {p.shape}")
-    if not (np.isfinite(resolution_m) and resolution_m > 0):
+    if not (np.isfinite(resolution_m) and resolution_m > 0 and np.isfinite(np.asarray(origin_m, float)).all()):
         raise InputError(f"{name}: the resolution is {resolution_m}; give the side of a cell in metres, above zero")
     if row_0 == "top":
         p = p[::-1]
@@ -228,22 +235,24 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
     sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
     if sheet.is_file():
         try:
-            facts = yaml.safe_load("\n".join(text_lines(sheet)))
-            path = sheet.parent / facts["image"] if path == sheet else path
+            facts = read_yaml(sheet)
+            path = inside(sheet.parent, facts["image"], sheet) if path == sheet else path
             origin = np.array(facts["origin"][:2], float)
             yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
             resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
-        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             text = f"not the YAML of a ROS map ({one_line(error)})"
             raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
-        if yaw:
+        if yaw or not np.isfinite(yaw):
             raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
     try:
-        with Image.open(path) as picture:
+        with open_picture(path, LARGEST_PICTURE) as picture:
             grey = np.asarray(picture.convert("L"), float) / 255
-    except OSError as error:
+    except PICTURE_ERRORS as error:
         raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
     return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
 

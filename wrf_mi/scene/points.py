@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +13,10 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.array_files import stored_array, stored_arrays
 from ..core.files import one_line
+from ..core.memory import require_memory
+from ..parallel import run_module
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -21,6 +25,10 @@ SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 """Libraries that Open3D is linked against and a small system lacks."""
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
+MOST_LAZ = 1000
+"""Largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred."""
+LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
+"""Address space of the process that reads LAZ beside its points, and the time that it has."""
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
 VOXEL_M = 0.03
@@ -77,6 +85,8 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
         lidar_package("laspy")  # a missing package is no fault of the file
     try:
         points = np.asarray(_read(file), float)
+    except InputError:
+        raise
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
     if points.ndim != 2 or points.shape[1] != 3:
@@ -127,17 +137,39 @@ def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray
     return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
 
 
+def _read_las(file: Path) -> Any:
+    """Points of a LAS or LAZ file, whose header must not state more than the file can hold."""
+    size = file.stat().st_size
+    laspy = lidar_package("laspy")
+    with laspy.open(file) as source:
+        header = source.header
+        packed, needed = header.are_points_compressed, header.point_count * header.point_format.size
+        if needed > size * (MOST_LAZ if packed else 1):
+            raise ValueError(f"states {header.point_count} points, and has {size} bytes")
+        require_memory(4 * needed, f"{file}: {header.point_count} points", "thin the cloud first")
+        if not packed:
+            return source.read().xyz
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "points.npy"
+        arguments = [str(file), str(out), str(LAZ_BYTES + 4 * needed)]
+        seconds = LAZ_S + size / LAZ_BYTES_PER_S
+        status, message = run_module("wrf_mi.scene.read_laz", arguments, quiet=True, most_s=seconds)
+        if status != 0:
+            raise ValueError(message if status == 1 else "its compressed points are damaged")
+        return stored_array(out)
+
+
 def _read(file: Path) -> Any:
     match file.suffix.lower():
         case ".npz":
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
-                return arrays["xyz_m" if "xyz_m" in arrays else "points"]
+            arrays = stored_arrays(file, ("xyz_m", "points"))
+            return arrays["xyz_m" if "xyz_m" in arrays else "points"]
         case ".las" | ".laz":
-            with lidar_package("laspy").open(file) as source:
-                return source.read().xyz
+            return _read_las(file)
         case ".xyz" | ".txt":
             with file.open(encoding="utf-8-sig") as text:
                 commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
             columns, delimiter = (0, 1, 2), "," if commas else None
             return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
-    return getattr(trimesh.load(file), "vertices", np.empty((0, 3)))
+    with file.open("rb") as stream:  # without a name no other file is looked for
+        return getattr(trimesh.load(stream, file_type=file.suffix.lower().removeprefix(".")), "vertices", [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -19,6 +19,8 @@ from ..core.types import IntArray
 
 Kind = Literal["floor", "ceiling", "wall", "other"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+QUIET: Mapping[str, Any] = {"obj": {"skip_materials": True}}
+"""Arguments of trimesh's readers by the ending of the file."""
 SAME_CORNER_M = 1e-4
 """Distance within which corners of faces coincide: STL has no shared vertices, and meshes that meet leave a gap."""
 
@@ -54,10 +56,18 @@ def mesh_parts(path: str | Path) -> list[Any]:
         InputError: a file that cannot be read as a mesh.
     """
     try:
-        parts: list[Any] = trimesh.load_scene(str(path), process=False).dump()
+        # Without a name no other file is looked for: materials and textures are not used.
+        with Path(path).open("rb") as stream:
+            kind = Path(path).suffix.lower().removeprefix(".")
+            parts: list[Any] = trimesh.load_scene(stream, file_type=kind, process=False, **QUIET.get(kind, {})).dump()
+        found = [part for part in parts if len(getattr(part, "faces", ()))]
+        for part in found:
+            faces, count = np.asarray(part.faces), len(part.vertices)
+            if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
+                raise ValueError(f"a face names a vertex that is not among its {count}")
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
         raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    return [part for part in parts if len(getattr(part, "faces", ()))]
+    return found
 
 
 def number_names(kinds: Sequence[Kind]) -> list[str]:

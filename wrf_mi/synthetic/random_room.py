@@ -19,7 +19,7 @@ from wrf_mi_scenes.random_rooms import random_room
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
-from ..core.files import write_arrays
+from ..core.array_files import write_arrays
 from ..receivers.instruments import ChannelInstrument
 from ..scene.make import make_scene
 from ..scene.scan import simulate_scan

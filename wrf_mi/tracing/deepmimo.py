@@ -21,7 +21,8 @@ from scipy.constants import speed_of_light
 from .. import __version__
 from ..core import InputError, Paths
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_arrays
+from ..core.array_files import write_arrays
+from ..core.files import atomic_folder
 from ..core.types import IntArray
 from ..datasets.deepmimo import PARAMS, VERSION
 from .result import TraceResult

@@ -16,8 +16,8 @@ import numpy as np
 
 from ..core import Antenna, Receiver, receiver_arrays
 from ..core.angles import FloatArray
+from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
-from ..core.files import stored_arrays, write_arrays
 from ..datasets import user_cache
 from ..receivers import rssi_dbm
 from .material_parameters import slabs_of_faces

@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import trimesh
-import yaml
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
 from .. import backend
 from ..core import InputError
 from ..core.files import one_line
-from ..scene.folder import FACTS_FILE, read_scene_folder
+from ..core.yaml_files import read_yaml
+from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ..scene.materials import FILE as MATERIALS_FILE
+from ..scene.materials import thicknesses
 from ..scene.surfaces import mesh_parts
+from ..scene.xml_file import read_scene_xml
 from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
@@ -97,18 +99,17 @@ def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float
     if (folder / MATERIALS_FILE).is_file():
         read = read_scene_folder(folder)
         return read.xml, dict(read.materials.thickness_m), read.materials.laws
-    try:
-        facts = yaml.safe_load((folder / FACTS_FILE).read_text(encoding="utf-8"))
-        return folder / facts["xml"], dict(facts.get("thickness_m", {})), {}
-    except FileNotFoundError:
-        raise InputError(f"{folder}: no {FACTS_FILE} in it, so not a scene folder; give one, or a file") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise InputError(f"{folder / FACTS_FILE}: not readable ({one_line(error)}); restore it") from None
+    file = folder / FACTS_FILE
+    if not file.exists():
+        raise InputError(f"{folder}: no {FACTS_FILE} in it, so not a scene folder; give one, or a file")
+    facts = read_yaml(file)
+    return scene_file(folder, facts), thicknesses(file, facts.get("thickness_m") or {}), {}
 
 
 def _from_xml(path: Path) -> Any:
     from sionna import rt
 
+    read_scene_xml(path)
     try:
         # Merged shapes, and with them the paths, have a random order.
         return rt.load_scene(str(path), merge_shapes=False)

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from ..core import InputError
-from ..gaussians import FIELDS, Encoding
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import InputError, Receiver
+from ..core.memory import require_memory
+from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..graph.graph import Field
 from ..graph.receivers import Form
 from .config import PATHS_ALONE, TrainConfig
+
+BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
+"""Memory of a training step for each neuron, and beside networks, of each pair of a Gaussian and a transmitter, and for
+each number of a Gaussian (its value, gradient, moments, running mean and best state): measured on 4,000 and 16,000
+Gaussians of the three fields, within a third."""
+MOST_NUMBERS = (1 << 32) - 1
+"""Most numbers of an array of Dr.Jit."""
 
 
 def field_of(config: TrainConfig, form: Form) -> Field | None:
@@ -56,3 +69,54 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
         sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
     return FIELDS[model](encoding=encoding, components=components, **sizes)
+
+
+def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
+    """Refuse parameters of a file that are not those of a field: the backend ends the process on other shapes.
+
+    Args:
+        field: the field; None: paths alone.
+        params: parameters by name, those of paths included.
+        source: file, for messages.
+
+    Raises:
+        InputError: a parameter that is missing, of another shape, or not finite.
+    """
+    for name, values in params.items():
+        if values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
+    if field is None:
+        return
+    place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
+    count = params["position"].shape[1] if "position" in params else 0
+    for name, like in field.init(random_gaussians([place], 4, rng), rng).items():
+        wanted = (like.shape[0], count) if name in field.per_gaussian else like.shape
+        found = params[name].shape if name in params else "none"
+        if found != wanted or not count:
+            text = f"parameter {name} of shape {found}, where the settings need {wanted}"
+            raise InputError(f"{source}: {text}; train the run anew")
+
+
+def check_memory(config: TrainConfig, field: Field) -> None:
+    """Refuse a training step that does not fit into memory.
+
+    Raises:
+        InputError: naming the settings to lower.
+    """
+    density = config.density
+    count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)
+    place = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    rng = np.random.default_rng(0)
+    sizes = {name: values.shape for name, values in field.init(random_gaussians([place], 4, rng), rng).items()}
+    neurons = sum(shape[0] for name, shape in sizes.items() if name.endswith(".bias"))
+    own = sum(sizes[name][0] for name in field.per_gaussian)
+    widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=own)
+    grown = count > config.initial.gaussians
+    what = f"setting {'density.max_gaussians' if grown else 'initial.gaussians'}={count} with batch={config.batch}: "
+    remedy = "lower one of them, or network.width"
+    pairs = count * config.batch
+    if pairs * widest > MOST_NUMBERS:
+        raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
+    if not (mi.variant() or "").startswith("cuda"):
+        step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
+        require_memory(step + BYTES_PER_NUMBER * count * own, f"{what}a training step", remedy)

@@ -19,8 +19,8 @@ from scipy.sparse import csr_array
 from .. import __version__
 from ..backend.device import to_tensor
 from ..core import Receiver
+from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
-from ..core.files import write_arrays
 from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights
@@ -92,7 +92,7 @@ def write_weights(path: Path, key: str, weights: csr_array) -> None:
     """Store weights if the folder can be written."""
     parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
     try:
-        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts)
+        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
     except OSError:
         return
 
@@ -100,10 +100,10 @@ def write_weights(path: Path, key: str, weights: csr_array) -> None:
 def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:
     """Stored weights of ``shape``; None if there are none, or if they are damaged or have another key."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
-                return None
-            weights = csr_array(tuple(stored[name] for name in ("data", "indices", "indptr")), shape=shape)
+        stored = stored_arrays(path)
+        if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
+            return None
+        weights = csr_array(tuple(stored[name] for name in ("data", "indices", "indptr")), shape=shape)
         # SciPy's product checks nothing: an index out of range would end the process.
         weights.check_format(full_check=True)
     except Exception:  # numpy, zipfile and scipy raise a dozen kinds on damaged files

@@ -29,7 +29,7 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from .adam import NonFiniteReport
 from .config import TrainConfig
-from .fields import field_of
+from .fields import check_memory, check_params, field_of
 from .initial import initial_gaussians
 from .loop import TrainingLoop
 from .predictor import Predictor
@@ -105,9 +105,12 @@ class Trainer(TrainingLoop):
         self.record, self.split, self.config = record, split, config
         self.targets = targets_of(record, known, scene is not None)
         form = form_of(record, config, self.targets, known, scene is not None)
+        field = field or field_of(config, form)
+        if field is not None:
+            check_memory(config, field)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(
-            field or field_of(config, form),
+            field,
             receivers,
             form,
             scene,
@@ -150,6 +153,7 @@ class Trainer(TrainingLoop):
                 logger.warning("%d training rows do not suffice to choose a reach: no Gaussians", len(split.train))
                 state.reach_m = 0.0
         else:
+            check_params(self.graph.field, state.params(), "checkpoint.npz")
             self.graph.cover(self._sides, state.params())
         self.state = state
         self._held_scores = np.zeros(0)

@@ -21,7 +21,7 @@ from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
-from ...training.fields import field_of
+from ...training.fields import check_memory, check_params, field_of
 from ...training.initial import initial_gaussians
 from ...training.loop import Progress
 from ...training.packed import PACKED, pack_params, unpack_params
@@ -58,6 +58,7 @@ class FittedField(Fitted):
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
         self.field = field_of(config, self.form)
         self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
+        check_params(self.field, self.params, str(store / "model.npz"))
         self.uses_heading = self.form.headings
         self.carriers_hz = np.zeros(0) if self.form.carriers_hz is None else self.form.carriers_hz
 
@@ -177,6 +178,8 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         form = form_of(record, config, targets, known, scene is not None)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         field = field_of(config, form)
+        if field is not None:
+            check_memory(config, field)
         Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
         plan_rows(config, targets, rows, field is not None and scene is not None)
         drawn = np.random.default_rng([config.seed, 0])

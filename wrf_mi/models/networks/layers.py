@@ -13,6 +13,7 @@ from drjit import nn
 from numpy.typing import ArrayLike, NDArray
 
 from ...backend.device import to_tensor
+from ...core import InputError
 from ...core.angles import FloatArray
 from ...gaussians.encoding import encode, encoded_size
 
@@ -47,8 +48,21 @@ class Module:
         return {path: np.asarray(weight) for path, weight in self.state().items()}
 
     def on_device(self, weights: Mapping[str, NDArray[Any]]) -> Self:
-        """The same network with other weights, as single-precision tensors."""
+        """The same network with other weights, as single-precision tensors; errors as `check`."""
+        self.check(weights)
         return self.with_state({path: to_tensor(values) for path, values in weights.items()})
+
+    def check(self, weights: Mapping[str, NDArray[Any]]) -> None:
+        """Refuse other weights than those of this network: the backend ends the process on other shapes.
+
+        Raises:
+            InputError: a weight that is missing, of another shape, or not finite.
+        """
+        for path, like in self.state().items():
+            found = weights.get(path)
+            if found is None or found.shape != tuple(like.shape) or not np.isfinite(found).all():
+                text = "missing" if found is None else f"of shape {found.shape}, or not finite"
+                raise InputError(f"weight {path} is {text}, where the settings need {tuple(like.shape)}")
 
 
 def _mapped(value: Any, path: str, change: Callable[[str, Any], Any]) -> Any:

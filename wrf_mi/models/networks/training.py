@@ -184,6 +184,8 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
     beside["network"] = np.asarray(network.name)
     begun = "network" in stored and str(stored["network"]) == network.name
+    if begun:
+        network.module.check(under("param/", stored))
     state = FitState.from_arrays(stored, network.momentum) if begun else None
     trainer = NetworkTrainer(network, config, seed, state)
     trainer.seconds = float(stored.get("seconds", 0.0))

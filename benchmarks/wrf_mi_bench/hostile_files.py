@@ -1,0 +1,206 @@
+"""Damaged and hostile files: every reader is given changed files and has to refuse them in one line, or to read them.
+
+The readers run in a child process (``python -m wrf_mi_bench.hostile_files FOLDER READER FIRST COUNT``), which may crash
+or hang without harm; it goes on with the next input. Inputs follow from their number: each can be made again.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from wrf_mi.core import InputError
+from wrf_mi.core.files import append_line, one_line, write_atomically
+
+HANG_S = 10.0
+"""Time after which an input counts as a hang."""
+START_S = 180.0
+"""Time for a child to start and to compile its first kernels."""
+MEMORY_BYTES = 3 << 30
+"""Address space that readers may take beyond that of the process: Python raises `MemoryError` past it."""
+LARGEST_TEXT = 300
+"""Characters of a message."""
+STATE, RESULTS, SAMPLES = "state", "results.jsonl", "samples"
+NUMBERS = (0, -1, 1, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1)
+TEXTS = (
+    *(b"0", b"-1", b"1e308", b"nan", b"inf", b"100000", b"9999999999", b"1" * 5000, b"..", b"/etc/passwd", b"null"),
+    *(b"[]", b"{}", b"[1, 2]", b"{a: 1}", b"true", b"*a", b"&a", b"\xff\xfe", b"\0", b"\n\n", b"'", b'"', b"<!ENTITY>"),
+    *(b"!!python/object:os.system", b"2024-99-99", b"1:1:1", b"<<: *a", b"element vertex 99999999999"),
+)
+"""Pieces that replace numbers and words."""
+WORD = re.compile(rb"[\w.+-]+")
+
+
+def mutated(content: bytes, number: int, name: str) -> bytes:
+    """The content of a file with one to four changes, drawn for the number of the input and the reader."""
+    rng = random.Random(f"{name} {number}")
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        at = rng.randrange(len(data)) if data else 0
+        size = min(rng.choice((1, 2, 4, 8, 64)), len(data) - at)
+        match rng.randrange(8):
+            case 0 if data:
+                data[at] ^= 1 << rng.randrange(8)
+            case 1:
+                data[at : at + size] = rng.randbytes(size)
+            case 2:
+                del data[at:]
+            case 3:
+                del data[at : at + size]
+            case 4:
+                data[at:at] = data[at : at + size] * rng.choice((1, 2, 50))
+            case 5:
+                wide = rng.choice((4, 8))
+                data[at : at + wide] = (rng.choice(NUMBERS) % (1 << 8 * wide)).to_bytes(
+                    wide, rng.choice(("little", "big"))
+                )
+            case 6 | 7 if words := list(WORD.finditer(bytes(data[at : at + 4096]))):
+                word = rng.choice(words)
+                data[at + word.start() : at + word.end()] = rng.choice(TEXTS)
+    return bytes(data)
+
+
+def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str, Any]]:
+    """Give each reader ``count`` inputs, in child processes.
+
+    Args:
+        folder: folder for samples and results, which are used again.
+        names: readers (`wrf_mi_bench.hostile_samples.READERS`).
+        count: inputs of each.
+
+    Returns:
+        For each reader: ``reader``, ``inputs``, ``refused``, ``loaded``, ``failed`` (messages by number of the input),
+        ``slowest_s`` and ``largest_mb``, growth of the resident memory by one input.
+    """
+    from .hostile_samples import prepare
+
+    prepare(folder / SAMPLES)
+    (folder / RESULTS).unlink(missing_ok=True)
+    failures: dict[str, dict[int, str]] = {name: {} for name in names}
+    place, first = 0, 0
+    while place < len(names):
+        write_atomically(folder / STATE, f"{names[place]} {first}")
+        call = [sys.executable, "-m", __name__ if __name__ != "__main__" else "wrf_mi_bench.hostile_files"]
+        call += [str(folder), ",".join(names[place:]), str(first), str(count)]
+        with (folder / "errors.txt").open("w") as errors:
+            child = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors)
+            reason = _watched(child, folder / STATE)
+        if reason is None:
+            break
+        name, number = _state(folder)
+        failures[name][number] = reason
+        place, first = names.index(name), number + 1
+    found: dict[str, dict[str, Any]] = {}
+    for text in (folder / RESULTS).read_text().splitlines() if (folder / RESULTS).exists() else ():
+        one = json.loads(text)
+        total = found.setdefault(one["reader"], one)
+        if total is not one:
+            total["failed"] |= one["failed"]
+            total |= {key: total[key] + one[key] for key in ("refused", "loaded")}
+            total |= {key: max(total[key], one[key]) for key in ("slowest_s", "largest_mb")}
+    rows = []
+    for name in names:
+        empty = {"reader": name, "refused": 0, "loaded": 0, "failed": {}, "slowest_s": 0.0, "largest_mb": 0.0}
+        row = found.get(name, empty)
+        rows.append({**row, "inputs": count, "failed": row["failed"] | {str(k): v for k, v in failures[name].items()}})
+    return rows
+
+
+def _state(folder: Path) -> tuple[str, int]:
+    name, number = (folder / STATE).read_text().rsplit(maxsplit=1)
+    return name, int(number)
+
+
+def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
+    """Wait for a child; the reason why it ended in an input, or None."""
+    seen, since, started = "", time.monotonic(), False
+    while child.poll() is None:
+        time.sleep(0.2)
+        now = state.read_text()
+        if now != seen:
+            started = started or seen != ""
+            seen, since = now, time.monotonic()
+        elif time.monotonic() - since > (HANG_S if started else START_S):
+            child.kill()
+            child.wait()
+            return f"took more than {HANG_S:g} s"
+    return None if child.returncode == 0 else f"the process ended with status {child.returncode}"
+
+
+def _limit_memory() -> None:
+    import psutil
+
+    most = psutil.Process().memory_info().vms + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def _read_one(reader: Any, sample: Path) -> str | None:
+    """None where it loads, "" where it is refused in one line, else what went wrong."""
+    try:
+        reader.read(sample)
+    except InputError as error:
+        text = str(error)
+        return "" if "\n" not in text and len(text) < 2000 else f"more than one line: {text[:LARGEST_TEXT]}"
+    except BaseException as error:  # the point of the measurement
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        return f"{type(error).__name__}: {one_line(error)[:LARGEST_TEXT]}"
+    return None
+
+
+def main(folder: str, names: str, first: str, count: str) -> None:
+    """Read changed files; the state before each input, and results, are files in the folder."""
+    import logging
+
+    from .hostile_samples import READERS, warm
+
+    logging.disable(logging.CRITICAL)
+    place = Path(folder)
+    warm()
+    _limit_memory()
+    start = int(first)
+    for name in names.split(","):
+        reader, work = READERS[name], place / "work"
+        refused = loaded = 0
+        failed: dict[str, str] = {}
+        slowest = largest = 0.0
+        shutil.rmtree(work, ignore_errors=True)
+        shutil.copytree(place / SAMPLES / reader.group, work)
+        whole = (work / reader.file).read_bytes()
+        if (wrong := _read_one(reader, work)) is not None:
+            failed["whole"] = f"the whole file is not read: {wrong}"
+        for number in range(start, int(count)):
+            write_atomically(place / STATE, f"{name} {number}")
+            (work / reader.file).write_bytes(mutated(whole, number, name))
+            before, peak = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            wrong = _read_one(reader, work)
+            slowest = max(slowest, time.perf_counter() - before)
+            largest = max(largest, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1e3)
+            refused, loaded = refused + (wrong == ""), loaded + (wrong is None)
+            if wrong:
+                failed[str(number)] = wrong
+        result: Mapping[str, Any] = {"reader": name, "refused": refused, "loaded": loaded, "failed": failed}
+        append_line(place / RESULTS, json.dumps({**result, "slowest_s": slowest, "largest_mb": largest}))
+        start = 0
+    shutil.rmtree(place / "work", ignore_errors=True)
+
+
+def unpacked(text: str) -> bytes:
+    """Bytes of a sample that is stored in the source."""
+    import base64
+
+    return zlib.decompress(base64.b85decode(text))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

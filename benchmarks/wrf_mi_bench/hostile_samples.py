@@ -1,0 +1,278 @@
+"""Small valid files of every format that is read, and their readers, for `wrf_mi_bench.hostile_files`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import yaml
+from PIL import Image
+
+from wrf_mi.core import Paths, Receiver, Record
+from wrf_mi.core.array_files import write_arrays
+from wrf_mi.core.paths import load_paths, save_paths
+from wrf_mi.core.types import Split
+from wrf_mi.datasets import load, load_split, save_split, write_ble_folder, write_spectrum_folder
+from wrf_mi.datasets.argos import read_argos
+from wrf_mi.datasets.deepmimo import read_deepmimo
+from wrf_mi.datasets.nerf2_csi import write_nerf2_csi
+from wrf_mi.datasets.newrf import read_newrf, read_pickled_table
+from wrf_mi.models.checks import check_parts
+from wrf_mi.runs.api import open_run, train
+from wrf_mi.runs.prediction_file import read_inputs
+from wrf_mi.runs.results import read_run
+from wrf_mi.scene.folder import read_scene_folder, write_scene
+from wrf_mi.scene.materials import read_materials
+from wrf_mi.scene.mesh import read_mesh
+from wrf_mi.scene.plan_sources import read_plan
+from wrf_mi.scene.points import read_points
+from wrf_mi.scene.surfaces import Surface
+from wrf_mi.tracing import open_scene
+from wrf_mi.training.checkpoint import cut_log, read_checkpoint
+
+from .hostile_files import unpacked
+
+UP = np.array([0.0, 0, 0, 1])
+CARRIER_HZ = 2.4e9
+# A table of pandas 3.1 with columns of numbers and of arrays, by Python's pickle, protocol 5.
+PICKLE = (
+    "c-oy)O>fgc5RLOi+7zfjgd(AGLZp{eTo4DKX%m6c2vfDaR;#tMj;+{hYrR$zi3&J0w9?)f`a9vq4Q4lqk|1(n59_f#@9mq}H=j%2Ul(&`sd7SjkE"
+    "Wp3+EmiFf<_F!!Oj=BfVwJ@s4qZmPjVV=ELbDpk_k@3v=LEG`%EBq;~<RP!TZTO!c}dGAYtI7a|o!rB;!fo4njs8jnT>Xc@`z31~K#)GZDC;s>Bm"
+    "<<Yb;_DC;+yxyAKkZyGc~l?(wsdvcU$`6}<dgzKxXa18ZsL0PZBw(Y~;xXjkgNpQMWH$MhtwLoH;syJB?%7CNBQW^%Xrs?J|$<i#{yx#q)sx4}bG"
+    "DJ`zD4xAR1ao7aN|Ct|vHqsIg)J~YHPa=uEC(iv@ML|qe^2E<Eb09Cm(D%Zd3^?T|4#j8Yeo5!N2Lk=10*gW?IT^#e?nF^8O0Xd=P%}J{o22Jdby"
+    "IT(wuRE|7M=Z5aw@d8H=4B16HlJmVMV_LzXrinle!9gtK$f(cg5lbE-6pjc<GCWi-~33(Z~N^*$yf84c$?wA=go&jED@tf$R$dkUKYswYweyuUxa"
+    "%flz-pGDjFAvgQio*A#4jHDlPc=zeoq};L2d+I;a4)Awo_g}!5U465vcslH~(Q~K6qZrRBv`#vvCu49_k?U!+GsAI&r>!4T-e(Jy`k{?>l~hQym@"
+    "1|+POyVIU>H~i$@GS!j1qCmb!R*?<!X&YOj6UTGgLsO#96+;8i*Itz6l@FFpSSr(#sN@2`U*0sl#xPuhPtE`~mA>hgJ"
+)
+SMALL = ("initial.gaussians=8", "network.width=8", "steps=4", "density.every=0", "checkpoint_every=2", "log_every=1")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader: folder of its files, the file that is changed, and a function of the folder that reads it."""
+
+    group: str
+    file: str
+    read: Callable[[Path], Any]
+
+
+def _load(folder: Path) -> None:
+    check_parts(load(folder))
+
+
+def _of(reader: Callable[..., Any], group: str, *files: str) -> dict[str, Reader]:
+    return {file: Reader(group, file, partial(_read_file, reader, file)) for file in files}
+
+
+def _read_file(reader: Callable[..., Any], file: str, folder: Path) -> Any:
+    return reader(folder / file)
+
+
+def _predicted(name: str) -> Callable[[Path], Any]:
+    """Read a run folder and predict."""
+
+    def read(folder: Path) -> None:
+        run = open_run(folder / name)
+        run.predict([[2.0, 1.0, 1.0]])
+
+    return read
+
+
+def _predicted_by_operator(folder: Path) -> None:
+    run = open_run(folder / "field")
+    run.predict([[2.0, 1.0, 1.0]])
+    assert np.isfinite(run.predict([[2.0, 1.0, 1.0]]).mean).all()
+
+
+def _inputs(folder: Path) -> None:
+    read_inputs(folder / "inputs.csv", None)
+
+
+READERS: Mapping[str, Reader] = {
+    "spectra: gateway_info.yml": Reader("spectra", "gateway_info.yml", _load),
+    "spectra: tx_pos.csv": Reader("spectra", "tx_pos.csv", _load),
+    "spectra: train_index.txt": Reader("spectra", "train_index.txt", _load),
+    "spectra: 00001.png": Reader("spectra", "spectrum/00001.png", _load),
+    "ble: anchors.csv": Reader("ble", "anchors.csv", _load),
+    "ble: calibration_df.csv": Reader("ble", "calibration_df.csv", _load),
+    "nerf2-ble: gateway_position.yml": Reader("nerf2-ble", "gateway_position.yml", _load),
+    "nerf2-ble: gateway_rssi.csv": Reader("nerf2-ble", "gateway_rssi.csv", _load),
+    "nerf2-csi: base-station.yml": Reader("nerf2-csi", "base-station.yml", _load),
+    "nerf2-csi: csidata.npy": Reader("nerf2-csi", "csidata.npy", _load),
+    **{f"newrf: {k}": v for k, v in _of(read_newrf, "files", "room.npz").items()},
+    **{f"newrf: {k}": v for k, v in _of(read_pickled_table, "files", "table.pkl").items()},
+    **{f"argos: {k}": v for k, v in _of(read_argos, "files", "capture.hdf5").items()},
+    "deepmimo: params.json": Reader("deepmimo", "params.json", read_deepmimo),
+    "deepmimo: power.mat": Reader("deepmimo", "power_t000_tx000_r001.mat", read_deepmimo),
+    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.ply", "cloud.las", "cloud.laz").items()},
+    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.xyz", "cloud.npz").items()},
+    **{f"mesh: {k}": v for k, v in _of(read_mesh, "files", "box.ply", "box.stl", "box.obj", "box.glb").items()},
+    **{f"plan: {k}": v for k, v in _of(read_plan, "files", "plan.npz", "plan.yaml", "plan.png", "plan.csv").items()},
+    "scene: scene.xml": Reader("scene", "scene.xml", lambda folder: open_scene(folder / "scene.xml", CARRIER_HZ)),
+    "scene: floor.ply": Reader("scene", "meshes/floor.ply", lambda folder: open_scene(folder, CARRIER_HZ)),
+    "scene: scene.yml": Reader("scene", "scene.yml", read_scene_folder),
+    "scene: materials.yml": Reader("scene", "materials.yml", read_materials),
+    "run: config.yaml": Reader("runs", "kriging/config.yaml", _predicted("kriging")),
+    "run: split.npz": Reader("runs", "kriging/split.npz", _predicted("kriging")),
+    "run: model.npz of kriging": Reader("runs", "kriging/model.npz", _predicted("kriging")),
+    "run: model.npz of wrf-gs+": Reader("runs", "field/model.npz", _predicted("field")),
+    "run: operator0.npz": Reader("runs", "field/operator0.npz", _predicted_by_operator),
+    "run: checkpoint.npz": Reader("runs", "stopped/checkpoint.npz", lambda folder: read_checkpoint(folder / "stopped")),
+    "run: log.jsonl": Reader("runs", "stopped/log.jsonl", lambda folder: cut_log(folder / "stopped", 2)),
+    "run: predictions.npz": Reader("runs", "kriging/predictions.npz", lambda folder: read_run(folder / "kriging")),
+    "run: metrics.json": Reader("runs", "kriging/metrics.json", lambda folder: read_run(folder / "kriging")),
+    **{f"run: {k}": v for k, v in _of(load_paths, "files", "paths.npz").items()},
+    **{f"split: {k}": v for k, v in _of(load_split, "files", "split.npz").items()},
+    "predict: inputs.csv": Reader("files", "inputs.csv", _inputs),
+    "predict: inputs.npz": Reader("files", "inputs.npz", lambda folder: read_inputs(None, folder / "inputs.npz")),
+}
+"""All readers by name."""
+
+
+def warm() -> None:
+    """Import what readers import late, before memory is limited."""
+    from wrf_mi.backend import init
+
+    init("llvm", threads=1)
+    for name in ("h5py", "laspy", "lazrs", "scipy.io", "sionna.rt"):
+        __import__(name)
+
+
+def prepare_spectra(folder: Path) -> Record:
+    """Write a folder of twelve small spectra."""
+    rng = np.random.default_rng(0)
+    receiver = Receiver("gateway1", np.array([0.0, 0, 1]), UP, array_m=np.array([[0.1, 0, 0], [-0.1, 0, 0]]))
+    record = Record(
+        "spectra",
+        "spectrum",
+        rng.uniform(1, 4, (12, 3)),
+        (receiver,),
+        rng.uniform(0, 1, (1, 12, 9, 36)).astype(np.float32),
+        official=(np.arange(8), np.arange(8, 12)),
+        frequencies_hz=np.array([CARRIER_HZ]),
+    )
+    write_spectrum_folder(folder, record)
+    return record
+
+
+def prepare(folder: Path) -> None:
+    """Write all samples, if they are not there."""
+    if (folder / "done").exists():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    rng = np.random.default_rng(0)
+    made = prepare_spectra(folder / "spectra")
+    positions = made.tx_pos_m
+    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
+    common["frequencies_hz"] = made.frequencies_hz
+    anchors = tuple(Receiver(f"anchor{k}", np.array([float(k), 0, 1]), UP) for k in (1, 2))
+    powers = rng.uniform(-80, -40, (2, 12)).astype(np.float32)
+    strengths = Record("ble", "rssi", observation=powers, **{**common, "receivers": anchors})
+    write_ble_folder(folder / "ble", strengths)
+    channels = (rng.normal(size=(1, 12, 2, 4)) + 1j * rng.normal(size=(1, 12, 2, 4))).astype(np.complex64)
+    hz = CARRIER_HZ + 1e6 * np.arange(4)
+    station = {**common, "frequencies_hz": hz, "uplink": channels[0], "uplink_hz": hz - 1e8}
+    write_nerf2_csi(folder / "nerf2-csi", Record("csi", "csi", observation=channels, **station))
+    _write_nerf2_ble(folder / "nerf2-ble", positions, rng)
+    _write_deepmimo(folder / "deepmimo", rng)
+    _write_scene(folder / "scene")
+    _write_files(folder / "files", positions, rng)
+    _write_runs(folder)
+    (folder / "done").touch()
+
+
+def _write_nerf2_ble(folder: Path, positions: Any, rng: np.random.Generator) -> None:
+    folder.mkdir(parents=True)
+    (folder / "gateway_position.yml").write_text(yaml.safe_dump({"gateway1": [0.0, 0, 1], "gateway2": [3.0, 0, 1]}))
+    np.savetxt(folder / "tx_pos.csv", positions, delimiter=",", header="x,y,z", comments="")
+    powers = rng.uniform(-90, -40, (len(positions), 2))
+    np.savetxt(folder / "gateway_rssi.csv", powers, delimiter=",", header="gateway1,gateway2", comments="")
+
+
+def _write_deepmimo(folder: Path, rng: np.random.Generator) -> None:
+    from scipy.io import savemat
+
+    folder.mkdir(parents=True)
+    sets = {f"txrx_set_{k}": {"id": k, "is_tx": not k, "is_rx": bool(k), "num_points": 1 + 5 * k} for k in (0, 1)}
+    stated = {"version": "4.0.5", "rt_params": {"frequency": CARRIER_HZ}, "txrx_sets": sets, "scene": {"num_scenes": 1}}
+    (folder / "params.json").write_text(json.dumps(stated))
+    matrices = {name: rng.uniform(1, 90, (6, 3)) for name in ("phase", "aod_az", "aod_el", "aoa_az", "aoa_el")}
+    matrices |= {"power": rng.uniform(-100, -60, (6, 3)), "delay": rng.uniform(1e-8, 1e-6, (6, 3))}
+    matrices |= {"rx_pos": rng.uniform(-9, 9, (6, 3)), "tx_pos": np.array([[0.0, 0, 9]])}
+    for name, values in matrices.items():
+        savemat(folder / f"{name}_t000_tx000_r001.mat", {name: values.astype(np.float32)})
+
+
+def _write_scene(folder: Path) -> None:
+    corners = np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    above = corners + np.array([0.0, 0, 3])
+    surfaces = [Surface("floor", "floor", corners, faces), Surface("ceiling", "ceiling", above, faces)]
+    write_scene(folder, surfaces, frame="z upwards", source="made here")
+
+
+def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None:
+    import h5py
+    import laspy
+
+    folder.mkdir(parents=True)
+    cloud = rng.uniform(0, 4, (60, 3))
+    trimesh.PointCloud(cloud).export(folder / "cloud.ply")
+    np.savetxt(folder / "cloud.xyz", cloud)
+    write_arrays(folder / "cloud.npz", {"points": cloud}, compressed=True)
+    for suffix in ("las", "laz"):
+        las = laspy.create(point_format=0)
+        las.header.scales = [0.001] * 3
+        las.x, las.y, las.z = cloud.T
+        las.write(folder / f"cloud.{suffix}")
+    for suffix in ("ply", "stl", "obj", "glb"):
+        trimesh.creation.box((4, 5, 3)).export(folder / f"box.{suffix}")
+    grid = np.full((30, 40), -2.0)
+    grid[[0, -1]], grid[:, [0, -1]] = 2.0, 2.0
+    write_arrays(folder / "plan.npz", {"log_odds": grid, "row_0": np.asarray("top"), "resolution_m": np.asarray(0.1)})
+    Image.fromarray(np.where(grid > 0, 0, 255).astype(np.uint8)).save(folder / "plan.png")
+    facts = {"image": "plan.png", "resolution": 0.1, "origin": [0.0, 0.0, 0.0], "negate": 0}
+    (folder / "plan.yaml").write_text(yaml.safe_dump(facts))
+    (folder / "plan.csv").write_text("x,y\n0,0\n4,0\n4,3\n0,3\n0,0\n")
+    channels = rng.normal(size=12) + 1j * rng.normal(size=12)
+    room = {"tx_pos": np.zeros(3), "rx_pos": positions, "frequency_hz": np.asarray(CARRIER_HZ), "csi": channels}
+    write_arrays(folder / "room.npz", room, compressed=True)
+    (folder / "table.pkl").write_bytes(unpacked(PICKLE))
+    with h5py.File(folder / "capture.hdf5", "w") as stored:
+        samples = rng.integers(-99, 99, (4, 2, 448, 2), dtype=np.int16)
+        stored.create_dataset("Pilot_Samples", data=samples, compression="gzip")
+        stored.attrs.update({"num_mob_ant": 2, "samples_per_user": 224, "measured_noise": 0})
+    numbers: Any = np.arange(2.0)
+    ones: Any = np.ones((2, 3)) / np.sqrt(3)
+    kinds, nowhere = np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3))
+    rows = np.arange(2)
+    paths = Paths(
+        rows, rows * 0, numbers + 1j, numbers + 1.0, ones, ones, kinds, nowhere, np.zeros((2, 0), np.int32), (), 2, 1
+    )
+    save_paths(folder / "paths.npz", paths)
+    save_split(folder / "split.npz", Split("own", 0, np.arange(6), np.arange(6, 8), np.arange(8, 12)))
+    np.savetxt(folder / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")
+    write_arrays(folder / "inputs.npz", {"tx_pos": positions})
+
+
+def _write_runs(folder: Path) -> None:
+    from wrf_mi.backend import init
+    from wrf_mi.training.session import Interrupted
+
+    init("llvm", threads=1)
+    train(folder / "ble", folder / "runs" / "kriging", "kriging")
+    settings = (*SMALL, "network.static_geometry=true")
+    run = train(folder / "spectra", folder / "runs" / "field", settings=settings).folder
+    open_run(run).predict([[2.0, 1.0, 1.0]])  # builds the operator
+    asked = iter(range(1, 5))
+    try:
+        train(folder / "spectra", folder / "runs" / "stopped", settings=settings, stop=lambda: next(asked) >= 3)
+    except Interrupted:
+        return

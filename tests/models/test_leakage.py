@@ -1,0 +1,81 @@
+"""No model sees a test row: its arrays are the same, bit for bit, if the test rows hold NaN and infinity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from made_channels import channels
+
+from wrf_mi.backend import init
+from wrf_mi.core import Record, Split
+from wrf_mi.datasets import load
+from wrf_mi.models import MODELS, Problem, Session
+from wrf_mi.models.model import Arrays, default_settings
+
+STEPS = ("steps=3", "log_every=100", "validate_every=3")
+SMALL = ("initial.gaussians=8", "network.width=8", "density.every=0", *STEPS)
+SETTINGS = {
+    "wrf-gs": SMALL,
+    "wrf-gs+": SMALL,
+    "factorised": SMALL,
+    "trees": ("trees=5",),
+    "vae": (*STEPS, "width=8", "last=8"),
+    "dcgan": (*STEPS, "channels=8"),
+    "nerf2": (*STEPS, "samples=4", "rays=8"),
+    "fire": (*STEPS, "width=8"),
+    "optml": (*STEPS, "max_paths=2"),
+    "r2f2": ("max_paths=2",),
+    "hybrid": ("ingredients=kriging,idw",),
+    "ray-tracing": ("rays=1000", "max_depth=1"),
+}
+"""Settings of short fits; the others have none that matter."""
+TASK = {"ray-tracing": "rssi", "hybrid": "rssi", "physics": "rssi", "nerf2": "rssi", "wrf-gs+": "spectrum"}
+"""Task where a model serves several; the first one else."""
+WRONG = np.array([np.nan, np.inf, -np.inf])
+
+
+def broken(record: Record, rows: np.ndarray) -> Record:
+    """The record with values that are not finite throughout some rows."""
+    observation = record.observation.copy()
+    observation[:, rows] = np.resize(WRONG, observation[:, rows].shape)
+    return replace(record, observation=observation)
+
+
+def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arrays:
+    """Arrays of a fitted model."""
+    scene = None
+    if MODELS[name].scene == "required":
+        scene = str(folder / "room.ply")
+        trimesh.creation.box((20, 20, 10)).export(scene)
+    entry = MODELS[name].serving(record.task, scene is not None)
+    given = {"model": name, "seed": 0, "deterministic": True}
+    settings = default_settings(entry, SETTINGS.get(name, ()), given)
+    problem = Problem(record, settings, 0, scene, None if scene is None else "concrete")
+    session = Session(folder, folder)
+    if entry.prepare is not None:
+        problem.settings = entry.prepare(problem, [split], session)
+    return entry.fit(problem, split, session).arrays()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_test_rows_do_not_reach_the_fit(name: str, one_gateway: Record, flat_folder: Path, tmp_path: Path) -> None:
+    init("llvm", threads=1)
+    records = {"spectrum": one_gateway, "rssi": load(flat_folder), "csi": channels()}
+    record = records[TASK.get(name) or (MODELS[name].tasks or ("rssi",))[0]]
+    assert record.official is not None
+    train, test = record.official
+    split = Split("own", 0, train[:-3], train[-3:], test)
+    found = []
+    for version in (record, broken(record, test)):
+        folder = tmp_path / str(len(found))
+        folder.mkdir()
+        found.append(fitted_arrays(name, version, split, folder))
+    clean, other = found
+    assert clean.keys() == other.keys()
+    for key in clean.keys() - {"trace_seconds"}:
+        values = clean[key]
+        np.testing.assert_array_equal(np.asarray(values), np.asarray(other[key]), err_msg=key)

@@ -1,0 +1,140 @@
+"""Run folders under faults: locks, damaged files, leftovers of killed processes, and chunks of predictions."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import refused
+from small_fits import settings, stop_after
+
+from wrf_mi.core import InputError
+from wrf_mi.core.array_files import stored_array, stored_arrays, write_arrays
+from wrf_mi.core.files import remove_leftovers
+from wrf_mi.core.locks import LOCK, alone_in_process, locked_folder
+from wrf_mi.core.memory import require_memory
+from wrf_mi.runs import run as run_module
+from wrf_mi.runs.api import Interrupted, open_run, predict_to_file, resume, train
+from wrf_mi.training.checkpoint import cut_log
+
+DEAD = 2**22 + 1
+"""No process of Linux has this number."""
+
+
+@pytest.fixture(scope="module")
+def kriging(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(
+        flat_folder, tmp_path_factory.mktemp("runs") / "kriging", "kriging", settings=("heading=false",)
+    ).folder
+
+
+def test_a_folder_has_one_writer(tmp_path: Path) -> None:
+    second = pytest.raises(InputError, match="writes into it; wait for its end, or stop it")
+    with locked_folder(tmp_path), second, locked_folder(tmp_path):
+        pass
+    assert not (tmp_path / LOCK).exists()
+    (tmp_path / LOCK).write_text(f"{DEAD}\n")  # of a process that was killed
+    with locked_folder(tmp_path):
+        assert (tmp_path / LOCK).exists()
+
+
+def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:
+    found: list[str] = []
+
+    def other() -> None:
+        try:
+            train(flat_folder, tmp_path / "run", "idw")
+        except InputError as error:
+            found.append(str(error))
+
+    with alone_in_process():
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+    assert found[0].startswith("another thread of this process fits or scores a model; wait for its end")
+    assert not (tmp_path / "run").exists()
+
+
+def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
+    (tmp_path / f".model.npz.{DEAD}.part").touch()
+    (tmp_path / f".scene.{DEAD}.old").mkdir()
+    (tmp_path / ".model.npz.1.part").touch()  # process 1 runs
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"scene", ".model.npz.1.part"}
+
+
+def test_damaged_lines_of_the_log_are_dropped(tmp_path: Path) -> None:
+    whole = b'{"step": 2, "loss": 1.0}\n'
+    (tmp_path / "log.jsonl").write_bytes(whole + b'\xff\xfe\n[1]\n{"step": 4}\n{"step": 2, "lo')
+    cut_log(tmp_path, 3)
+    assert (tmp_path / "log.jsonl").read_bytes() == whole
+
+
+def test_changed_arrays_are_noticed(kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = kriging / "model.npz"
+    whole = file.read_bytes()
+    with np.load(file) as held:
+        arrays = dict(held)
+    name = next(key for key in arrays if key.endswith("weights"))
+    np.savez(file, **arrays | {name: arrays[name] + 1})
+    refused(["evaluate", kriging], "model.npz: not readable .*another checksum.*; train the run anew", capsys)
+    file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("change", ["shape", "nan"])
+def test_a_checkpoint_of_other_arrays_is_refused(change: str, folder: Path, tmp_path: Path) -> None:
+    """They are refused before the backend, which ends the process on other shapes."""
+    with pytest.raises(Interrupted):
+        train(folder, tmp_path / "run", settings=settings("steps=10"), stop=stop_after(4))
+    file = tmp_path / "run" / "checkpoint.npz"
+    arrays = stored_arrays(file)
+    for group in ("param", "mean", "first", "second"):
+        values = arrays[f"{group}/deform.0.bias"]
+        arrays[f"{group}/deform.0.bias"] = values[:-1] if change == "shape" else values * np.float32(np.nan)
+    write_arrays(file, arrays, checksum=True)
+    with pytest.raises(InputError, match="train the run anew"):
+        resume(tmp_path / "run")
+
+
+def test_sizes_are_checked_before_they_are_allocated(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"the array takes 931,323 GiB, and .* GiB of memory are free; lower its size"):
+        require_memory(1e15, "the array", "lower its size")
+    np.save(tmp_path / "lie.npy", np.zeros(3))
+    content = (tmp_path / "lie.npy").read_bytes()
+    (tmp_path / "lie.npy").write_bytes(content.replace(b"(3,), }          ", b"(30000000000,), }"))
+    with pytest.raises(ValueError, match=r"states \[30000000000\] numbers of float64, and has 152 bytes"):
+        stored_array(tmp_path / "lie.npy")
+
+
+def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"initial.gaussians=500000000 with batch=.*; lower one of them"):
+        train(folder, tmp_path / "run", settings=settings("initial.gaussians=500000000"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_chunks_give_the_predictions_of_all_at_once(
+    kriging: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    positions = np.random.default_rng(0).uniform(0, 3, (7, 3))
+    whole = open_run(kriging).predict(positions, 1).mean
+    monkeypatch.setattr(run_module, "PREDICTED_PER_CHUNK", 2)
+    monkeypatch.setattr(run_module, "MOST_PER_CHUNK", 3)
+    np.testing.assert_allclose(open_run(kriging).predict(positions, 1).mean, whole, rtol=1e-6)
+    predict_to_file(kriging, positions, tmp_path / "out.npz")
+    np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], whole, rtol=1e-6)
+
+
+@pytest.mark.parametrize("line", ["dataset: [1]", "seed: x", "task: 5", "n_train: {a: 1}", "model: [a]"])
+def test_odd_configurations_are_refused(
+    line: str, kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (kriging / "config.yaml").read_text().splitlines()
+    key = line.partition(":")[0]
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text("\n".join(line if one.startswith(f"{key}:") else one for one in text))
+    refused(["evaluate", run], "config.yaml", capsys)
+    assert json.loads((kriging / "metrics.json").read_text())["model"] == "kriging"

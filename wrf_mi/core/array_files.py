@@ -1,0 +1,131 @@
+"""Files of arrays, ``.npz`` and ``.npy``: written atomically, read without trust in what they state.
+
+A file is read into memory of the size that it states only if its content can fill it and the memory is there. Nothing
+is unpickled. With a checksum any change of names, types, shapes or numbers is noticed.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .digest import content_digest
+from .files import atomic_file
+from .memory import require_memory
+
+CHECKSUM = "wrf_mi/sha256"
+"""Key of the SHA-256 of all other arrays."""
+MOST_DEFLATED = 1032
+"""Largest ratio of DEFLATE (zlib's documentation, "Maximum compression factor")."""
+RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: MOST_DEFLATED}
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+REMEDY = "read it on a machine with more memory"
+
+
+@dataclass(frozen=True)
+class ArrayStream:
+    """An array that is written without being in memory: its shape, type and content in C order, in pieces."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    pieces: Iterable[bytes]
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
+    """Write an ``.npz`` file of plain arrays, or of `ArrayStream`, atomically.
+
+    Args:
+        path: file to write.
+        arrays: arrays by their names.
+        compressed: compress them.
+        checksum: add a checksum, which `stored_arrays` compares; not for `ArrayStream`.
+    """
+    stored = dict(arrays)
+    if checksum:
+        stored = {name: np.asarray(values) for name, values in arrays.items()}
+        stored[CHECKSUM] = np.asarray(content_digest(stored))
+    how = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with atomic_file(path) as part, zipfile.ZipFile(part, "w", how) as archive:
+        for name, values in stored.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if isinstance(values, ArrayStream):
+                    descr = np.lib.format.dtype_to_descr(values.dtype)
+                    header = {"descr": descr, "fortran_order": False, "shape": values.shape}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    for piece in values.pieces:
+                        member.write(piece)
+                else:
+                    np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+    return path
+
+
+def stored_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Arrays of an ``.npz`` file; call it within `wrf_mi.core.files.readable`.
+
+    Args:
+        path: the file.
+        names: arrays that are read if they are there; None: all, which are compared with the checksum if there is one.
+
+    Raises:
+        InputError: they do not fit into memory.
+        Exception: of a dozen kinds for a damaged file.
+    """
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        chosen = {name: info for name, info in members.items() if names is None or name in names}
+        for name, info in chosen.items():
+            if info.file_size > RATIOS.get(info.compress_type, 0) * min(info.compress_size, size):
+                raise ValueError(f"array {name} states more content than it has")
+        require_memory(sum(info.file_size for info in chosen.values()), f"{path}: its content", REMEDY)
+        arrays = {}
+        for name, info in chosen.items():
+            with archive.open(info) as member:
+                arrays[name] = _read_array(member, info.file_size)
+    if names is None and CHECKSUM in arrays and str(arrays.pop(CHECKSUM)) != content_digest(arrays):
+        raise ValueError("its content has changed since it was written: another checksum")
+    return arrays
+
+
+def stored_names(path: Path) -> set[str]:
+    """Names of the arrays of an ``.npz`` file; errors as `stored_arrays`."""
+    with zipfile.ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
+def stored_array(path: Path) -> NDArray[Any]:
+    """The array of a ``.npy`` file; errors as `stored_arrays`."""
+    size = path.stat().st_size
+    require_memory(size, f"{path}: its content", REMEDY)
+    with path.open("rb") as stream:
+        return _read_array(stream, size)
+
+
+def _read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
+    """The array of a stream in NumPy's format with ``size`` bytes."""
+    version = np.lib.format.read_magic(stream)
+    if version not in HEADERS:
+        raise ValueError(f"format {version} of NumPy")
+    shape, fortran, dtype = HEADERS[version](stream)
+    count = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject:
+        raise ValueError("objects, which would be unpickled")
+    if any(side < 0 for side in shape) or count > size - stream.tell():
+        raise ValueError(f"states {list(shape)} numbers of {dtype}, and has {size} bytes")
+    content = bytearray(count)
+    view, filled = memoryview(content), 0
+    while filled < count:
+        piece = stream.read(min(count - filled, 1 << 24))
+        if not piece:
+            raise ValueError("ends too early")
+        view[filled : filled + len(piece)] = piece
+        filled += len(piece)
+    stream.read(1)  # the archive compares its own checksum at the end
+    return np.ndarray(shape, dtype, content, order="F" if fortran else "C")

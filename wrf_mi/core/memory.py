@@ -1,0 +1,67 @@
+"""Memory that this process may still take, and refusal of what does not fit, before hours of work.
+
+A large allocation is estimated and compared with what is free: memory of the machine, the limit of its control group
+(containers, batch systems) and that of the process (``ulimit -v``). Beyond them the system ends the process without a
+message, or Python raises far from the setting that is too large.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+from .errors import InputError
+
+SMALL_BYTES = 1 << 26
+"""Allocations up to 64 MiB are not compared: an estimate of what is free is no better."""
+_CGROUP = Path("/sys/fs/cgroup")
+_UNLIMITED = 1 << 60
+"""Control groups of version 1 state about 2^63 where there is no limit."""
+
+
+def free_bytes() -> int:
+    """Bytes that this process may still allocate: of the machine, its control group and its own limits."""
+    free = [psutil.virtual_memory().available, *_cgroup_bytes()]
+    used = psutil.Process().memory_info()
+    for limit, taken in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
+        most, _ = resource.getrlimit(limit)
+        if most != resource.RLIM_INFINITY:
+            free.append(most - taken)
+    return max(int(min(free)), 0)
+
+
+def _cgroup_bytes() -> Iterator[int]:
+    """Free bytes of the control group, of version 2 or 1, as a container sees it; none without a limit."""
+    for limit, usage, cache in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        try:
+            most, taken = ((_CGROUP / name).read_text().strip() for name in (limit, usage))
+            words = (_CGROUP / limit).with_name("memory.stat").read_text().split()
+            reclaimed = int(words[words.index(cache) + 1]) if cache in words else 0
+            if most.isdecimal() and int(most) < _UNLIMITED:
+                yield int(most) - max(int(taken) - reclaimed, 0)
+        except (OSError, ValueError):
+            continue
+
+
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Refuse an allocation that does not fit.
+
+    Args:
+        needed: estimated bytes.
+        what: subject of the sentence, with the file or setting.
+        remedy: what to lower, or to do in its place.
+
+    Raises:
+        InputError: more than is free.
+    """
+    if needed > SMALL_BYTES and needed > (free := free_bytes()):
+        text = (
+            f"{what} takes {needed / 2**30:,.3g} GiB" if needed < 2**40 else f"{what} takes {needed / 2**30:,.0f} GiB"
+        )
+        raise InputError(f"{text}, and {free / 2**30:.3g} GiB of memory are free; {remedy}")

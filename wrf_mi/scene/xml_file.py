@@ -1,0 +1,70 @@
+"""Scene files of others for Mitsuba: read without entities, with known plugins, and with files of their own folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
+
+from ..core import InputError
+from ..core.files import inside, one_line
+
+PLUGINS = {
+    "shape": "ply obj serialized rectangle cube sphere disk cylinder shapegroup instance merge",
+    "bsdf": "radio-material itu-radio-material twosided diffuse roughplastic plastic principled conductor "
+    "roughconductor dielectric roughdielectric thindielectric mask bumpmap normalmap blendbsdf null",
+    "texture": "bitmap checkerboard uniform mesh_attribute volume",
+    "emitter": "area point constant envmap directional spot",
+    "sensor": "perspective thinlens orthographic",
+    "film": "hdrfilm",
+    "sampler": "independent stratified multijitter orthogonal ldsampler",
+    "rfilter": "box tent gaussian mitchell catmullrom lanczos",
+    "integrator": "path direct depth aov volpath",
+    "spectrum": "uniform regular irregular srgb d65 blackbody",
+}
+"""Plugins that a scene file may name, by the element that names them: geometry, materials and what pictures need."""
+VALUES = (
+    *("scene", "default", "string", "float", "integer", "boolean", "vector", "point", "rgb", "spectrum", "ref"),
+    *("transform", "translate", "rotate", "scale", "matrix", "lookat"),
+)
+"""Elements without a plugin. ``include``, ``path`` and ``alias`` are not among them: they reach other files."""
+FILES = ("filename",)
+"""Names of texts that are files."""
+DEEPEST = 64
+"""Most levels of elements: Mitsuba's reader calls itself for each."""
+
+
+def read_scene_xml(path: Path) -> Element:
+    """The root of a scene file.
+
+    Raises:
+        InputError: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
+    """
+    try:
+        root = parse(path, forbid_dtd=True).getroot()
+    except DefusedXmlException:
+        raise InputError(f"{path}: has a document type or entities; remove them") from None
+    except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
+    _check(root, path, 0)
+    return root
+
+
+def _check(element: Element, path: Path, depth: int) -> None:
+    if depth > DEEPEST:
+        raise InputError(f"{path}: elements within elements to more than {DEEPEST} levels; correct the scene")
+    tag, plugin = element.tag, element.get("type", "")
+    known = PLUGINS.get(tag, "").split()
+    if plugin not in known if plugin else tag not in VALUES:
+        what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
+        remedy = f"known are {', '.join(known or [*VALUES, *PLUGINS])}"
+        raise InputError(f"{path}: {one_line(what)} does not belong into a scene; {remedy}")
+    if tag in ("string", "default") and "$" in element.get("value", ""):
+        raise InputError(f"{path}: a value with a parameter ($); write the value in its place")
+    if tag == "string" and element.get("name") in FILES:
+        inside(path.parent, element.get("value", ""), path)
+    for child in element:
+        _check(child, path, depth + 1)
