@@ -33,7 +33,8 @@ def add_parser(commands: Any) -> None:
 def locate_command(a: Arguments) -> int:
     """Write positions to a file, and a picture beside it."""
     from ..core import InputError
-    from ..core.files import write_arrays, write_figure
+    from ..core.array_files import write_arrays
+    from ..core.files import write_figure
     from ..maps.locate import locate, located_run
     from ..maps.locate_figure import draw_positions
     from ..maps.locate_file import (

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..core import Antenna, DataFault, Record, receiver_arrays, stored_receivers
-from ..core.files import readable, stored_arrays, write_arrays
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import readable
 from .folder_files import single_file
 
 VERSION, FORMAT = "record_format", 1

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import readable, write_atomically
 from ..models.gaussian.model import PARAM
 from ..models.model import keyed, under
 from ..runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new

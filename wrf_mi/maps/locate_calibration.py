@@ -25,7 +25,8 @@ from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
-from ..core.files import readable, stored_arrays, write_arrays, write_atomically
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..models import Fitted, Session
 from ..models.held_out import fit_model, hold_out_folds, labelled
