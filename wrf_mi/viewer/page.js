@@ -211,9 +211,9 @@
     maps.sort((a, b) => (a.height ?? Infinity) - (b.height ?? Infinity));
     const names = Object.keys(data.quantities);
     Object.assign(state, { quantity: names[0], map: 0, mapOpacity: 0.9 });
-    const title = (one) => (one.z ? one.name : `${number(one.height, 2)} m (${one.name})`);
+    const title = (one) => (one.z ? `points (${one.name})` : `${number(one.height, 2)} m (${one.name})`);
     addLayer({
-      name: maps.length > 1 ? `maps (${maps.length})` : `map ${maps[0].name}`,
+      name: maps.length > 1 ? `maps (${maps.length})` : `map at ${title(maps[0])}`,
       scale: () => ["map", data.quantities[state.quantity].range, data.quantities[state.quantity].label],
       options: () => [
         choice("Quantity", names.map((name) => data.quantities[name].label), 0, (i) => (state.quantity = names[i])),
