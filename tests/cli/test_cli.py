@@ -66,7 +66,7 @@ def test_commands_are_complete() -> None:
         "compress",
         "compare",
     }
-    expected |= {"export", "import", "bench", "demo"}
+    expected |= {"map", "locate", "view", "export", "import", "bench", "demo"}
     assert {name[0] for name in commands(build_parser()) if name} == expected
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from ..backend.device import to_vectors
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..runs.folder import load_rows
@@ -101,6 +102,6 @@ def inside_scene(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
     from ..tracing.devices import solid_around
     from ..tracing.surfaces import scene_surfaces
 
-    origin = mi.Point3f(*np.ascontiguousarray(positions_m.T, np.float32))
+    origin = to_vectors(positions_m, mi.Point3f)
     below = np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, mi.Vector3f(0, 0, -1))), bool)
     return below & (solid_around(scene_surfaces(scene), positions_m) < 0)
