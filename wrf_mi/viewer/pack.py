@@ -12,6 +12,8 @@ LARGEST = 65534
 """Number of steps of a range."""
 MISSING = 65535
 """Code of a value that is not finite."""
+SMALLEST_RANGE = 1e-300
+"""Range below which numbers are packed as equal: the steps of a smaller one have few digits or underflow."""
 
 
 def packed(values: ArrayLike) -> dict[str, Any]:
@@ -31,7 +33,7 @@ def packed(values: ArrayLike) -> dict[str, Any]:
     known = numbers[finite]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     exact = array.dtype.kind in "iub" and high - low <= LARGEST
-    step = 1.0 if exact or high == low else (high - low) / LARGEST
+    step = 1.0 if exact or high - low < SMALLEST_RANGE else (high - low) / LARGEST
     codes = np.full(array.shape, MISSING, "<u2")
     codes[finite] = np.round((known - low) / step)
     return {
