@@ -390,7 +390,7 @@ def test_files_without_points_are_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"vertices": POINTS}, "points is not a file in the archive"),
+        ({"vertices": POINTS}, "no array points or xyz_m in it"),
         ({"points": POINTS[:, :2]}, r"expected points of shape \[m, 3\], got \[5, 2\]"),
         ({"points": POINTS[:0]}, "no points in it"),
         ({"points": np.array(["a", "b"])}, "no points to be read"),

@@ -38,6 +38,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
     """
     groups = _groups(read_runs(run_dirs))
     folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
     sections, drawn = [], []
     for done, (slug, runs) in enumerate(groups.items()):
         on_progress("comparing", done / len(groups))
@@ -45,7 +46,6 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
         drawn += shown
         files = [(folder / name, title) for name, title, _ in shown]
         sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
-    folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "compare.csv", [row for section in sections for row in section.scores], list(COLUMNS))
     found = [row for section in sections for row in difference_rows(section.differences)]
     write_csv(folder / "differences.csv", found, list(DIFFERENCES))

@@ -176,7 +176,7 @@ class Run:
         start, size = 0, PREDICTED_PER_CHUNK
         while start < len(inputs) or not start:
             rows = slice(start, min(start + size, len(inputs)))
-            found = self.fitted.predict(inputs.rows(rows) if len(inputs) > size else inputs, receiver)
+            found = self.fitted.predict(inputs if rows == slice(0, len(inputs)) else inputs.rows(rows), receiver)
             yield rows, found
             if rows.stop >= len(inputs):
                 return

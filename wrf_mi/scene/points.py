@@ -89,10 +89,10 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
         raise
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
+    if points.size == 0:
+        raise InputError(f"{file}: no points in it; give {FORMATS}")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{file}: expected points of shape [m, 3], got {list(points.shape)}")
-    if len(points) == 0:
-        raise InputError(f"{file}: no points in it; give {FORMATS}")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(f"{file}, point {bad[0] + 1}: not finite; remove that point")
@@ -163,6 +163,8 @@ def _read(file: Path) -> Any:
     match file.suffix.lower():
         case ".npz":
             arrays = stored_arrays(file, ("xyz_m", "points"))
+            if not arrays:
+                raise InputError(f"{file}: no array points or xyz_m in it; give one [m, 3]")
             return arrays["xyz_m" if "xyz_m" in arrays else "points"]
         case ".las" | ".laz":
             return _read_las(file)
