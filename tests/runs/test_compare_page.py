@@ -62,6 +62,7 @@ def strengths(
         prediction,
         truth,
         {"idw100": truth + reference_db},
+        None,
         {},
     )
 

@@ -15,6 +15,7 @@ from small_fits import settings
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.gaussians import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.static_signals import recorded_signals, static_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
@@ -104,7 +105,7 @@ def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch:
     stored = run / "operator0.npz"
     first = stored.read_bytes()
     with np.load(stored, allow_pickle=False) as arrays:
-        assert set(arrays.files) == {"format", "key", "data", "indices", "indptr"}
+        assert set(arrays.files) == {"format", "key", "data", "indices", "indptr", CHECKSUM}
     built = open_run(run).predictor()(TX)
 
     def never(*_: Any) -> None:

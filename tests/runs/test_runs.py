@@ -272,7 +272,7 @@ def test_damaged_configurations_are_refused(finished: Path, tmp_path: Path) -> N
     path = run / "config.yaml"
     for content in ("settings: [1", "just text", "", f"format: {FORMAT}\ndataset: x\n"):
         path.write_text(content)
-        with pytest.raises(InputError, match=r"config\.yaml: not readable") as caught:
+        with pytest.raises(InputError, match=r"config\.yaml: not ") as caught:
             resume(run)
         assert "\n" not in str(caught.value)
     path.write_text(f"format: {FORMAT - 1}\ndataset: x\n")

@@ -248,7 +248,7 @@ def test_command_traces_predicts_and_compares(
         assert stored["prediction"] == pytest.approx(read_run(out).prediction, abs=FLOAT32_DB)
         assert stored["receiver_name"].tolist() == ["anchor1", "anchor2"]
     page = compare([run, out], tmp_path / "compare").read_text()
-    assert page.count("ray-tracing") == 2
+    assert all(folder.name in page for folder in (run, out))
     assert "idw100" in page
 
 

@@ -167,6 +167,9 @@ def test_layout_is_recognised_by_files(tmp_path: Path) -> None:
         folder = tmp_path / layout.name
         folder.mkdir()
         name = layout.files[0] if layout.files else f"data{layout.suffixes[0]}"
-        (folder / name).touch()
+        if layout.array:
+            np.savez(folder / name, **{layout.array: np.array(1)})
+        else:
+            (folder / name).touch()
         assert layouts.layout_of(folder) is layout
         assert callable(layout.read)
