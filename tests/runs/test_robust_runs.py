@@ -115,13 +115,14 @@ def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) ->
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("largest", [3, 100], ids=["several", "rest at once"])
 def test_chunks_give_the_predictions_of_all_at_once(
-    kriging: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    largest: int, kriging: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     positions = np.random.default_rng(0).uniform(0, 3, (7, 3))
     whole = open_run(kriging).predict(positions, 1).mean
     monkeypatch.setattr(run_module, "PREDICTED_PER_CHUNK", 2)
-    monkeypatch.setattr(run_module, "MOST_PER_CHUNK", 3)
+    monkeypatch.setattr(run_module, "MOST_PER_CHUNK", largest)
     np.testing.assert_allclose(open_run(kriging).predict(positions, 1).mean, whole, rtol=1e-6)
     predict_to_file(kriging, positions, tmp_path / "out.npz")
     np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], whole, rtol=1e-6)
