@@ -249,7 +249,7 @@ def test_bad_calls_are_refused(
         ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
         (
             ["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=0"],
-            "k = 0: the blend needs at least one",
+            "k = 0: IDW needs at least one",
         ),
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),

@@ -28,7 +28,7 @@ class Csi(Task):
     level_kind, level_note = "gain", "mean of |h|^2 over antennas and subcarriers, in the unit of the data"
     note = (
         "CEA is the channel estimation accuracy, -10 log10 of the relative squared error over a sample's antennas "
-        "and subcarriers; the blend mixes the four nearest training rows by inverse squared distance; the copy of the "
+        "and subcarriers; IDW averages the four nearest training rows by inverse squared distance; the copy of the "
         "uplink takes each antenna's uplink coefficients for the downlink's."
     )
 

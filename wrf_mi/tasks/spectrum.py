@@ -31,7 +31,7 @@ class Spectrum(Task):
         "strong it is"
     )
     note = (
-        "SSIM is scikit-image's structural similarity with a data range of one; the blend mixes the four nearest "
+        "SSIM is scikit-image's structural similarity with a data range of one; IDW averages the four nearest "
         "training spectra by inverse squared distance."
     )
 

@@ -33,7 +33,7 @@ class InverseDistance:
 
     def __init__(self, k: int = 4, power: float = 2, softening_m: float = 0) -> None:
         if k < 1:
-            raise InputError(f"k = {k}: the blend needs at least one neighbour")
+            raise InputError(f"k = {k}: IDW needs at least one neighbour")
         if not softening_m >= 0:
             raise InputError(f"softening {softening_m} m: choose 0 or more")
         self.k, self.power, self.softening_m = k, power, softening_m
