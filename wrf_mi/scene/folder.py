@@ -17,7 +17,6 @@ import numpy as np
 import trimesh
 import yaml
 from defusedxml.common import DefusedXmlException
-from defusedxml.ElementTree import parse
 from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
@@ -27,6 +26,7 @@ from ..core.yaml_files import read_yaml
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .surfaces import Surface
+from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, f
 def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
     """Material of each shape of a scene file by the shape's name, and constants of materials of its own."""
     try:
-        root = parse(xml, forbid_dtd=True).getroot()
+        root = parsed_xml(xml)
         own = {
             bsdf.get("id", "").removeprefix("mat-"): {
                 value.get("name", ""): float(value.get("value", "nan")) for value in bsdf.findall("float")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -37,6 +38,11 @@ DEEPEST = 64
 """Most levels of elements: Mitsuba's reader calls itself for each."""
 
 
+def parsed_xml(path: Path) -> Element:
+    """The root of an XML file; `DefusedXmlException` where it has a document type or entities."""
+    return cast(Element, parse(path, forbid_dtd=True).getroot())
+
+
 def read_scene_xml(path: Path) -> Element:
     """The root of a scene file.
 
@@ -44,7 +50,7 @@ def read_scene_xml(path: Path) -> Element:
         InputError: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
     """
     try:
-        root = parse(path, forbid_dtd=True).getroot()
+        root = parsed_xml(path)
     except DefusedXmlException:
         raise InputError(f"{path}: has a document type or entities; remove them") from None
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
