@@ -16,6 +16,8 @@ from .bench import provenance
 Row = dict[str, str]
 STORED = Path("benchmarks/results")
 """Stored results, in a checkout."""
+MEASURED = "measured"
+"""Machine, versions and date of a stored part."""
 
 
 def line(what: str, value: str, asked: str = "") -> Row:
@@ -36,12 +38,12 @@ def stored_part(benchmark: str, name: str, measure: Callable[[], dict[str, Any]]
     Parts are stored when they are done, with machine, versions and date, so that a measurement of many hours goes on,
     on another machine too. A part is measured again where its file is deleted.
     """
-    return dict(kept(STORED / benchmark / f"{name}.json", lambda: {**provenance(), **measure()}))
+    return dict(kept(STORED / benchmark / f"{name}.json", lambda: {MEASURED: provenance(), **measure()}))
 
 
 def measured_on(parts: Iterable[Mapping[str, Any]]) -> str:
     """First and last date of the parts of a benchmark."""
-    dates = sorted({part["date"] for part in parts})
+    dates = sorted({part[MEASURED]["date"] for part in parts})
     return dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
 
 

@@ -30,7 +30,7 @@ from wrf_mi.synthetic.room_bands import NAME as BANDS
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT
-from .comparison import data_folder, line, measured_on, stored_part
+from .comparison import MEASURED, data_folder, line, measured_on, stored_part
 from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
 
@@ -43,9 +43,8 @@ OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these r
 SCORE_DIGITS = 4
 """Decimals of stored scores: finer than any difference that is reported."""
 PAIRS = "pairs"
-FACTS = (PAIRS, "inside_90", "crps", "task")
+FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 """What is known of a measurement beside the scores of the methods."""
-PROVENANCE = ("date", "machine", "versions", "worker_threads")
 AT_CARRIERS = "kriging,idw,ray-tracing"
 AT_RECEIVERS = "physics,mri,ray-tracing"
 """Ingredients of the hybrid at a new carrier, and at a receiver without any row."""
@@ -104,7 +103,7 @@ def _facts(hybrid: Results) -> dict[str, Any]:
     """Intervals and task of the hybrid; names of the receivers and rows of all scores, in their order."""
     known = np.isfinite(np.asarray(hybrid.score, float)[:, np.argsort(hybrid.row)])
     pairs = [[hybrid.receivers[r], int(np.sort(hybrid.row)[i])] for r, i in np.argwhere(known)]
-    return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:]}}
+    return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:-1]}}
 
 
 def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
@@ -178,7 +177,7 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
     """
     task = TASKS[found[0]["task"]]
     sign = 1 if task.higher_is_better else -1
-    names = [name for name in found[0] if name not in (*FACTS, *PROVENANCE)]
+    names = [name for name in found[0] if name not in FACTS]
     pairs = [tuple(pair) for one in found for pair in one[PAIRS]]
     place = {pair: k for k, pair in enumerate(dict.fromkeys(pairs))}
     number = np.array([place[pair] for pair in pairs])

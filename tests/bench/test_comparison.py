@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from wrf_mi_bench.comparison import STORED, measured_on, stored_part
+from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 
 
 def test_part_is_measured_once_and_stored_with_machine_and_date(
@@ -21,12 +21,14 @@ def test_part_is_measured_once_and_stored_with_machine_and_date(
     first, second = stored_part("check", "part", measure), stored_part("check", "part", measure)
     assert (len(calls), first) == (1, second)
     assert first["score"] == 0.5
-    assert {"date", "machine", "versions"} <= set(first)
+    assert {"date", "machine", "versions"} <= set(first[MEASURED])
     (STORED / "check" / "part.json").unlink()
     stored_part("check", "part", measure)
     assert len(calls) == 2
 
 
 def test_dates_of_parts() -> None:
-    assert measured_on([{"date": "2026-01-02"}]) == "2026-01-02"
-    assert measured_on([{"date": "2026-01-02"}, {"date": "2025-12-31"}]) == "2025-12-31 to 2026-01-02"
+    assert measured_on([{MEASURED: {"date": "2026-01-02"}}]) == "2026-01-02"
+    assert (
+        measured_on([{MEASURED: {"date": day}} for day in ("2026-01-02", "2025-12-31")]) == "2025-12-31 to 2026-01-02"
+    )
