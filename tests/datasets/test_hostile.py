@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import laspy
+import numpy as np
 import pytest
 from PIL import Image
 from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from wrf_mi.core import InputError
-from wrf_mi.core.files import inside
+from wrf_mi.core.files import inside, one_line
 from wrf_mi.core.yaml_files import read_yaml
 from wrf_mi.datasets import load
 from wrf_mi.scene.plan_sources import read_plan
+from wrf_mi.scene.points import read_points
 from wrf_mi.scene.surfaces import mesh_parts
 from wrf_mi.scene.xml_file import read_scene_xml
 
@@ -89,3 +92,25 @@ def test_faces_without_their_vertices_are_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
     with pytest.raises(InputError, match="cannot be read as a mesh"):
         mesh_parts(tmp_path / "bad.obj")
+
+
+def test_vertices_of_two_coordinates_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 1 1\nf 1 2 3\n")
+    with pytest.raises(InputError, match=r"vertices of shape \[3, 2\]"):
+        mesh_parts(tmp_path / "flat.obj")
+
+
+@pytest.mark.parametrize(("at", "what"), [(100, "records"), (243, "extended records")])
+def test_a_scan_that_states_records_without_end_is_refused(at: int, what: str, tmp_path: Path) -> None:
+    cloud = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    cloud.xyz = np.zeros((5, 3))
+    cloud.write(tmp_path / "cloud.las")
+    content = bytearray((tmp_path / "cloud.las").read_bytes())
+    content[at : at + 4] = b"\xff" * 4
+    (tmp_path / "cloud.las").write_bytes(content)
+    with pytest.raises(InputError, match=f"states 4294967295 {what}, and has"):
+        read_points(tmp_path / "cloud.las")
+
+
+def test_messages_of_other_libraries_are_short() -> None:
+    assert len(one_line(ValueError("1" * 5000))) < 500

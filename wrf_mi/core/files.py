@@ -17,9 +17,14 @@ LONGEST = 300
 """Most characters of another library's message: some hold the damaged content."""
 
 
+MOST_MESSAGE = 400
+"""Characters that are shown of another library's message: some repeat the content of a file."""
+
+
 def one_line(error: object) -> str:
     """The message of another library's error on one line."""
-    return " ".join(str(error).split())
+    text = " ".join(str(error).split())
+    return text if len(text) <= MOST_MESSAGE else f"{text[:MOST_MESSAGE]} ..."
 
 
 _REMEDIES = {

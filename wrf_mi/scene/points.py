@@ -27,6 +27,10 @@ LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 MOST_LAZ = 1000
 """Largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred."""
+LAS_HEADER, LAS_MINOR, LAS_EXTENDED = 375, 25, 4
+"""Bytes of the header of LAS 1.4, place of its minor version, and the version from which extended records exist."""
+LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
+"""Places of the numbers (32 bits) of variable-length records in the header, and the least bytes of a record."""
 LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads LAZ beside its points, and the time that it has."""
 CORE = (0.005, 0.995)
@@ -141,6 +145,12 @@ def _read_las(file: Path) -> Any:
     """Points of a LAS or LAZ file, whose header must not state more than the file can hold."""
     size = file.stat().st_size
     laspy = lidar_package("laspy")
+    with file.open("rb") as stream:
+        head = stream.read(LAS_HEADER).ljust(LAS_HEADER, b"\0")
+    for what, at, least in LAS_RECORDS:  # laspy reads as many as are stated, beyond the end of the file, too
+        records = int.from_bytes(head[at : at + 4], "little")
+        if (what == "records" or head[LAS_MINOR] >= LAS_EXTENDED) and records * least > size:
+            raise ValueError(f"states {records} {what}, and has {size} bytes")
     with laspy.open(file) as source:
         header = source.header
         packed, needed = header.are_points_compressed, header.point_count * header.point_format.size

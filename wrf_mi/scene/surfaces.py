@@ -63,6 +63,8 @@ def mesh_parts(path: str | Path) -> list[Any]:
         found = [part for part in parts if len(getattr(part, "faces", ()))]
         for part in found:
             faces, count = np.asarray(part.faces), len(part.vertices)
+            if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
+                raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
             if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
                 raise ValueError(f"a face names a vertex that is not among its {count}")
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
