@@ -4,6 +4,7 @@ import functools
 import hashlib
 import shutil
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -101,6 +102,17 @@ def test_a_corrupted_file_is_refused_and_nothing_is_left(server: tuple[str, Path
     with pytest.raises(InputError, match=r"00004\.png has not the published SHA-256") as error:
         download(DATASET, entries, tmp_path / "home" / "small", url, retries=0, progress=progress)
     assert "\n" not in str(error.value)
+    assert list((tmp_path / "home").iterdir()) == []
+
+
+def test_a_file_without_end_is_refused_and_nothing_is_left(
+    server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    url, root = server
+    entries = manifest(small_folder(root / "abc123"))
+    monkeypatch.setattr(sys.modules[download.__module__], "MOST_BYTES", 100)
+    with pytest.raises(InputError, match="is larger than any published file, nothing was kept"):
+        download(DATASET, entries, tmp_path / "home" / "small", url, retries=0)
     assert list((tmp_path / "home").iterdir()) == []
 
 

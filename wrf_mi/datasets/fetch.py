@@ -7,10 +7,13 @@ of the original, which is not kept.
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pooch
@@ -30,6 +33,8 @@ RETRIES = 2
 """Number of further attempts after a failure."""
 TIMEOUT_S = 30
 """Seconds without an answer after which a download fails."""
+MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
+"""Largest download of a file that is kept (those known have less than 1 MB), and of one that is converted."""
 
 
 def fetch(
@@ -89,7 +94,7 @@ def download(
         for entry in entries:  # pooch makes folders too, but not if two threads do at once
             (part / entry.path).parent.mkdir(parents=True, exist_ok=True)
         store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=retries)
-        _fetch_all(store, dataset.name, progress)
+        _fetch_all(store, dataset.name, progress, {entry.path for entry in entries if entry.converted})
         for entry in entries:
             if entry.converted:
                 _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
@@ -112,8 +117,31 @@ def _convert(path: Path, entry: RemoteFile, source: str) -> None:
     write_arrays(path, arrays, compressed=True)
 
 
-def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
-    downloader = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+class _TooLarge(Exception):
+    """A server sends more than a file can have."""
+
+
+class _Bounded(io.FileIO):
+    """A file that takes a number of bytes at most."""
+
+    def __init__(self, path: str, most: int) -> None:
+        super().__init__(path, "w")
+        self.left = most
+
+    def write(self, data: Any) -> int:
+        self.left -= len(data)
+        if self.left < 0:
+            raise _TooLarge
+        return super().write(data)
+
+
+def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str]) -> None:
+    whole = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+
+    def bounded(url: str, path: str, store: pooch.Pooch, most: int) -> None:
+        with _Bounded(path, most) as file:
+            whole(url, file, store)
+
     logger = pooch.get_logger()
     level = logger.level
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
@@ -123,7 +151,10 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
     ):
         task = bar.add_task(f"fetching {name}", total=len(store.registry))
         logger.setLevel(logging.WARNING)  # one line per file otherwise
-        jobs = {pool.submit(store.fetch, path, downloader=downloader): path for path in store.registry}
+        jobs = {}
+        for path in store.registry:
+            most = MOST_CONVERTED if path in converted else MOST_BYTES
+            jobs[pool.submit(store.fetch, path, downloader=partial(bounded, most=most))] = path
         try:
             for job in as_completed(jobs):
                 error, url = job.exception(), store.get_url(jobs[job])
@@ -132,6 +163,9 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool) -> None:
                 if isinstance(error, requests.exceptions.RequestException):
                     remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
                     raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
+                if isinstance(error, _TooLarge):
+                    text = f"{url} is larger than any published file, nothing was kept"
+                    raise InputError(f"data set {name}: {text}; check the mirror") from None
                 if isinstance(error, ValueError):  # raised by pooch for a wrong hash
                     text = f"{url} has not the published SHA-256, nothing was kept"
                     raise InputError(f"data set {name}: {text}; try again") from None
