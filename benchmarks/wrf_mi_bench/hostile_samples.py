@@ -24,6 +24,13 @@ from wrf_mi.datasets.argos import read_argos
 from wrf_mi.datasets.deepmimo import read_deepmimo
 from wrf_mi.datasets.nerf2_csi import write_nerf2_csi
 from wrf_mi.datasets.newrf import read_newrf, read_pickled_table
+from wrf_mi.exports import export
+from wrf_mi.exports.field_file import import_field
+from wrf_mi.exports.format import ExportOptions
+from wrf_mi.exports.paths_table import read_paths
+from wrf_mi.maps.api import radio_map
+from wrf_mi.maps.dataset import write_map
+from wrf_mi.maps.locate_file import read_observations
 from wrf_mi.models.checks import check_parts
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.prediction_file import read_inputs
@@ -36,6 +43,7 @@ from wrf_mi.scene.points import read_points
 from wrf_mi.scene.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.training.checkpoint import cut_log, read_checkpoint
+from wrf_mi.viewer.map_layer import read_map
 
 from .hostile_files import unpacked
 
@@ -95,6 +103,16 @@ def _inputs(folder: Path) -> None:
     read_inputs(folder / "inputs.csv", None)
 
 
+def _observations(folder: Path) -> None:
+    read_observations(folder / "heard.csv", [Receiver(name, np.zeros(3), UP) for name in ("one", "other")])
+
+
+def _imported(folder: Path) -> None:
+    out = folder / "imported"
+    shutil.rmtree(out, ignore_errors=True)
+    import_field(folder / "field.npz", out).predict([[2.0, 1.0, 1.0]])
+
+
 READERS: Mapping[str, Reader] = {
     "spectra: gateway_info.yml": Reader("spectra", "gateway_info.yml", _load),
     "spectra: tx_pos.csv": Reader("spectra", "tx_pos.csv", _load),
@@ -130,6 +148,12 @@ READERS: Mapping[str, Reader] = {
     "run: metrics.json": Reader("runs", "kriging/metrics.json", lambda folder: read_run(folder / "kriging")),
     **{f"run: {k}": v for k, v in _of(load_paths, "files", "paths.npz").items()},
     **{f"split: {k}": v for k, v in _of(load_split, "files", "split.npz").items()},
+    **{f"paths: {k}": v for k, v in _of(read_paths, "files", "paths.csv").items()},
+    **{f"map: {k}": v for k, v in _of(read_map, "runs", "map.nc", "surface.nc").items()},
+    "map: chunk of map.zarr": Reader("runs", "map.zarr/power_dbm/0.0.0", lambda folder: read_map(folder / "map.zarr")),
+    "map: .zmetadata": Reader("runs", "map.zarr/.zmetadata", lambda folder: read_map(folder / "map.zarr")),
+    "import: field.npz": Reader("runs", "field.npz", _imported),
+    "locate: heard.csv": Reader("files", "heard.csv", _observations),
     "predict: inputs.csv": Reader("files", "inputs.csv", _inputs),
     "predict: inputs.npz": Reader("files", "inputs.npz", lambda folder: read_inputs(None, folder / "inputs.npz")),
 }
@@ -257,6 +281,7 @@ def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None
         rows, rows * 0, numbers + 1j, numbers + 1.0, ones, ones, kinds, nowhere, np.zeros((2, 0), np.int32), (), 2, 1
     )
     save_paths(folder / "paths.npz", paths)
+    (folder / "heard.csv").write_text("x,y,rssi_one,other_dbm\n1,2,-60.5,-71\n2,2,,-70\n")
     save_split(folder / "split.npz", Split("own", 0, np.arange(6), np.arange(6, 8), np.arange(8, 12)))
     np.savetxt(folder / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")
     write_arrays(folder / "inputs.npz", {"tx_pos": positions})
@@ -267,9 +292,16 @@ def _write_runs(folder: Path) -> None:
     from wrf_mi.training.session import Interrupted
 
     init("llvm", threads=1)
-    train(folder / "ble", folder / "runs" / "kriging", "kriging")
+    strengths = train(folder / "ble", folder / "runs" / "kriging", "kriging")
+    where = ExportOptions(frequency_hz=CARRIER_HZ, tx_pos_m=np.array([[1.0, 2, 1]]), rx_pos_m=np.array([[3.0, 1, 2]]))
+    export(folder / "scene", "paths", folder / "files" / "paths.csv", where)
+    made = radio_map(strengths, height_m=1.0, step_m=0.5)
+    write_map(made, folder / "runs" / "map.nc")
+    write_map(made, folder / "runs" / "map.zarr")
+    write_map(radio_map(strengths, surface=folder / "files" / "box.ply"), folder / "runs" / "surface.nc")
     settings = (*SMALL, "network.static_geometry=true")
     run = train(folder / "spectra", folder / "runs" / "field", settings=settings).folder
+    export(run, "field", folder / "runs" / "field.npz")
     open_run(run).predict([[2.0, 1.0, 1.0]])  # builds the operator
     asked = iter(range(1, 5))
     try:

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..core import InputError
 from ..core.array_files import stored_arrays, write_arrays
-from ..core.files import readable, write_atomically
+from ..core.files import atomic_folder, readable
 from ..models.gaussian.model import PARAM
 from ..models.model import keyed, under
 from ..runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new
@@ -76,10 +76,11 @@ def import_field(file: str | Path, out: str | Path) -> Run:
         model = {key: values for key, values in arrays.items() if not key.startswith(SPLIT_ARRAYS)}
         if CONFIG not in texts or not split:
             raise InputError(f"{path}: incomplete; export it again")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_arrays(folder / SPLIT, split)
-    write_arrays(folder / FITTED, model, compressed=True)
-    for name, text in sorted(texts.items(), reverse=True):
-        write_atomically(folder / name, text)
-    check_format(folder)
+    with atomic_folder(folder, replace=True) as part:  # `check_new` leaves nothing that could be lost
+        write_arrays(part / SPLIT, split)
+        write_arrays(part / FITTED, model, compressed=True)
+        for name, text in texts.items():
+            (part / name).write_text(text, encoding="utf-8")
+        check_format(part)
+        open_run(part)
     return open_run(folder)
