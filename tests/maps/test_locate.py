@@ -20,7 +20,7 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.maps.grid import grid_over
 from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_area import Candidates
+from wrf_mi.maps.locate_area import Candidates, candidates_of
 from wrf_mi.maps.locate_calibration import FILE, Located, Predicted, choose, fit_silence, widest
 from wrf_mi.maps.locate_file import read_observations
 from wrf_mi.maps.locate_knn import Neighbours
@@ -297,3 +297,16 @@ def test_widest_form_within_a_standard_error_is_chosen() -> None:
     alike = [np.zeros(100), -0.01 + 0.5 * noise[0], -1 + 0.5 * noise[1]]
     assert widest(forms, alike) == forms[1]
     assert widest(forms, [np.zeros(100), np.full(100, -0.01), np.full(100, -1.0)]) == forms[0]
+
+
+def test_candidates_do_not_depend_on_test_rows(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    at = np.column_stack([rng.uniform(0.5, 5.5, (40, 2)), np.ones(40)])
+    moved = at.copy()
+    moved[30:] = [50.0, -50.0, 9.0]
+    first, second = (
+        candidates_of(train(record_of(known, strengths(known), 30), tmp_path / name, "kriging"))
+        for known, name in ((at, "first"), (moved, "second"))
+    )
+    np.testing.assert_array_equal(first.positions_m, second.positions_m)
+    assert first.grid.height_m == 1.0

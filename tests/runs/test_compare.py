@@ -271,3 +271,28 @@ def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
     row, column = np.argwhere(yellow).mean(axis=0)
     assert column == pytest.approx(150, abs=2)
     assert row == pytest.approx(150 * (1 - 30 / 90), abs=2)
+
+
+def test_comparison_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    run, out = make_run(tmp_path / "run"), tmp_path / "out"
+    compare([run], out)
+    (out / "old.png").write_bytes(b"")
+    page = compare([run], out).read_text()
+    assert not (out / "old.png").exists()
+
+    def fail(*_):
+        raise RuntimeError("no picture")
+
+    monkeypatch.setattr("wrf_mi.runs.compare.write_figure", fail)
+    for folder in (out, tmp_path / "new"):
+        with pytest.raises(RuntimeError, match="no picture"):
+            compare([run], folder)
+    assert (out / "index.html").read_text() == page
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
+
+
+def test_folders_of_other_content_are_refused(tmp_path):
+    run = make_run(tmp_path / "run")
+    with pytest.raises(InputError, match="something else than a comparison"):
+        compare([run], run)
+    assert (run / "metrics.json").is_file()

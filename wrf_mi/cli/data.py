@@ -46,9 +46,10 @@ def list_command(a: Arguments) -> int:
     if a.json:
         print_json(rows)
         return 0
+    width = max(len(row["name"]) for row in rows) + 1
     for row in rows:
-        print(f"{row['name']:<19}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
-        print(f"{'':<19}{row['origin']}")
+        print(f"{row['name']:<{width}}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
+        print(f"{'':<{width}}{row['origin']}")
     return 0
 
 

@@ -151,6 +151,11 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
 
     Raises:
         InputError: no ``=``, an unknown key, or a value of the wrong type or out of its range.
+
+    >>> from wrf_mi import TrainConfig
+    >>> config = with_settings(TrainConfig(), ["steps=200", "initial.gaussians=500"])
+    >>> config.steps, config.initial.gaussians
+    (200, 500)
     """
     values: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]
     known = [name for name, _ in flat(values)]

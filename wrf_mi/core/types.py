@@ -28,6 +28,12 @@ class Receiver:
         orientation_xyzw: unit quaternion, receiver's frame to world.
         antenna: antenna of the receiver, or of each element of its array.
         array_m: elements of its antenna array [m, 3], receiver's frame, metres; None: a single antenna or unknown.
+
+    A receiver whose frame is turned by 90 degrees about the vertical:
+
+    >>> receiver = Receiver("anchor1", np.array([0.0, 0, 2]), np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)]))
+    >>> (receiver.to_world @ [1, 0, 0]).round(6) + 0.0
+    array([0., 1., 0.])
     """
 
     name: str
@@ -76,6 +82,14 @@ class Record:
         runs: run of the measurement, such as a day or a session, in which each row was taken, texts [n]; None where
             unknown.
         source: file or folder of the data.
+
+    Signal strengths of two transmitter positions at one receiver:
+
+    >>> receiver = Receiver("anchor1", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    >>> strengths = np.array([[-40.0, -46.0]], np.float32)
+    >>> record = Record("made-up", "rssi", np.array([[1.0, 0, 0], [2, 0, 0]]), (receiver,), strengths)
+    >>> len(record), record.observation.shape
+    (2, (1, 2))
     """
 
     name: str
@@ -174,6 +188,9 @@ class Split:
     such a receiver and a training row [q, 2], and scores are of these receivers alone.
     ``validation`` rows are training data, kept apart from ``train`` while settings are chosen; the final fit uses both
     (``all_train``).
+
+    >>> Split("mine", 0, train=np.array([0, 3]), validation=np.array([1]), test=np.array([2])).all_train
+    array([0, 1, 3])
     """
 
     name: str

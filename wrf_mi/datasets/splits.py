@@ -79,6 +79,16 @@ def make_splits(
     Raises:
         InputError: an unknown name, a rule that the record cannot follow, a part without any row that was received, or
             numbers out of range.
+
+    >>> from wrf_mi import Receiver
+    >>> receiver = Receiver("anchor1", np.zeros(3), np.array([0.0, 0, 0, 1]))
+    >>> positions_m = np.random.default_rng(0).uniform(0, 5, (50, 3))
+    >>> record = Record("made-up", "rssi", positions_m, (receiver,), np.full((1, 50), -50, np.float32))
+    >>> split = make_splits(record, "random", n_train=20)[0]
+    >>> len(split.train), len(split.validation), len(split.test)
+    (18, 2, 10)
+    >>> [one.name for one in make_splits(record, "blocked")]
+    ['blocked:0', 'blocked:1', 'blocked:2', 'blocked:3', 'blocked:4']
     """
     if not 0 <= validation_fraction < 1:
         raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core import InputError
-from ..core.carriers import FREQUENCY
+from ..core.carriers import FREQUENCY, carriers_text
 from ..core.receivers import receiver_index
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
@@ -129,8 +129,7 @@ def _check(
 def _check_carrier(run: Run, frequency_hz: float | None) -> None:
     known = run.problem.record.carriers_hz
     if frequency_hz is None and known is not None and run.model.several_carriers:
-        first = ", ".join(f"{one:.10g}" for one in np.unique(known)[:4])
-        raise InputError(f"{run.folder}: its data have several carriers ({first} Hz); give the frequency of the map")
+        raise InputError(f"{run.folder}: its data have {carriers_text(known)}; give the frequency of the map")
     if frequency_hz is not None and not (np.isfinite(frequency_hz) and frequency_hz > 0):
         raise InputError(f"frequency {frequency_hz:g} Hz: give a positive number")
     if frequency_hz is not None and known is None:
@@ -151,8 +150,9 @@ def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
 def _places(run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None) -> Grid | SurfaceMesh:
     if surface is not None:
         return surface_of(surface, step_m)
-    height = usual_height(run) if height_m is None else height_m
-    return grid_over(*area_of(run), STEP_M if step_m is None else step_m, height)
+    known = run.problem.record.tx_pos_m
+    height = usual_height(run, known) if height_m is None else height_m
+    return grid_over(*area_of(run, known), STEP_M if step_m is None else step_m, height)
 
 
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
@@ -166,10 +166,12 @@ def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float
         "task": task.name,
         "level": task.level_note or task.quantity,
         "level_is_absolute": int(task.level_kind != "relative"),
-        "transmit_power_dbm": conditions.transmit_dbm,
     }
+    absolute = task.level_kind != "relative"
+    if absolute:
+        found["transmit_power_dbm"] = conditions.transmit_dbm
     if conditions.threshold_db is not None:
-        found["threshold_dbm"] = conditions.threshold_db
+        found["threshold_dbm" if absolute else "threshold_db"] = conditions.threshold_db
     if headings:
         words = f"mean over {len(headings)} headings" if heading_deg is None else f"{heading_deg:g} degrees"
         found["transmitter_heading"] = words

@@ -99,7 +99,9 @@ def map_dataset(
         data["triangle"] = ("point", "corner", "axis"), corners, _metres("corners of the triangle around each point")
     for name, variable in VARIABLES.items():
         if name in values:
-            described = {"units": level_unit if name in LEVELS else variable.units, "long_name": variable.long_name}
+            described = {"units": variable.units, "long_name": variable.long_name}
+            if name in LEVELS and level_unit != variable.units:
+                described = {"units": level_unit, "long_name": f"{variable.long_name}, relative to full scale"}
             data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), described
     data[BEST] = dims, _best(values[POWER]).reshape(shape), _best_attributes(receivers)
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})

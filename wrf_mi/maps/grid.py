@@ -12,6 +12,8 @@ from ..runs.run import Run
 
 LARGEST = 10_000_000
 """Largest number of positions of a grid: 240 MB of coordinates."""
+MARGIN_M = 0.5
+"""Margin around transmitter positions where no scene states the area."""
 
 
 @dataclass(frozen=True)
@@ -58,27 +60,26 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
     return Grid(x, y, float(height_m))
 
 
-def area_of(run: Run, margin_m: float = 0.5) -> tuple[FloatArray, FloatArray]:
-    """Corners [3], metres, of the box around a run's scene, else around its data's positions and a margin.
+def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners [3], metres, of the box around a run's scene; without one around positions [n, 3] and `MARGIN_M`.
 
     Raises:
-        InputError: no scene, and no known position in the data.
+        InputError: no scene, and no position that is known.
     """
     if (scene := run.problem.opened_scene) is not None:
         box = scene.mi_scene.bbox()
         return np.array(box.min, float).ravel(), np.array(box.max, float).ravel()
-    known = run.problem.record.tx_pos_m
-    known = known[np.isfinite(known).all(axis=1)]
+    known = tx_pos_m[np.isfinite(tx_pos_m).all(axis=1)]
     if not len(known):
-        raise InputError(f"{run.folder}: neither scene nor transmitter positions are known; give the area")
-    return known.min(axis=0) - margin_m, known.max(axis=0) + margin_m
+        raise InputError(f"{run.folder}: neither scene nor transmitter positions are known; train with --scene")
+    return known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
 
 
-def usual_height(run: Run) -> float:
-    """Median height of the transmitters of a run's data, metres; that of the middle of its area where none is known."""
-    heights = run.problem.record.tx_pos_m[:, 2]
+def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
+    """Median height of positions [n, 3], metres; that of the middle of the run's area where none is known."""
+    heights = tx_pos_m[:, 2]
     heights = heights[np.isfinite(heights)]
     if len(heights):
         return float(np.median(heights))
-    low, high = area_of(run)
+    low, high = area_of(run, tx_pos_m)
     return float(low[2] + high[2]) / 2

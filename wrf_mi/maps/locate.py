@@ -112,7 +112,7 @@ def locate(
         observed_dbm: signal strengths [n_rx, m] in dBm, receivers in the order of ``run.receivers``; NaN where nothing
             was received.
         step_m: distance between candidate positions, metres; None: 0.25 m, more for large areas.
-        height_m: height of the transmitters; None: that of most transmitters of the run's data.
+        height_m: height of the transmitters; None: the median of the training rows.
         level: probability that regions hold.
         offset_db: standard deviation of an unknown offset of the transmitter's power from that of the training rows'
             transmitter; None: as chosen by held-out rows.

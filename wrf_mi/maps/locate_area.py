@@ -23,8 +23,6 @@ USUAL, MOST = 4000, 10_000
 """Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between
 all of them take 0.8 GB.
 """
-MARGIN_M = 0.5
-"""Margin around the training rows where no scene states the area."""
 
 
 @dataclass(frozen=True)
@@ -66,25 +64,17 @@ def candidates_of(run: Run, step_m: float | None = None, height_m: float | None 
     Args:
         run: a finished run.
         step_m: distance between neighbours; None: `STEP_M`, more for large areas.
-        height_m: their height; None: that of most transmitters of the run's data.
+        height_m: their height; None: the median of the training rows.
 
     Raises:
         InputError: a step that is not positive or too small, no candidate, or neither scene nor known positions.
     """
     scene, record = run.problem.opened_scene, run.problem.record
-    if scene is None:
-        known = record.tx_pos_m[load_rows(run.folder, record).all_train]
-        known = known[np.isfinite(known).all(axis=1)]
-        if not len(known):
-            raise InputError(
-                f"{run.folder}: neither scene nor positions of training rows are known; train with --scene"
-            )
-        low, high = known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
-    else:
-        low, high = area_of(run)
+    known = record.tx_pos_m[load_rows(run.folder, record).all_train]
+    low, high = area_of(run, known)
     if step_m is None:
         step_m = max(STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL)))
-    grid = grid_over(low, high, step_m, usual_height(run) if height_m is None else height_m)
+    grid = grid_over(low, high, step_m, usual_height(run, known) if height_m is None else height_m)
     inside = np.ones(len(grid.x_m) * len(grid.y_m), bool) if scene is None else inside_scene(scene, grid.positions_m)
     if not inside.any():
         remedy = "give another --height" if height_m is not None else "give --height"

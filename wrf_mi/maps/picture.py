@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,11 +12,15 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
 
 from ..core import Prediction
 from ..core.angles import FloatArray
+from ..core.carriers import FREQUENCY
 from ..runs.figures import without_formulas
+from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..runs.scene_view import surfaces_of
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES, cut_lines
@@ -33,24 +38,45 @@ MOST_POINTS = 400
 """Largest number of measured points of a panel."""
 TAIL = 1.0
 """Percentage of values beyond either end of the colour scale."""
+MEASURED_TAIL = 10.0
+"""The same of measured levels, among which are single deep fades."""
 STRONGEST = "strongest receiver"
+TRAINED = {"marker": "o", "s": 9, "edgecolors": "white", "linewidths": 0.4}
+OTHER = {"marker": "s", "s": 9, "edgecolors": "black", "linewidths": 0.4}
+MARKS = "circles: training rows, squares: other measured rows, crosses: receivers"
+LETTERS_PER_INCH, LETTERS_OF_BAR, LINE_IN = 14, 32, 0.16
+"""Of the text above the panels; length of the colour scale's label, and height of a line, inches."""
+SAME_CARRIER = 1e-9
+"""Relative difference of frequencies that are the same."""
+
+
+class _Measured(NamedTuple):
+    """Measured rows of a panel: positions [n, 3] in metres, levels [n], and whether each trained the model."""
+
+    points_m: FloatArray
+    level: FloatArray
+    trained: NDArray[np.bool_]
 
 
 def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     """Expected power at each receiver, and of several at the strongest one, with one colour scale for all.
 
-    Walls are the cut of the run's scene at the map's height; measured points of the run's data at this receiver have
-    their measured level as colour.
+    Walls are the cut of the run's scene at the map's height; measured rows of the run's data at this receiver and at
+    the map's carrier have their measured level as colour, circles those that trained the model, squares all others.
     """
     flat = "point" not in dataset.sizes
     power = dataset[POWER].values
     panels: list[tuple[str, int | None]] = [(STRONGEST, None)] if len(power) > 1 else []
     panels += [(str(name), k) for k, name in enumerate(dataset["receiver"].values)][:MOST_PANELS]
-    low, high = np.percentile(power[np.isfinite(power)], [TAIL, 100 - TAIL])
+    measured = [_measured(dataset, run, k) for k in range(len(power))]
+    low, high = _range(power, np.concatenate([rows.level for rows in measured]))
     colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
     lines = -(-len(panels) // COLUMNS)
     columns = min(COLUMNS, len(panels))
-    figure = Figure(figsize=(PANEL_IN * columns + 1, PANEL_IN * _aspect(dataset) * lines + 0.6), layout="constrained")
+    width = PANEL_IN * columns + 1
+    heading = _heading(dataset, measured, int(width * LETTERS_PER_INCH))
+    height = PANEL_IN * _aspect(dataset) * lines + 0.7 + LINE_IN * heading.count("\n")
+    figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
     walls = _walls(run, float(dataset["height"])) if flat else []
@@ -59,7 +85,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
         values = strongest if number is None else power[number]
         draw = _draw_plan if flat else _draw_mesh
         draw(axes, dataset, values, colours, walls)
-        _draw_points(axes, dataset, run, number, colours, flat)
+        _draw_points(axes, dataset, None if number is None else measured[number], number, colours)
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=6)
         if flat:
@@ -67,11 +93,38 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
             axes.set_ylabel("y (m)" if place % columns == 0 else "", fontsize=7)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
-    bar = figure.colorbar(colours, ax=list(grid.flat), shrink=0.8)
-    bar.set_label(f"{dataset[POWER].attrs['long_name']} ({dataset[POWER].attrs['units']})", fontsize=8)
+    bar = figure.colorbar(colours, ax=list(grid.flat), shrink=0.8, extend="both", pad=0.02 if flat else 0.12)
+    label = f"{dataset[POWER].attrs['long_name']} ({dataset[POWER].attrs['units']})"
+    bar.set_label(textwrap.fill(label, LETTERS_OF_BAR), fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    figure.suptitle(f"{dataset.attrs['title']}; dots: measured, crosses: receivers", fontsize=9)
+    figure.suptitle(heading, fontsize=8)
     return without_formulas(figure)
+
+
+def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], width: int) -> str:
+    """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
+    heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
+    words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
+    if FREQUENCY in dataset.attrs:
+        words.append(f"{dataset.attrs[FREQUENCY] / 1e6:.6g} MHz")
+    if not len(heights):
+        words.append("no measured row at this carrier" if FREQUENCY in dataset.attrs else "no measured row")
+    elif f"{heights.min():.2f}" == f"{heights.max():.2f}":
+        words.append(f"measured at z = {heights.min():.2f} m")
+    else:
+        words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
+    parts = [dataset.attrs["title"], ", ".join(words), MARKS]
+    if not dataset.attrs["level_is_absolute"]:
+        parts.append("levels relative to full scale are no signal strengths")
+    return "\n".join(textwrap.fill(part, width) for part in parts)
+
+
+def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
+    """Ends of the colour scale: nearly all of the map, and all but the fades of the measured levels."""
+    ends = [np.percentile(power[np.isfinite(power)], [TAIL, 100 - TAIL])]
+    if len(measured):
+        ends.append(np.percentile(measured, [MEASURED_TAIL, 100 - MEASURED_TAIL]))
+    return float(np.min(ends)), float(np.max(ends))
 
 
 def _aspect(dataset: xarray.Dataset) -> float:
@@ -111,27 +164,40 @@ def _draw_mesh(
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     size = np.maximum(high - low, 0.05 * float((high - low).max()))
     for axis, start, extent in zip("xyz", low, size, strict=True):
-        axes.set(**{f"{axis}lim": (start, start + extent), f"{axis}label": f"{axis} (m)"})
-    axes.set_box_aspect(size)
+        axes.set(**{f"{axis}lim": (start, start + extent)})
+        # Labels of a short axis would lie upon each other.
+        getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(max(1, round(6 * extent / size.max()))))
+        getattr(axes, f"set_{axis}label")(f"{axis} (m)", fontsize=7)
+    axes.set_box_aspect(size, zoom=0.85)
     axes.set_proj_type("ortho")
     axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
 
 
-def _draw_points(
-    axes: Any, dataset: xarray.Dataset, run: Run, number: int | None, colours: ScalarMappable, flat: bool
-) -> None:
-    """Measured levels of a receiver, thinned, and the receivers as crosses."""
-    record = run.problem.record
-    at = np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
-    chosen = at if number is None else at[number : number + 1]
-    axes.scatter(*chosen.T[: 2 if flat else 3], marker="x", color="#c1121f", s=22, linewidths=1.4, zorder=5)
-    if number is None:
-        return
+def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
+    """Rows with a level at a receiver of a map, at its carrier, thinned."""
+    record, split = run.problem.record, load_rows(run.folder, run.problem.record)
     task, index = task_of(record), int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
     added = float(dataset.attrs["transmit_power_dbm"]) if task.level_kind == "gain" else 0.0
     level = task.level(Prediction(record.observation[index])).mean + added
-    known = np.flatnonzero(np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1))
-    known = known[:: -(-len(known) // MOST_POINTS)] if len(known) else known
-    points = record.tx_pos_m[known].T[: 2 if flat else 3]
-    shades = {"c": level[known], "cmap": colours.cmap, "norm": colours.norm}
-    axes.scatter(*points, **shades, s=9, edgecolors="white", linewidths=0.4, zorder=4)
+    known = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)
+    if record.carriers_hz is not None and FREQUENCY in dataset.attrs:
+        known &= np.isclose(record.carriers_hz, dataset.attrs[FREQUENCY], rtol=SAME_CARRIER, atol=0)
+    rows = np.flatnonzero(known)
+    rows = rows[:: max(1, -(-len(rows) // MOST_POINTS))]
+    trained = split.left[split.left[:, 0] == index, 1] if index in split.held_receivers else split.all_train
+    return _Measured(record.tx_pos_m[rows], level[rows], np.isin(rows, trained))
+
+
+def _draw_points(
+    axes: Any, dataset: xarray.Dataset, measured: _Measured | None, number: int | None, colours: ScalarMappable
+) -> None:
+    """Measured levels of a receiver, and the receivers as crosses."""
+    dims = 3 if "point" in dataset.sizes else 2
+    at = np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
+    chosen = at if number is None else at[number : number + 1]
+    axes.scatter(*chosen.T[:dims], marker="x", color="#c1121f", s=22, linewidths=1.4, zorder=5)
+    if measured is None:
+        return
+    shades = {"cmap": colours.cmap, "norm": colours.norm}
+    for rows, mark in ((measured.trained, TRAINED), (~measured.trained, OTHER)):
+        axes.scatter(*measured.points_m[rows].T[:dims], c=measured.level[rows], **shades, **mark, zorder=4)

@@ -6,7 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.files import write_atomically, write_figure
+from ..core import InputError
+from ..core.files import atomic_folder, write_atomically, write_figure
 from ..training.session import OnProgress, quiet
 from . import figures
 from .compare_page import Section, page
@@ -14,12 +15,14 @@ from .compare_pictures import pictures
 from .compare_tables import COLUMNS, DIFFERENCES, difference_rows, differences, score_rows
 from .results import Results, read_runs, write_csv
 
+INDEX = "index.html"
+
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProgress = quiet) -> Path:
     """Write a comparison of runs.
 
     Runs on the same data set are compared on the same test rows, with their references (`wrf_mi.tasks.TASKS`). Writes
-    into ``out`` (made if need be): ``compare.csv``, one row per run and reference; ``differences.csv``, paired
+    into ``out``, whole or not at all: ``compare.csv``, one row per run and reference; ``differences.csv``, paired
     differences of each run and the best one, and its reference, on common rows; for each data set pictures
     ``<data set>-*.png`` of score distributions (``cdf``), ``samples`` with the truth beside each prediction, ``time``
     against error, where positions are known ``errors`` over them and the ``best`` run at each, ``scene`` if one was
@@ -27,32 +30,43 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
 
     Args:
         run_dirs: run folders, of any data sets and tasks.
-        out: folder to write to.
+        out: folder to write; an earlier comparison there is replaced.
         on_progress: progress callback: stage and fraction done.
 
     Returns:
         Path of ``index.html``.
 
     Raises:
-        InputError: no run, or a folder that is not a run.
+        InputError: no run, a folder that is not a run, or ``out`` that holds something else than a comparison.
     """
     groups = _groups(read_runs(run_dirs))
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    sections, drawn = [], []
-    for done, (slug, runs) in enumerate(groups.items()):
-        on_progress("comparing", done / len(groups))
-        shown = pictures(slug, runs)
-        drawn += shown
-        files = [(folder / name, title) for name, title, _ in shown]
-        sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
-    write_csv(folder / "compare.csv", [row for section in sections for row in section.scores], list(COLUMNS))
-    found = [row for section in sections for row in difference_rows(section.differences)]
-    write_csv(folder / "differences.csv", found, list(DIFFERENCES))
-    for done, (name, _, figure) in enumerate(drawn):
-        on_progress("drawing", done / len(drawn))
-        write_figure(folder / name, figures.without_formulas(figure))
-    return write_atomically(folder / "index.html", page(sections, folder))
+    out = Path(out)
+    if out.exists() and not _is_comparison(out):
+        raise InputError(f"{out}: exists and holds something else than a comparison; choose another folder")
+    with atomic_folder(out, replace=True) as folder:
+        sections, drawn = [], []
+        for done, (slug, runs) in enumerate(groups.items()):
+            on_progress("comparing", done / len(groups))
+            shown = pictures(slug, runs)
+            drawn += shown
+            files = [(folder / name, title) for name, title, _ in shown]
+            sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
+        write_csv(folder / "compare.csv", [row for section in sections for row in section.scores], list(COLUMNS))
+        found = [row for section in sections for row in difference_rows(section.differences)]
+        write_csv(folder / "differences.csv", found, list(DIFFERENCES))
+        for done, (name, _, figure) in enumerate(drawn):
+            on_progress("drawing", done / len(drawn))
+            write_figure(folder / name, figures.without_formulas(figure))
+        write_atomically(folder / INDEX, page(sections, out))
+    return out / INDEX
+
+
+def _is_comparison(folder: Path) -> bool:
+    """Whether a folder is empty or holds nothing but the files of `compare`."""
+    if not folder.is_dir():
+        return False
+    suffixes = {file.suffix if file.is_file() else None for file in folder.iterdir()}
+    return not suffixes or ((folder / INDEX).is_file() and suffixes <= {".html", ".csv", ".png"})
 
 
 def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:

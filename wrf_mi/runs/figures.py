@@ -61,6 +61,11 @@ def spectrum_table(rows: Rows, columns: Sequence[str]) -> Figure:
     Args:
         rows: a name and a spectrum [H, W] per column; None leaves the plot out.
         columns: title of each column.
+
+    >>> truth = np.random.default_rng(0).uniform(size=(9, 36))
+    >>> figure = spectrum_table([("row 0", [truth, truth**2])], ["measured", "predicted"])
+    >>> [axes.get_title() for axes in figure.axes]
+    ['measured', 'predicted']
     """
     figure = Figure(figsize=(PANEL_IN * len(columns), PANEL_IN * len(rows) + 0.2), layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, subplot_kw={"projection": "polar"})

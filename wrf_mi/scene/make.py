@@ -39,7 +39,7 @@ def make_scene(
     row_0: Row0 | None = None,
     replace: bool = False,
 ) -> SceneFolder:
-    """Make a scene folder that Mitsuba and Sionna RT both open.
+    r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
         points_file: a 3D scan, z upwards (`wrf_mi.scene.points.read_points`); a plan in two dimensions
@@ -64,6 +64,20 @@ def make_scene(
 
     Raises:
         InputError: an unusable file, a missing package, options that do not fit the source, or an existing folder.
+
+    A room of 6 m x 5 m from the walls of a plan, and the same without its ceiling:
+
+    >>> import shutil, tempfile
+    >>> import wrf_mi
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> corners = ["x,y", "0,0", "6,0", "6,5", "0,5", "0,0"]
+    >>> characters = (folder / "layout.csv").write_text("\n".join(corners))
+    >>> made = make_scene(folder / "layout.csv", folder / "room", height_m=2.5)
+    >>> made.xml.name, dict(made.counts)
+    ('scene.xml', {'surfaces': 6, 'faces': 12})
+    >>> wrf_mi.edit_scene(made.folder, folder / "open", remove=["ceiling*"]).name
+    'open'
+    >>> shutil.rmtree(folder)
     """
     file, out = Path(points_file), Path(out)
     if out.exists() and not replace:

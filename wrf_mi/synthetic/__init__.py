@@ -43,6 +43,10 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
 
     Raises:
         InputError: as `wrf_mi.datasets.load`.
+
+    >>> record = load_record("laboratory")
+    >>> record.task, record.observation.shape[2:]
+    ('spectrum', (90, 360))
     """
     makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: lambda **kw: traced_room(**kw)[0]}
     # Looked up at the call, so that tests can replace them.

@@ -22,6 +22,10 @@ phases in rad, and constant [6, g], centres in metres and unit normals."""
 class TraceOptions:
     """Settings of `wrf_mi.tracing.trace_paths`; kinds of path that are off cost no time.
 
+    >>> options = TraceOptions(transmission=True, max_depth=4, max_reflections=1)
+    >>> options.reflection, options.diffraction
+    (True, False)
+
     Attributes:
         line_of_sight: the direct path.
         reflection: specular reflections.

@@ -1,0 +1,111 @@
+"""Pictures of maps by the command: spectra, channels, several carriers, surfaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import xarray as xr
+from calling import call
+from made_channels import channels
+from made_waves import wave_record
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+
+import wrf_mi
+from wrf_mi.core import Record
+from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi, write_spectrum_folder
+from wrf_mi.maps.dataset import write_map
+from wrf_mi.maps.picture import map_figure
+
+BANDS_HZ = (9e8, 2.4e9)
+
+
+def mapped(data: Any, folder: Path, capsys: Any, *more: Any) -> tuple[xr.Dataset, Figure, wrf_mi.Run]:
+    """Map by the command of a run of kriging with intervals, and its picture drawn anew."""
+    run = wrf_mi.train(data, folder / "run", "kriging", intervals=True)
+    out = folder / "map.nc"
+    status, _, err = call(["map", run.folder, "--step", "0.5", "--out", out, *more], capsys)
+    assert (status, err) == (0, "mapping\n")
+    assert out.with_suffix(".png").stat().st_size > 1000
+    with xr.open_dataset(out) as dataset:
+        return dataset.load(), map_figure(dataset, run), run
+
+
+def dots(figure: Figure, panel: int) -> dict[str, np.ndarray]:
+    """Levels of the measured rows of a panel: those of training rows and all others."""
+    drawn = [one for one in figure.axes[panel].collections if isinstance(one, PathCollection)]
+    circles, squares = (np.asarray(one.get_array()) for one in drawn[1:])
+    return {"trained": circles, "other": squares}
+
+
+def heading(figure: Figure) -> str:
+    return " ".join(figure.get_suptitle().split())
+
+
+def test_picture_of_spectra_states_a_relative_level(tmp_path: Path, capsys: Any) -> None:
+    data = write_spectrum_folder(tmp_path / "data", wave_record(receivers=1))
+    dataset, figure, run = mapped(data, tmp_path, capsys, "--threshold", "-10")
+    assert dataset["power_dbm"].attrs["units"] == "dB"
+    assert dataset.attrs["threshold_db"] == -10
+    assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
+    assert "no signal strengths" in heading(figure)
+    assert "full scale (dB)" in " ".join(figure.axes[-1].get_ylabel().split())
+    split = make_splits(run.problem.record, "official")[0]
+    assert {name: len(values) for name, values in dots(figure, 0).items()} == {
+        "trained": len(split.all_train),
+        "other": len(split.test),
+    }
+
+
+def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, capsys: Any) -> None:
+    record = channels()
+    dataset, figure, _ = mapped(write_nerf2_csi(tmp_path / "data", record), tmp_path, capsys, "--transmit-power", "20")
+    level = 20 + 10 * np.log10(np.mean(np.abs(record.observation[0]) ** 2, axis=(1, 2)))
+    shown = np.sort(np.concatenate(list(dots(figure, 0).values())))
+    np.testing.assert_allclose(shown, np.sort(level), rtol=1e-5)
+    assert dataset["power_dbm"].attrs["units"] == "dBm"
+    np.testing.assert_allclose(dataset["power_dbm"] - dataset["path_gain_db"], 20, rtol=1e-5)
+
+
+@pytest.fixture
+def two_bands() -> Record:
+    """Strengths of -40 dBm at one carrier and -60 dBm at the other."""
+    rng = np.random.default_rng(0)
+    rows = np.arange(40)
+    carriers = np.array(BANDS_HZ)[rows % 2]
+    receiver = wrf_mi.Receiver("wall", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
+    observed = np.where(rows % 2, -60.0, -40.0) + rng.normal(0, 0.5, 40)
+    known = {"carriers_hz": carriers, "official": (rows[:30], rows[30:])}
+    positions = np.column_stack([rng.uniform(1, 4, (40, 2)), np.full(40, 1.3)])
+    return Record("bands", "rssi", positions, (receiver,), observed[None].astype(np.float32), **known)
+
+
+def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tmp_path: Path, capsys: Any) -> None:
+    data = write_ble_folder(tmp_path / "data", two_bands)
+    dataset, figure, run = mapped(data, tmp_path, capsys, "--frequency", BANDS_HZ[1])
+    assert dataset.attrs["frequency_hz"] == BANDS_HZ[1]
+    assert "2400 MHz" in heading(figure)
+    found = dots(figure, 0)
+    assert (len(found["trained"]), len(found["other"])) == (15, 5)
+    assert np.concatenate(list(found.values())).max() < -50
+    status, _, err = call(["map", run.folder, "--out", tmp_path / "none.nc"], capsys)
+    assert status == 2
+    assert "900000000, 2400000000 Hz" in err
+    between = map_figure(wrf_mi.radio_map(run, step_m=1.0, frequency_hz=1.5e9), run)
+    assert "no measured row at this carrier" in heading(between)
+
+
+def test_picture_of_a_surface_shows_the_mesh(flat_folder: Path, tmp_path: Path, capsys: Any) -> None:
+    trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "table.ply")
+    more = ("--surface", tmp_path / "table.ply", "--receiver", "anchor1")
+    dataset, figure, _ = mapped(flat_folder, tmp_path, capsys, *more)
+    faces = figure.axes[0].collections[0]
+    colours = np.unique(faces.get_facecolor()[:, :3], axis=0)
+    assert len(faces.get_facecolor()) == dataset.sizes["point"]
+    assert len(colours) > 1
+    assert "transmitter at z" not in heading(figure)
+    assert write_map(dataset, tmp_path / "map.csv").read_text().startswith("receiver,x,y,z,")

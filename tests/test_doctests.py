@@ -1,0 +1,31 @@
+"""Examples in the docstrings of the public names run and print what they state."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+
+import pytest
+
+import wrf_mi
+
+WITHOUT = {
+    "wrf_mi.core.errors",
+    "wrf_mi.datasets.fetch",  # needs a network
+    "wrf_mi.maps.dataset",  # in the example of wrf_mi.maps.api
+    "wrf_mi.runs.compare",  # in that of wrf_mi.runs.api
+    "wrf_mi.runs.run",  # in that of wrf_mi.runs.api
+    "wrf_mi.runs.scene_view",  # in notebooks
+    "wrf_mi.scene.edit",  # in that of wrf_mi.scene.make
+    "wrf_mi.training.config",  # in that of wrf_mi.core.settings
+    "wrf_mi.training.trainer",  # in notebooks
+}
+"""Modules of public names without examples of their own."""
+NAMES = {getattr(wrf_mi, name).__module__ for name in wrf_mi.__all__}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES - WITHOUT))
+def test_examples_of_docstrings_run(name: str) -> None:
+    results = doctest.testmod(importlib.import_module(name))
+    assert results.attempted > 0
+    assert results.failed == 0
