@@ -25,6 +25,8 @@ from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.fit_key import dataset_files, fit_key
 from wrf_mi.runs.folder import CONFIG, METRICS, versions
 
+from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
+
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
 """Public data sets; all others are made on this machine."""
 
@@ -150,7 +152,7 @@ SHARED_NOTE = (
 def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | None = None) -> list[dict[str, Any]]:
     """Measure cases and checks, each in a subprocess, and write ``<case>.json`` and ``README.md`` to ``out``.
 
-    A case that is finished in ``runs`` for the same arguments, data and versions is used again; one that was stopped
+    A case that is finished in ``runs`` for the same arguments, source, data and versions is used again; a stopped one
     is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths.
 
     Returns:
@@ -189,22 +191,31 @@ def _case(runs: Path, name: str) -> dict[str, Any]:
     folder = case_folder(runs, name)
     resumes = name in CHECKS and CHECKS[name].resumes
     if not resumes and (folder / (STORED_CHECK if name in CHECKS else MEASURED)).exists():
-        print(f"{name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
+        print(f"{name}: finished before in {folder}, with the same source, data and versions", file=sys.stderr)
     return _check(name, folder) if name in CHECKS else _measure(name, folder)
 
 
 def case_folder(runs: Path, name: str) -> Path:
-    """Folder of a case or check: its name and a key of arguments, data and versions (`wrf_mi.runs.fit_key`)."""
+    """Folder of a case or check: its name and a key of arguments, source, data and versions (`wrf_mi.runs.fit_key`)."""
     made: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
     what = made.function if isinstance(made, Check) else made.arguments
-    return runs / f"{name}-{fit_key(what, [dataset_files(one) for one in made.data])}"
+    # A check that goes on keys its parts itself.
+    source = {} if isinstance(made, Check) and made.resumes else source_digests(*modules_of(name))
+    return runs / f"{name}-{fit_key(what, source, [dataset_files(one) for one in made.data])}"
+
+
+def modules_of(name: str) -> tuple[str, ...]:
+    """Modules that a case or check executes."""
+    if name in CHECKS:
+        return modules_of_benchmark(CHECKS[name].function.partition(":")[0])
+    return modules_of_command(CASES[name].arguments)
 
 
 def _measure(name: str, folder: Path) -> dict[str, Any]:
     case = CASES[name]
     if not (folder / METRICS).exists() or not (folder / MEASURED).exists():
         wall = run_command(case.arguments, folder, f"bench {name}: ")
-        write_atomically(folder / MEASURED, json.dumps({"wall_seconds": wall, **provenance()}))
+        write_atomically(folder / MEASURED, json.dumps({"wall_seconds": wall, **provenance(*modules_of(name))}))
     return {
         "case": name,
         "title": case.title,
@@ -242,14 +253,18 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
         if status != 0:
             raise BenchFailed(f"bench {name}: ended with status {status} {message}".rstrip())
         figures = json.loads(stored.read_text())
-        measured = {"wall_seconds": time.perf_counter() - start, **provenance(), "figures": figures}
+        measured = {"wall_seconds": time.perf_counter() - start, **provenance(*modules_of(name)), "figures": figures}
         write_atomically(stored, json.dumps(measured, indent=1))
     known = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
     return known | json.loads(stored.read_text())
 
 
-def provenance() -> dict[str, Any]:
-    """Date, machine, versions of packages and, in a worker, its number of threads."""
+def provenance(*modules: str) -> dict[str, Any]:
+    """Date, machine, versions of packages, digests of the source and, in a worker, its number of threads.
+
+    Args:
+        modules: modules that made the result; what they import counts too.
+    """
     count, known = worker_threads(), versions()
     machine = {
         "processor": known["device"],
@@ -258,7 +273,13 @@ def provenance() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
     }
     threads = {} if count is None else {"worker_threads": count}
-    return {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": known, **threads}
+    return {
+        "date": time.strftime("%Y-%m-%d"),
+        "machine": machine,
+        "versions": known,
+        SOURCE: source_digests(*modules),
+        **threads,
+    }
 
 
 def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

@@ -34,9 +34,19 @@ def bench_command(a: argparse.Namespace) -> int:
             a.store and a.quick and a.names,
             f"--store: a quick {' '.join(a.names)} is not stored; omit --store, or --quick",
         ),
+        (
+            a.stale and bool(a.names or a.quick or a.store or a.scheduler),
+            "--stale: lists all results and measures none; omit names, --quick, --store and --scheduler",
+        ),
     ):
         if refused:
             raise InputError(message)
+    if a.stale:
+        from .stale import stale, stale_lines
+
+        older, count = stale(Path(a.out))
+        print_json(older) if a.json else print(stale_lines(older, count))
+        return 0
     from wrf_mi.parallel import open_scheduler
 
     from .bench import CASES, CHECKS, REFUSED, BenchFailed, CheckRefused, bench, check_table, own_table, quick_checks

@@ -11,7 +11,7 @@ from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.datasets.registry import locate
 
-from .bench import provenance
+from .bench import modules_of, provenance
 
 Row = dict[str, str]
 STORED = Path("benchmarks/results")
@@ -38,7 +38,9 @@ def stored_part(benchmark: str, name: str, measure: Callable[[], dict[str, Any]]
     Parts are stored when they are done, with machine, versions and date, so that a measurement of many hours goes on,
     on another machine too. A part is measured again where its file is deleted.
     """
-    return dict(kept(STORED / benchmark / f"{name}.json", lambda: {MEASURED: provenance(), **measure()}))
+    return dict(
+        kept(STORED / benchmark / f"{name}.json", lambda: {MEASURED: provenance(*modules_of(benchmark)), **measure()})
+    )
 
 
 def measured_on(parts: Iterable[Mapping[str, Any]]) -> str:

@@ -247,7 +247,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
         "title": "interleaved pairs",
         "command": f"wrf-mi bench --quick --backend {init().name} --store",
         "wall_seconds": time.perf_counter() - start,
-        **provenance(),
+        **provenance(__name__),
         "figures": {"ratios": found},
     }
     if stored is None:

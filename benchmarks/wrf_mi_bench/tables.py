@@ -3,7 +3,7 @@
 Each row of `wrf_mi_bench.table_plan` is stored as a JSON file when its run is done, so an interrupted measurement can
 be resumed, on another machine too. A row is measured again where its arguments or the content of its data set have
 changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a run folder has
-a key of command, data, scene and versions (`wrf_mi.runs.fit_key`).
+a key of command, source, data, scene and versions (`wrf_mi.runs.fit_key`).
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from wrf_mi.tasks.scores import summary
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
 from .scene import SCANNED, scanned_scene
+from .sources import modules_of_command, source_digests
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
 
@@ -121,10 +122,13 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
     """Figures of a row, from a finished run of the same key or a new one."""
     scene = _scene(row, runs)
     data = _data_digest(row.part.dataset)
-    folder = runs / f"{row.name}-{fit_key(row.command, data, [scene_files(place) for place in scene[1:]])}"
+    source = source_digests(*modules_of_command(row.command.split()))
+    folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scene[1:]])}"
     wall = None
     if (folder / METRICS).exists():
-        print(f"tables: {row.name}: finished before in {folder}, with the same data and versions", file=sys.stderr)
+        print(
+            f"tables: {row.name}: finished before in {folder}, with the same source, data and versions", file=sys.stderr
+        )
     else:
         # Ray tracing takes seconds and cannot be resumed.
         resumes = not row.method.startswith("ray-tracing")
@@ -142,7 +146,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         "share": row.share,
         "seed": row.seed,
         "command": row.command,
-        **provenance(),
+        **provenance(*modules_of_command(row.command.split())),
         "data": data,
         "wall_seconds": wall,
         **figures,

@@ -18,12 +18,12 @@ def test_part_is_measured_once_and_stored_with_machine_and_date(
         calls.append(1)
         return {"score": 0.5}
 
-    first, second = stored_part("check", "part", measure), stored_part("check", "part", measure)
+    first, second = stored_part("rooms", "part", measure), stored_part("rooms", "part", measure)
     assert (len(calls), first) == (1, second)
     assert first["score"] == 0.5
-    assert {"date", "machine", "versions"} <= set(first[MEASURED])
-    (STORED / "check" / "part.json").unlink()
-    stored_part("check", "part", measure)
+    assert {"date", "machine", "versions", "source"} <= set(first[MEASURED])
+    (STORED / "rooms" / "part.json").unlink()
+    stored_part("rooms", "part", measure)
     assert len(calls) == 2
 
 

@@ -24,6 +24,8 @@ def add_parser(commands: Any) -> None:
     text += "stress a few of its cases, fails if a bound is exceeded; with tables a small version in ten minutes"
     add("--quick", action="store_true", help=text)
     add("--store", action="store_true", help="store the ratios, with --quick")
+    text = "list the results that are older than their source, with the command that measures each anew"
+    add("--stale", action="store_true", help=text)
     text = "hours after which no row is begun, with tables; the next call goes on (default: measure all)"
     add("--hours", type=float, metavar="H", help=text)
 

@@ -31,6 +31,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         self._what, self._known = what, dict(builtin)
         self._others = {point.name: point for point in entry_points(group=group)}
         self._twice = self._known.keys() & self._others.keys()
+        self._modules = {name: entry.partition(":")[0] for name, entry in builtin.items() if isinstance(entry, str)}
 
     def add(self, name: str, entry: Entry) -> None:
         """Add an entry for this process.
@@ -41,6 +42,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         if name in self:
             raise InputError(f"{self._what} {name!r}: there is one of that name; choose another")
         self._known[name] = entry
+
+    def module(self, name: str) -> str:
+        """Name of the module of an entry, which is not imported; "" where it was added as an object."""
+        return self._others[name].module if name in self._others else self._modules.get(name, "")
 
     def __getitem__(self, name: str) -> Entry:
         if name in self._twice:

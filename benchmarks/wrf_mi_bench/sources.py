@@ -1,0 +1,137 @@
+"""Digests of the source that a result depends on.
+
+A result depends on the module of its benchmark, on the models that this module names, and on every module of this
+project that these import. A digest is that of syntax trees without docstrings: comments and layout do not count.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from wrf_mi.models import MODELS
+
+from .table_plan import CORRECTED, NAMED
+
+PACKAGES = {"wrf_mi": "", "wrf_mi_bench": "benchmarks", "wrf_mi_plugins": "plugins", "wrf_mi_scenes": "scenes"}
+"""Packages of this project, and their folders in a checkout."""
+SOURCE = "source"
+"""Key of the digests in a stored result."""
+DIGITS = 12
+"""Hexadecimal digits of a digest."""
+COMMANDS = {
+    "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
+    "train": ("wrf_mi.cli.train",),
+    NAMED: ("wrf_mi_bench.scene",),
+    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.correct"),
+}
+"""Modules behind words of commands that benchmarks run in subprocesses."""
+RUNNER = f"{__package__}.bench"
+"""Lists, runs and stores benchmarks; makes no figure."""
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def source_digests(*modules: str) -> dict[str, str]:
+    """Digest of modules and of what they import, by folder, e.g. ``wrf_mi/gaussians``."""
+    return by_folder({name: file.read_text(encoding="utf-8") for name, file in needed_files(*modules).items()})
+
+
+def by_folder(files: Mapping[str, str]) -> dict[str, str]:
+    """Digest of each folder, by the names of its files with their text."""
+    folders: dict[str, dict[str, str]] = {}
+    for name, text in sorted(files.items()):
+        folders.setdefault(name.rpartition("/")[0], {})[name] = code_digest(text)
+    return {folder: _sha(repr(found)) for folder, found in folders.items()}
+
+
+def modules_of_benchmark(module: str) -> tuple[str, ...]:
+    """The module of a benchmark, and those of the models that its strings name."""
+    file = _file(module)
+    found = () if file is None else ast.walk(_tree(file))
+    texts = {one.value for one in found if isinstance(one, ast.Constant) and isinstance(one.value, str)}
+    return (module, *(MODELS.module(text) for text in MODELS if text in texts))
+
+
+def modules_of_command(words: Iterable[str]) -> tuple[str, ...]:
+    """Modules of the command, models and scenes that words of ``wrf-mi`` name."""
+    known = {**COMMANDS, **{name: (MODELS.module(name),) for name in MODELS}}
+    return tuple(module for word in words for module in known.get(word, ()))
+
+
+def _sha(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+
+
+@cache
+def code_digest(text: str) -> str:
+    """Digest of the syntax tree of a module without docstrings, the same for every version of Python."""
+    return _sha(repr(_plain(ast.parse(text))))
+
+
+def _plain(node: Any) -> Any:
+    # Not `ast.dump`: fields that are empty appear in some versions of Python only.
+    if isinstance(node, list):
+        return [_plain(one) for one in node]
+    if not isinstance(node, ast.AST):
+        return node
+    fields = dict(ast.iter_fields(node))
+    if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+        fields["body"] = fields["body"][1:]
+    return type(node).__name__, [(name, _plain(value)) for name, value in fields.items() if value not in (None, [])]
+
+
+def needed_files(*modules: str) -> dict[str, Path]:
+    """Files of modules and of all that they import, by package and path."""
+    found: dict[str, Path] = {}
+    left, own = list(modules), {*PACKAGES, *(module.partition(".")[0] for module in modules)}
+    seen = {RUNNER}
+    while left:
+        module = left.pop()
+        if module in seen or module.partition(".")[0] not in own:
+            continue
+        seen.add(module)
+        if (file := _file(module)) is None:
+            continue
+        name = module.replace(".", "/")
+        found[f"{name}/__init__.py" if file.name == "__init__.py" else f"{name}.py"] = file
+        left += [module.rpartition(".")[0], *_imports(file, module)]
+    return found
+
+
+@cache
+def _file(module: str) -> Path | None:
+    """File of a module; None: there is none, as for names that are imported from a module."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        return None
+    parent = module.rpartition(".")[0]
+    if parent and ((above := _file(parent)) is None or above.name != "__init__.py"):
+        return None
+    spec = find_spec(module)
+    return Path(spec.origin) if spec is not None and spec.origin and spec.origin.endswith(".py") else None
+
+
+@cache
+def _tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+@cache
+def _imports(file: Path, module: str) -> tuple[str, ...]:
+    """Modules that a module imports, in its functions too except for packages, and names that may be modules."""
+    # Functions of a package's first file call for users what modules below import where they need it.
+    first = file.name == "__init__.py"
+    package = module if first else module.rpartition(".")[0]
+    found: list[str] = []
+    for node in _tree(file).body if first else ast.walk(_tree(file)):
+        if isinstance(node, ast.Import):
+            found += [name.name for name in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            found += [base, *(f"{base}.{name.name}" for name in node.names)]
+    return tuple(found)
