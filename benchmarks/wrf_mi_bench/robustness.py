@@ -20,13 +20,9 @@ from .hostile_samples import READERS
 INPUTS, QUICK_INPUTS = 2000, 50
 """Inputs of each reader."""
 SLOW = {
-    "deepmimo: power.mat": 0.1,
-    "points: cloud.laz": 0.1,
     "run: operator0.npz": 0.1,
-    "scene: scene.xml": 0.25,
-    "scene: floor.ply": 0.25,
 }
-"""Share of the inputs for readers that start a process, build an operator or open a scene."""
+"""Share of the inputs for readers that take long: one builds an operator."""
 QUICK_KILLS, TOGETHER = 3, 8
 """Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")

@@ -64,7 +64,7 @@ def test_pictures_are_measured_before_they_are_decoded(tmp_path: Path) -> None:
 
 def test_names_stay_in_their_folder(tmp_path: Path) -> None:
     assert inside(tmp_path, "meshes/a.ply", tmp_path) == tmp_path / "meshes/a.ply"
-    for name in ("../a", "/etc/passwd", "a/../../b", "", 5, None):
+    for name in ("../a", "/etc/passwd", "a/../../b", "", 5, None, "a" * 5000):
         with pytest.raises(InputError, match=r"outside its folder|no name of a file"):
             inside(tmp_path, name, tmp_path / "scene.yml")
 

@@ -92,6 +92,18 @@ def test_wrong_scenes_are_refused(tmp_path: Path):
     refused("invalid vertex position", write_xml(tmp_path / "nan", {"floor": ("itu_concrete", mesh)}))
 
 
+def test_faces_without_their_vertices_are_refused_before_mitsuba_reads_them(tmp_path: Path):
+    """Mitsuba follows such a face beyond its vertices, which ends the process."""
+    mesh = sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0))
+    xml = write_xml(tmp_path, {"floor": ("itu_concrete", mesh)})
+    (file,) = tmp_path.rglob("*.ply")
+    mesh.faces[-1, -1] = 1 << 28
+    mesh.export(file)
+    refused(r"floor\.ply: cannot be read as a mesh \(a face names a vertex", xml)
+    file.unlink()
+    refused(r"floor\.ply: cannot be read as a mesh", xml)
+
+
 def test_remedy_for_a_frequency_out_of_range_opens_the_scene(tmp_path: Path):
     """Brick ends at 40 GHz; the file gets the constants that the message asks for."""
     xml = write_xml(tmp_path, {name: ("itu_brick", part) for name, (_, part) in SHOEBOX.items()})

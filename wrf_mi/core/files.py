@@ -71,6 +71,10 @@ def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
     return f"{text}; {remedy}" if remedy else text
 
 
+MOST_NAME = 1024
+"""Characters of a name that another file states; systems take 4096 of a whole path."""
+
+
 def inside(folder: Path, name: object, source: Path) -> Path:
     """The path of a file that another file names, below its folder.
 
@@ -82,7 +86,7 @@ def inside(folder: Path, name: object, source: Path) -> Path:
     Raises:
         InputError: no name, or one that leaves the folder.
     """
-    if not isinstance(name, str) or not name or "\0" in name:
+    if not isinstance(name, str) or not name or "\0" in name or len(name) > MOST_NAME:
         raise DataFault(source, f"{one_line(repr(name))[:60]} is no name of a file; correct it")
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):

@@ -32,6 +32,8 @@ VALUES = (
     *("transform", "translate", "rotate", "scale", "matrix", "lookat"),
 )
 """Elements without a plugin. ``include``, ``path`` and ``alias`` are not among them: they reach other files."""
+MESHES = ("ply", "obj")
+"""Shapes that are files of vertices and faces."""
 FILES = ("filename",)
 """Names of texts that are files."""
 DEEPEST = 64
@@ -57,6 +59,13 @@ def read_scene_xml(path: Path) -> Element:
         raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
     _check(root, path, 0)
     return root
+
+
+def mesh_files(root: Element, folder: Path) -> list[Path]:
+    """Meshes that the shapes of a scene in a folder name."""
+    texts = [text for shape in root.iter("shape") if shape.get("type") in MESHES for text in shape.iter("string")]
+    named = dict.fromkeys(text.get("value", "") for text in texts if text.get("name") in FILES)
+    return [folder / name for name in named]
 
 
 def _check(element: Element, path: Path, depth: int) -> None:

@@ -19,7 +19,7 @@ from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.materials import thicknesses
 from ..scene.surfaces import mesh_parts
-from ..scene.xml_file import read_scene_xml
+from ..scene.xml_file import mesh_files, read_scene_xml
 from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
@@ -109,7 +109,8 @@ def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float
 def _from_xml(path: Path) -> Any:
     from sionna import rt
 
-    read_scene_xml(path)
+    for file in mesh_files(read_scene_xml(path), path.parent):
+        mesh_parts(file)  # Mitsuba follows a face to a vertex that is not there, and ends the process
     try:
         # Merged shapes, and with them the paths, have a random order.
         return rt.load_scene(str(path), merge_shapes=False)
