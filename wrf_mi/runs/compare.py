@@ -42,7 +42,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
     groups = _groups(read_runs(run_dirs))
     out = Path(out)
     if out.exists() and not _is_comparison(out):
-        raise InputError(f"{out}: exists and holds something else than a comparison; choose another folder")
+        raise InputError(f"{out}: exists and holds something else than a comparison; choose another place")
     with atomic_folder(out, replace=True) as folder:
         sections, drawn = [], []
         for done, (slug, runs) in enumerate(groups.items()):
