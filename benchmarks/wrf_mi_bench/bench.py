@@ -121,6 +121,7 @@ _OWN: Mapping[str, Check] = {
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),
+    "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "sentinels": _here(
         "figures kept",

@@ -1,6 +1,6 @@
 """Digests of the source that a result depends on.
 
-A result depends on the module of its benchmark, on the models that this module names, and on every module of this
+A result depends on the module of its benchmark, on what this module names for subprocesses, and on every module of this
 project that these import. A digest is that of syntax trees without docstrings: comments and layout do not count.
 """
 
@@ -50,11 +50,12 @@ def by_folder(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def modules_of_benchmark(module: str) -> tuple[str, ...]:
-    """The module of a benchmark, and those of the models that its strings name."""
+    """The module of a benchmark, and the modules, commands and models that its strings name, as for subprocesses."""
     file = _file(module)
     found = () if file is None else ast.walk(_tree(file))
-    texts = {one.value for one in found if isinstance(one, ast.Constant) and isinstance(one.value, str)}
-    return (module, *(MODELS.module(text) for text in MODELS if text in texts))
+    texts = sorted({one.value for one in found if isinstance(one, ast.Constant) and isinstance(one.value, str)})
+    named = [text for text in texts if text.partition(".")[0] in PACKAGES and _file(text) is not None]
+    return (module, *named, *modules_of_command(texts))
 
 
 def modules_of_command(words: Iterable[str]) -> tuple[str, ...]:

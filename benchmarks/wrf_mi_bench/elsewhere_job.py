@@ -1,0 +1,76 @@
+"""One variant of `wrf_mi_bench.elsewhere`: ``python -m wrf_mi_bench.elsewhere_job FILE BACKEND THREADS SMALL``."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.backend import init
+
+SETTINGS = ("deterministic=true", "density.every=10", "density.start=0", "validate_every=1000000")
+
+
+def main(file: str, backend: str, threads: str, small: str) -> None:
+    """Compute images, gradients and metrics, and store them as ``.npz``.
+
+    Args:
+        file: file to write.
+        backend: ``llvm`` or ``cuda``; a deterministic training is only made on ``llvm``.
+        threads: number of threads of the CPU.
+        small: ``1``: few rows, Gaussians and steps.
+    """
+    known = init(backend, int(threads))
+    import drjit as dr
+    import mitsuba as mi
+
+    from wrf_mi.backend.device import to_float, to_tensor
+    from wrf_mi.core.settings import with_settings
+    from wrf_mi.datasets import make_splits
+    from wrf_mi.gaussians.tiles import perception_plane
+    from wrf_mi.runs.api import train
+    from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
+    from wrf_mi.tasks.losses import spectrum_loss
+    from wrf_mi.tracing import TraceOptions
+    from wrf_mi.training.config import TrainConfig
+    from wrf_mi.training.step import TrainingData, device_pose, grey
+    from wrf_mi.training.trainer import Trainer
+
+    from .traced import random_field, splatted
+    from .workloads import record, tracer
+
+    few = small == "1"
+    rows, gaussians, steps = (8, 20, 5) if few else (40, 200, 200)
+    found: dict[str, Any] = {"image": np.abs(splatted(*random_field(0, "alpha", gaussians)))}
+    ordered = np.arange(rows)
+    traced = tracer(TraceOptions())(transmitter_path(rows)).astype(np.float32)
+    found["traced"] = traced
+    made = replace(record(rows, official=(ordered[: -rows // 4], ordered[-rows // 4 :])), observation=traced)
+    config = with_settings(TrainConfig(), [f"initial.gaussians={gaussians}", f"steps={steps}"])
+    split = make_splits(made, "official")[0]
+    trainer = Trainer(made, split, config)
+    params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
+    dr.enable_grad(params)
+    plane, pose = perception_plane(*made.observation.shape[-2:], mi.Float), device_pose(RECEIVER)
+    data = TrainingData(to_tensor(made.tx_pos_m.T), to_float(made.observation), to_float([1.0]))
+    batch = config.batch
+    tx, truth = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
+    shown = grey(trainer.field, params, tx, pose, plane)
+    dr.backward(spectrum_loss(shown, truth, batch, plane.height, plane.width, config.loss.ssim_weight)[0])
+    found |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
+    if backend == "llvm":
+        with tempfile.TemporaryDirectory() as folder:
+            words = [*SETTINGS, f"initial.gaussians={gaussians}", f"steps={steps}"]
+            score = train(made, Path(folder) / "run", settings=words).metrics["ssim"]
+        found["metrics"] = np.array([score[name] for name in ("median", "mean", "p10", "p90")])
+    versions = {"numpy": np.__version__, "llvm": known.llvm_version or "", "device": known.device}
+    np.savez(file, versions=json.dumps(versions), **found)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
