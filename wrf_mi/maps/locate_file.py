@@ -75,7 +75,8 @@ def _column(table: CsvTable, name: str) -> str:
     found = [column for column in able if column in table.header]
     if not found:
         text = f"no column of receiver {one_line(name)}"
-        raise DataFault(table.path, f"{text}; name one {one_line(able[0])}, with empty fields where nothing is", line=1)
+        remedy = f"name one {' or '.join(map(one_line, able))}, and leave it empty where nothing was received"
+        raise DataFault(table.path, f"{text}; {remedy}", line=1)
     if len(found) > 1:
         raise DataFault(table.path, f"{found[0]} and {found[1]} are of one receiver; remove one of them", line=1)
     return found[0]

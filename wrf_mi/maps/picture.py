@@ -41,8 +41,8 @@ TAIL = 1.0
 MEASURED_TAIL = 10.0
 """The same of measured levels, among which are single deep fades."""
 STRONGEST = "strongest receiver"
-TRAINED = {"marker": "o", "s": 9, "edgecolors": "white", "linewidths": 0.4}
-OTHER = {"marker": "s", "s": 9, "edgecolors": "black", "linewidths": 0.4}
+TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
+OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
 MARKS = "circles: training rows, squares: other measured rows, crosses: receivers"
 LETTERS_PER_INCH, LETTERS_OF_BAR, LINE_IN = 14, 32, 0.16
 """Of the text above the panels; length of the colour scale's label, and height of a line, inches."""
