@@ -1,13 +1,15 @@
-"""Faults of small trainings: killed at every write and at random moments, a full disk, a closed pipe, Ctrl-C twice.
+"""Faults of commands: killed at every write and at random moments, full disk, folder without write permission, closed
+pipe, Ctrl-C twice.
 
-Each training is a fork of one process that has imported everything and computed nothing (``python -m
-wrf_mi_bench.faults FOLDER MODELS KILLS``). A killed training is resumed, and has to give the metrics, predictions and
-arrays of one that was left alone, bit for bit, with no other file.
+Each command (`wrf_mi_bench.fault_commands`) is a fork of one process that has imported everything and computed nothing
+(``python -m wrf_mi_bench.faults FOLDER COMMANDS KILLS``). After the fault it goes on, and has to give the results of
+one without faults, bit for bit, with no other file.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import random
@@ -26,262 +28,302 @@ from typing import Any
 import numpy as np
 
 from wrf_mi.cli.main import main as command
-from wrf_mi.core.array_files import stored_arrays
 from wrf_mi.core.files import write_atomically
-from wrf_mi.runs.folder import CONFIG, FITTED, METRICS, PREDICTIONS, SECONDS
+from wrf_mi.core.locks import locked_folder
 
-SETTINGS = {
-    "kriging": (),
-    "vae": ("steps=4", "width=8", "last=8", "checkpoint_every=2"),
-    "wrf-gs+": (
-        *("initial.gaussians=8", "network.width=8", "network.layers=2", "steps=6", "checkpoint_every=2"),
-        *("log_every=1", "validate_every=3", "density.every=0"),
-    ),
-}
-"""Settings of short trainings by model: one that is fitted at once, a network, and Gaussians."""
-TIMES = ("train_seconds", "ms_per_sample", "peak_memory_mb")
-"""Metrics that differ from run to run."""
-FILE_BYTES = (250, 400, 1500, 6000)
-"""Limits of the size of files, in place of a full disk; the message on standard error is a file here, too."""
-MOST_S = 120.0
+from .fault_commands import COMMANDS, Command, differing, prepare_data
+
+MOST_S = 240.0
 REFUSED, INTERRUPTED, CLOSED = 2, 130, 141
 EVENTS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 """Audit events of Python that change folders; opening a file to write is another."""
+CAPABILITIES_VERSION, DAC_OVERRIDE = 0x20080522, 1
+"""Version 3 of Linux's capabilities, and the one by which root writes where permissions forbid it (capabilities(7))."""
+
+Signals = Sequence[tuple[float, int]]
+"""Signals to a process: seconds after its start, and number."""
 
 
-def count_changes(folder: Path, kill_at: int = 0) -> list[int]:
-    """Number of changes of files below a folder that this process makes, kept up to date; it is killed at a number."""
-    count, below = [0], str(folder)
+def watch_changes(folder: Path, at: int = 0, number: int = signal.SIGKILL, times: int = 1) -> list[str]:
+    """Audit events of the changes of files below a folder that this process makes, kept up to date.
+
+    Args:
+        folder: the folder.
+        at: change that a signal precedes, counted from 1; 0: none.
+        number: number of the signal, which this process sends to itself.
+        times: signals, one at each of so many changes.
+    """
+    changes, below = list[str](), str(folder)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
         if (writes or event in EVENTS) and str(arguments[0]).startswith(below):
-            count[0] += 1
-            if count[0] == kill_at:
-                os.kill(os.getpid(), signal.SIGKILL)
+            changes.append(event)
+            if at and 0 <= len(changes) - at < times:
+                os.kill(os.getpid(), number)
 
     sys.addaudithook(hook)
-    return count
+    return changes
 
 
-def forked(work: Callable[[], int], errors: Path, kill_after_s: float | None = None) -> int:
+def forked(work: Callable[[], int], errors: Path, signals: Signals = ()) -> int:
     """Status of a function in a fork of this process, negative for a signal; its standard error goes to a file."""
+    read, write = os.pipe()  # not the file: its size may be limited
     child = os.fork()
     if not child:
         status = 70
         with contextlib.suppress(BaseException):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+            os.dup2(write, 2)
             status = work()
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(status)
-    until = time.monotonic() + (MOST_S if kill_after_s is None else kill_after_s)
-    while True:
-        found, status = os.waitpid(child, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status)
-        if time.monotonic() > until:
-            os.kill(child, signal.SIGKILL)
-            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        time.sleep(0.005)
+    os.close(write)
+    os.set_blocking(read, False)
+    begun, left, found = time.monotonic(), [*sorted(signals), (MOST_S, int(signal.SIGKILL))], 0
+    with errors.open("wb") as stream:
+        while not found:
+            time.sleep(0.005)
+            found, status = os.waitpid(child, os.WNOHANG)
+            with contextlib.suppress(BlockingIOError):
+                while piece := os.read(read, 1 << 16):
+                    stream.write(piece)
+            if left and not found and time.monotonic() - begun > left[0][0]:
+                os.kill(child, left.pop(0)[1])
+    os.close(read)
+    return os.waitstatus_to_exitcode(status)
 
 
-class Training:
-    """A short training of a model, and what it gives when it is left alone.
+def obey_permissions() -> None:
+    """Root, too, is refused what the permissions of files and folders forbid."""
+    header, data = (ctypes.c_uint32 * 2)(CAPABILITIES_VERSION, 0), (ctypes.c_uint32 * 6)()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.capget(header, data) == 0:
+        data[0] &= ~(1 << DAC_OVERRIDE)  # of the effective ones
+        libc.capset(header, data)
+
+
+class Trial:
+    """A command, and its results without faults.
 
     Args:
-        model: a key of `SETTINGS`.
-        data: folder of spectra.
-        folder: folder for runs.
+        command: the command.
+        folder: folder for data and results.
     """
 
-    def __init__(self, model: str, data: Path, folder: Path) -> None:
-        self.model, self.data, self.folder = model, data, folder
-        self.errors = folder / "errors.txt"
+    def __init__(self, command: Command, folder: Path) -> None:
+        self.command, self.folder = command, folder
+        self.errors, self.whole = folder / "errors.txt", folder / "whole"
         folder.mkdir(parents=True, exist_ok=True)
-        whole = folder / "whole"
-        start = time.monotonic()
-        status = self.train(whole)
-        self.seconds = time.monotonic() - start
-        if status != 0:
-            raise RuntimeError(f"{model}: a training that was left alone ended with status {status}")
-        self.files, self.content = self._content(whole)
+        changes = folder / "changes.json"
 
-    def changes(self) -> int:
-        """Number of changes of files of a training."""
-        out, stored = self.folder / "counted", self.folder / "changes.txt"
+        def watch() -> Callable[[], object]:
+            found = watch_changes(self.whole)
+            return lambda: write_atomically(changes, json.dumps(found))
+
+        status = self.run(self.whole, watch)
+        if status != 0:
+            raise RuntimeError(f"{command.name} without faults ended with status {status}: {self.message()}")
+        self.changes: list[str] = json.loads(changes.read_text())
+        self.files, self.content = self._found(self.whole)
+        begun = time.monotonic()  # of the second time: the first one compiles kernels
+        if wrong := self.finished(folder / "again"):
+            raise RuntimeError(f"{command.name} without faults, called twice: {wrong}")
+        self.seconds = time.monotonic() - begun
+        shutil.rmtree(folder / "again")
+
+    def run(
+        self,
+        place: Path,
+        before: Callable[[], Any] = lambda: None,
+        signals: Signals = (),
+        children: bool = False,
+    ) -> int:
+        """Status of the command with its results in a folder, where it goes on if it was begun.
+
+        Args:
+            place: folder for the results.
+            before: called in the fork before the command; what it returns, if callable, is called after it.
+            signals: signals to the fork.
+            children: leave the processes that the command starts processes, see `Command.prepare`.
+        """
+        place.mkdir(exist_ok=True)
+        call = self.command.call(place)
+        if call is None:
+            return 0
 
         def work() -> int:
-            count = count_changes(out)
-            status = command(self._new(out))
-            stored.write_text(str(count[0]))
+            self.command.prepare(children)
+            after = before()
+            status = command(call)
+            if callable(after):
+                after()
             return status
 
-        forked(work, self.errors)
-        shutil.rmtree(out)
-        return int(stored.read_text())
+        return forked(work, self.errors, signals)
 
-    def _new(self, out: Path) -> list[str]:
-        call = ["train", str(self.data), "--model", self.model, "--deterministic", "--out", str(out)]
-        return [*call, *(part for setting in SETTINGS[self.model] for part in ("--set", setting))]
+    def numbers(self, most: int | None) -> list[int]:
+        """Numbers of all changes, or of some renames, the last one included."""
+        if most is None:
+            return list(range(1, len(self.changes) + 1))
+        renames = [number for number, event in enumerate(self.changes, 1) if event == "os.rename"]
+        return sorted({renames[round(k)] for k in np.linspace(len(renames) - 1, 0, most, endpoint=False)})
 
-    def train(self, out: Path, before: Callable[[], Any] = lambda: None, kill_after_s: float | None = None) -> int:
-        """Status of a training into a folder, or of its continuation there."""
-        resumed = (out / CONFIG).exists()
+    def _found(self, place: Path) -> tuple[set[str], dict[str, Any]]:
+        return {path.relative_to(place).as_posix() for path in place.rglob("*")}, self.command.content(place)
 
-        def work() -> int:
-            before()
-            return command(["train", "--resume", str(out)] if resumed else self._new(out))
-
-        return forked(work, self.errors, kill_after_s)
-
-    def _content(self, run: Path) -> tuple[set[str], dict[str, Any]]:
-        metrics = json.loads((run / METRICS).read_text())
-        content: dict[str, Any] = {key: value for key, value in metrics.items() if key not in TIMES}
-        content |= {f"{FITTED}/{key}": v for key, v in stored_arrays(run / FITTED).items() if key != SECONDS}
-        content |= {f"{PREDICTIONS}/{key}": values for key, values in stored_arrays(run / PREDICTIONS).items()}
-        return {path.relative_to(run).as_posix() for path in run.rglob("*")}, content
-
-    def finished(self, out: Path) -> str:
-        """Go on to the end; what differs from a training that was left alone, or ""."""
-        status = self.train(out)
+    def finished(self, place: Path) -> str:
+        """Go on to the end; what differs from results without faults, or ""."""
+        status = self.run(place)
         if status != 0:
             return f"going on ended with status {status}: {self.message()}"
-        files, content = self._content(out)
+        files, content = self._found(place)
         if files != self.files:
             return f"other files: {', '.join(sorted(files ^ self.files))}"
-        if content.keys() != self.content.keys():
-            return "other keys of the results"
-        wrong = [key for key, value in self.content.items() if not _same(value, content[key])]
+        wrong = differing(self.content, content)
         return f"other results: {', '.join(wrong)}" if wrong else ""
 
     def message(self) -> str:
-        """Last line of the standard error of the last training."""
+        """Last line of the standard error of the last call."""
         lines = self.errors.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
-    def one_line(self, status: int, wanted: int) -> str:
-        """What is wrong with status and message of a training that was refused; "" if nothing is."""
+    def one_line(self, status: int, *wanted: int) -> str:
+        """What is wrong with status and message of a command that was stopped; "" if nothing is."""
         text = self.errors.read_text(errors="replace")
-        if status != wanted or "Traceback" in text or not self.message().startswith("wrf-mi: "):
+        if status not in wanted or "Traceback" in text or not self.message().startswith("wrf-mi: "):
             return f"status {status} for {wanted}, {self.message()[:200]!r}"
         return ""
 
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    return bool(one == other)
+def killed_at_changes(trial: Trial, most: int | None) -> Iterator[str]:
+    """Kill at each change of files, or at ``most`` of the renames, before which there are temporary files."""
+    for number in trial.numbers(most):
+        place = trial.folder / f"change{number}"
+        status = trial.run(place, partial(watch_changes, place, number))
+        wrong = trial.finished(place) if status == -signal.SIGKILL else f"status {status} for a kill"
+        shutil.rmtree(place, ignore_errors=True)
+        yield wrong and f"{trial.command.name}, killed at change {number} of {len(trial.changes)}: {wrong}"
 
 
-def killed_at_changes(training: Training, most: int | None) -> Iterator[str]:
-    """Kill a training at each change of files, or at ``most`` of them spread over all."""
-    changes = training.changes()
-    numbers = list(range(1, changes + 1))
-    if most is not None and most < changes:
-        numbers = np.unique(np.linspace(1, changes, most).astype(int)).tolist()
-    for number in numbers:
-        out = training.folder / f"change{number}"
-        status = training.train(out, partial(count_changes, out, number))
-        wrong = training.finished(out) if status == -signal.SIGKILL else f"status {status} for a kill"
-        shutil.rmtree(out, ignore_errors=True)
-        yield wrong and f"{training.model}, killed at change {number} of {changes}: {wrong}"
-
-
-def killed_at_random(training: Training, count: int) -> Iterator[str]:
-    """Kill a training at random moments, once or several times before its end."""
-    rng = random.Random(training.model)
+def killed_at_random(trial: Trial, count: int) -> Iterator[str]:
+    """Kill at random moments, once or several times before the end."""
+    rng = random.Random(trial.command.name)
     for number in range(count):
-        out, kills = training.folder / f"random{number}", 0
+        place, kills = trial.folder / f"random{number}", 0
         while rng.random() < 0.7 or not kills:
-            training.train(out, kill_after_s=rng.uniform(0, training.seconds))
+            trial.run(place, signals=[(rng.uniform(0, trial.seconds), signal.SIGKILL)])
             kills += 1
-        wrong = training.finished(out)
-        shutil.rmtree(out, ignore_errors=True)
-        yield wrong and f"{training.model}, killed at {kills} random moments: {wrong}"
+        wrong = trial.finished(place)
+        shutil.rmtree(place, ignore_errors=True)
+        yield wrong and f"{trial.command.name}, killed at {kills} random moments: {wrong}"
 
 
-def full_disk(training: Training, sizes: Sequence[int]) -> Iterator[str]:
+def full_disk(trial: Trial, most: int | None) -> Iterator[str]:
     """Limit the size of files: refused in one line, and gone on with later."""
-    for size in sizes:
-        out = training.folder / f"full{size}"
+    sizes = trial.command.file_bytes
+    for size in sizes if most is None else sizes[1:3]:
+        place = trial.folder / f"full{size}"
         limits = (size, resource.RLIM_INFINITY)
-        status = training.train(out, partial(resource.setrlimit, resource.RLIMIT_FSIZE, limits))
-        wrong = training.one_line(status, REFUSED) if status else ""
-        wrong = wrong or training.finished(out)
-        shutil.rmtree(out, ignore_errors=True)
-        yield wrong and f"{training.model}, files of {size} bytes at most: {wrong}"
+        status = trial.run(place, partial(resource.setrlimit, resource.RLIMIT_FSIZE, limits))
+        wrong = trial.one_line(status, *trial.command.refused) if status else ""
+        wrong = wrong or trial.finished(place)
+        shutil.rmtree(place, ignore_errors=True)
+        yield wrong and f"{trial.command.name}, files of {size} bytes at most: {wrong}"
 
 
-def signals_and_pipes(training: Training) -> Iterator[str]:
-    """A closed pipe, Ctrl-C twice, and a second training into the folder of one that runs."""
-    whole = training.folder / "whole"
+def no_permission(trial: Trial) -> Iterator[str]:
+    """A folder without write permission: refused in one line, and gone on with when there is one."""
+    place = trial.folder / "closed"
+    place.mkdir()
+    place.chmod(0o500)
+    wrong = trial.one_line(trial.run(place, obey_permissions), REFUSED)
+    place.chmod(0o700)
+    wrong = wrong or trial.finished(place)
+    shutil.rmtree(place)
+    yield wrong and f"{trial.command.name}, no write permission: {wrong}"
 
-    def closed() -> int:
+
+def interrupted(trial: Trial, most: int | None) -> Iterator[str]:
+    """Ctrl-C twice: at a change of files and the next one, which may be the cleaning up, and at random moments."""
+    rng = random.Random(trial.command.name)
+
+    def judged(place: Path, status: int, when: str) -> str:
+        wrong = trial.one_line(status, INTERRUPTED) if status else ""  # it may have been about to end
+        wrong = wrong or trial.finished(place)
+        shutil.rmtree(place, ignore_errors=True)
+        return wrong and f"{trial.command.name}, Ctrl-C twice {when}: {wrong}"
+
+    for number in trial.numbers(5 if most is None else 2):
+        place = trial.folder / f"stopped{number}"
+        twice = partial(watch_changes, place, number, signal.SIGINT, 2)
+        yield judged(place, trial.run(place, twice, children=True), f"at change {number} of {len(trial.changes)}")
+    for number in range(5 if most is None else 1):
+        place, first_s = trial.folder / f"impatient{number}", rng.uniform(0.1, trial.seconds)
+        signals = [(first_s, signal.SIGINT), (first_s + rng.uniform(0, 0.5), signal.SIGINT)]
+        yield judged(place, trial.run(place, signals=signals, children=True), f"after {first_s:.2f} s")
+
+
+def closed_pipe(trial: Trial) -> Iterator[str]:
+    """A closed pipe of standard output: no message, and the results are whole."""
+    place = trial.folder / "pipe"
+
+    def closed() -> None:
         read, write = os.pipe()
         os.close(read)
         os.dup2(write, 1)
-        return command(["evaluate", str(whole)])
 
-    status = forked(closed, training.errors)
-    text = training.errors.read_text().strip()
-    yield "" if (status, text) == (CLOSED, "") else f"a closed pipe: status {status}, {text[:200]!r}"
-    out = training.folder / "twice"
-
-    def impatient() -> None:
-        def stop(*_: Any) -> bool:
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
-            return False
-
-        from wrf_mi.cli.output import Watch
-
-        setattr(Watch, "on_progress", stop)  # noqa: B010
-
-    wrong = training.one_line(training.train(out, impatient), INTERRUPTED) or training.finished(out)
-    yield wrong and f"Ctrl-C twice: {wrong}"
-    from wrf_mi.core.locks import locked_folder
-
-    shutil.rmtree(out)
-    shutil.copytree(whole, out)
-    with locked_folder(out):
-        wrong = training.one_line(training.train(out), REFUSED)
-    yield wrong and f"a second training into a folder: {wrong}"
+    status, text = trial.run(place, closed), trial.errors.read_text()
+    silent = status in (0, CLOSED) and "Traceback" not in text and "wrf-mi: " not in text
+    wrong = trial.finished(place) if silent else f"status {status}, {trial.message()[:200]!r}"
+    shutil.rmtree(place)
+    yield wrong and f"{trial.command.name}, a closed pipe: {wrong}"
 
 
-def measure(folder: Path, models: Sequence[str], kills: int | None) -> dict[str, Any]:
+def locked(trial: Trial) -> Iterator[str]:
+    """A second command into the folder of one that runs."""
+    for name in trial.command.locked:
+        place = trial.folder / "locked"
+        shutil.copytree(trial.whole, place)
+        with locked_folder(place / name):
+            wrong = trial.one_line(trial.run(place), REFUSED)
+        shutil.rmtree(place)
+        yield wrong and f"{trial.command.name}, a second one into a folder: {wrong}"
+
+
+def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, Any]:
     """Cases and failures of all faults, by their kind.
 
     Args:
-        folder: folder for data (``data``) and runs.
-        models: keys of `SETTINGS`.
-        kills: random kills, and kills at changes of files, of each model; None: 20, and all.
+        folder: folder for data and results.
+        names: keys of `wrf_mi_bench.fault_commands.COMMANDS`.
+        kills: random kills, and kills at changes of files, of each command; None: 20, and all.
     """
     found: dict[str, list[str]] = {}
-    for model in models:
-        training = Training(model, folder / "data", folder / model)
-        parts: dict[str, Iterator[str]] = {
-            "killed at a write or rename": killed_at_changes(training, kills),
-            "killed at random moments": killed_at_random(training, 20 if kills is None else kills),
-            "full disk": full_disk(training, FILE_BYTES if kills is None else FILE_BYTES[1:3]),
-            "pipe, Ctrl-C, lock": signals_and_pipes(training),
+    for name in names:
+        trial = Trial(COMMANDS[name](folder), folder / name.replace(" ", "-"))
+        kinds: dict[str, Iterator[str]] = {
+            "killed at a write or rename": killed_at_changes(trial, kills),
+            "killed at random moments": killed_at_random(trial, 20 if kills is None else kills),
+            "full disk": full_disk(trial, kills),
+            "no write permission": no_permission(trial),
+            "Ctrl-C twice": interrupted(trial, kills),
+            "closed pipe": closed_pipe(trial),
+            "locked folder": locked(trial),
         }
-        for kind, cases in parts.items():
+        for kind, cases in kinds.items():
             for wrong in cases:
                 found.setdefault(kind, []).append(wrong)
-                print(f"{model}: {kind} {len(found[kind])} {wrong}", file=sys.stderr, flush=True)
+                print(f"{name}: {kind} {len(found[kind])} {wrong}", file=sys.stderr, flush=True)
     return {kind: {"cases": len(every), "failed": [one for one in every if one]} for kind, every in found.items()}
 
 
-def run(folder: Path, models: Sequence[str] = tuple(SETTINGS), kills: int | None = None) -> dict[str, Any]:
-    """`measure` in a process of its own, over spectra that are made in the folder."""
-    from .hostile_samples import prepare_spectra
-
+def run(folder: Path, names: Sequence[str] = tuple(COMMANDS), kills: int | None = None) -> dict[str, Any]:
+    """`measure` in a process of its own, over data that are made in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "data").exists():
-        prepare_spectra(folder / "data")
-    call = [sys.executable, "-m", "wrf_mi_bench.faults", str(folder), ",".join(models), str(kills or 0)]
+    prepare_data(folder)
+    call = [sys.executable, "-m", "wrf_mi_bench.faults", str(folder), ",".join(names), str(kills or 0)]
     done = subprocess.run(call, check=False, stdout=subprocess.DEVNULL)
     if done.returncode != 0:
         raise RuntimeError(f"faults: ended with status {done.returncode}")
@@ -289,11 +331,13 @@ def run(folder: Path, models: Sequence[str] = tuple(SETTINGS), kills: int | None
     return figures
 
 
-def main(folder: str, models: str, kills: str) -> None:
+def main(folder: str, names: str, kills: str) -> None:
     """Measure, and write ``faults.json`` in the folder."""
     place = Path(folder)
-    import_module("wrf_mi.runs.api")  # before the first fork: all that a training needs
-    figures = measure(place, models.split(","), int(kills) or None)
+    # Before the first fork: all that a command needs.
+    for module in ("wrf_mi.runs.api", "wrf_mi.correction", "wrf_mi_bench.tables", "sionna.rt"):
+        import_module(module)
+    figures = measure(place, names.split(","), int(kills) or None)
     write_atomically(place / "faults.json", json.dumps(figures, indent=1))
 
 

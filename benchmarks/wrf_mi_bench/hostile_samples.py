@@ -186,6 +186,22 @@ def prepare_spectra(folder: Path) -> Record:
     return record
 
 
+def prepare_strengths(folder: Path, rows: int = 12) -> Record:
+    """Write a folder of a few signal strengths at two anchors; the last third are test rows."""
+    rng = np.random.default_rng(0)
+    record = Record(
+        "ble",
+        "rssi",
+        rng.uniform(1, 4, (rows, 3)),
+        tuple(Receiver(f"anchor{k}", np.array([float(k), 0, 1]), UP) for k in (1, 2)),
+        rng.uniform(-80, -40, (2, rows)).astype(np.float32),
+        official=(np.arange(2 * rows // 3), np.arange(2 * rows // 3, rows)),
+        frequencies_hz=np.array([CARRIER_HZ]),
+    )
+    write_ble_folder(folder, record)
+    return record
+
+
 def prepare(folder: Path) -> None:
     """Write all samples, if they are not there."""
     if (folder / "done").exists():
@@ -196,10 +212,7 @@ def prepare(folder: Path) -> None:
     positions = made.tx_pos_m
     common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
     common["frequencies_hz"] = made.frequencies_hz
-    anchors = tuple(Receiver(f"anchor{k}", np.array([float(k), 0, 1]), UP) for k in (1, 2))
-    powers = rng.uniform(-80, -40, (2, 12)).astype(np.float32)
-    strengths = Record("ble", "rssi", observation=powers, **{**common, "receivers": anchors})
-    write_ble_folder(folder / "ble", strengths)
+    prepare_strengths(folder / "ble")
     channels = (rng.normal(size=(1, 12, 2, 4)) + 1j * rng.normal(size=(1, 12, 2, 4))).astype(np.complex64)
     hz = CARRIER_HZ + 1e6 * np.arange(4)
     station = {**common, "frequencies_hz": hz, "uplink": channels[0], "uplink_hz": hz - 1e8}

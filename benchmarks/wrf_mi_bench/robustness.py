@@ -1,4 +1,4 @@
-"""Hard to break: faults of trainings, and damaged and hostile files, counted (``wrf-mi bench robustness``)."""
+"""Hard to break: faults of commands, long use, and damaged and hostile files, counted (``wrf-mi bench robustness``)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import Any
 
 from wrf_mi.runs.fit_key import fit_key, source_files
 
-from . import faults
+from . import endurance, faults
 from .bench import BenchFailed
-from .comparison import kept, line
+from .comparison import Row, kept, line
+from .fault_commands import COMMANDS
 from .hostile_files import run_readers
 from .hostile_samples import READERS
 
@@ -27,24 +28,22 @@ QUICK_KILLS, TOGETHER = 3, 8
 """Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")
 NEVER = "0 wrong"
+QUICK_COMMANDS, QUICK_CALLS = ("wrf-gs+", "correct", "tables"), (300, 30)
+"""Commands of a quick measurement, and its predictions and opened runs."""
 
 
-def _rows(trainings: Mapping[str, Any], files: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    rows = []
-    for kind, found in trainings.items():
-        rows.append(line(kind, f"{found['cases']} cases, {len(found['failed'])} wrong", NEVER))
+def _rows(found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]) -> list[Row]:
+    rows = [line(kind, f"{one['cases']} cases, {len(one['failed'])} wrong", NEVER) for kind, one in found.items()]
     for one in files:
         counts = f"{one['inputs']} inputs, {one['refused']} refused, {one['loaded']} read, {len(one['failed'])} wrong"
         most = f"longest {one['slowest_s']:.1f} s, memory +{one['largest_mb']:.0f} MB"
         rows.append(line(one["reader"], f"{counts}; {most}", NEVER))
-    rows.append(_summary(trainings, files))
-    return rows
+    return [*rows, *(row for one in long for row in one["rows"])]
 
 
-def _summary(trainings: Mapping[str, Any], files: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _summary(found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], wrong: Sequence[str]) -> Row:
     """All cases and the worst one."""
-    cases = sum(found["cases"] for found in trainings.values()) + sum(one["inputs"] for one in files)
-    wrong = _wrong(trainings, files)
+    cases = sum(one["cases"] for one in found.values()) + sum(one["inputs"] for one in files)
     slowest = max(files, key=lambda one: float(one["slowest_s"]))
     largest = max(files, key=lambda one: float(one["largest_mb"]))
     worst = f"longest {slowest['slowest_s']:.1f} s ({slowest['reader']}), most memory +{largest['largest_mb']:.0f} MB "
@@ -52,27 +51,32 @@ def _summary(trainings: Mapping[str, Any], files: Sequence[Mapping[str, Any]]) -
     return line("all", f"{cases} cases, {len(wrong)} wrong; {worst}", NEVER)
 
 
-def _wrong(trainings: Mapping[str, Any], files: Sequence[Mapping[str, Any]]) -> list[str]:
-    found = [text for one in trainings.values() for text in one["failed"]]
-    return found + [f"{one['reader']}, input {k}: {text}" for one in files for k, text in one["failed"].items()]
-
-
-def _result(trainings: Mapping[str, Any], files: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    wrong = _wrong(trainings, files)
-    figures = {"rows": _rows(trainings, files), "trainings": trainings, "readers": list(files), "wrong": wrong}
+def _result(
+    found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    wrong = [text for one in found.values() for text in one["failed"]]
+    wrong += [f"{one['reader']}, input {k}: {text}" for one in files for k, text in one["failed"].items()]
+    wrong += [text for one in long for text in one["wrong"]]
+    rows = [*_rows(found, files, long), _summary(found, files, wrong)]
+    figures = {"rows": rows, "faults": found, "readers": list(files), "wrong": wrong}
     return figures | ({"failed": f"{len(wrong)} cases wrong, first {wrong[0]}"} if wrong else {})
 
 
 def main() -> dict[str, Any]:
-    """All faults, and `INPUTS` changed files of every reader; what this code has measured is kept."""
+    """All faults, long use, and `INPUTS` changed files of every reader; what this code has measured is kept."""
     place = RUNS / fit_key(source_files())
-    trainings: dict[str, Any] = {}
-    for model in faults.SETTINGS:
-        folder = place / f"faults-{model}"
-        for kind, found in kept(place / f"faults-{model}.json", partial(faults.run, folder, [model])).items():
-            total = trainings.setdefault(kind, {"cases": 0, "failed": []})
-            total["cases"] += found["cases"]
-            total["failed"] += found["failed"]
+    found: dict[str, Any] = {}
+    for name in COMMANDS:
+        folder = place / f"faults-{name}"
+        for kind, one in kept(place / f"faults-{name}.json", partial(faults.run, folder, [name])).items():
+            total = found.setdefault(kind, {"cases": 0, "failed": []})
+            total["cases"] += one["cases"]
+            total["failed"] += one["failed"]
+        shutil.rmtree(folder, ignore_errors=True)
+    long = []
+    for work in (endurance.lost_worker, endurance.memory, endurance.demo):
+        folder = place / work.__name__
+        long.append(kept(place / f"{work.__name__}.json", partial(work, folder)))
         shutil.rmtree(folder, ignore_errors=True)
     files = []
     fast = [name for name in READERS if name not in SLOW]
@@ -81,21 +85,25 @@ def main() -> dict[str, Any]:
     for number, (names, count) in enumerate(groups):
         files += kept(place / f"readers{number}.json", partial(run_readers, place / "files", names, count))
     shutil.rmtree(place / "files", ignore_errors=True)
-    return _result(trainings, files)
+    return _result(found, files, long)
 
 
-def quick(inputs: int = QUICK_INPUTS, models: Sequence[str] = ("wrf-gs+",), kills: int = QUICK_KILLS) -> dict[str, Any]:
+def quick(
+    inputs: int = QUICK_INPUTS, names: Sequence[str] = QUICK_COMMANDS, kills: int = QUICK_KILLS
+) -> dict[str, Any]:
     """Few cases of each kind.
 
     Raises:
         BenchFailed: one is wrong.
     """
-    with tempfile.TemporaryDirectory() as place:
-        trainings = faults.run(Path(place) / "faults", models, kills)
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        found = faults.run(place / "faults", names, kills)
         fast = [name for name in READERS if name not in SLOW]
-        files = run_readers(Path(place) / "files", fast, inputs)
-        files += run_readers(Path(place) / "files", list(SLOW), max(inputs // 10, 2))
-    figures = _result(trainings, files)
+        files = run_readers(place / "files", fast, inputs)
+        files += run_readers(place / "files", list(SLOW), max(inputs // 10, 2))
+        long = [endurance.lost_worker(place / "lost"), endurance.memory(place / "memory", *QUICK_CALLS)]
+    figures = _result(found, files, long)
     if "failed" in figures:
         raise BenchFailed(f"bench robustness: {figures['failed']}")
     return figures

@@ -24,7 +24,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
-from wrf_mi.core.files import atomic_folder, one_line, write_atomically
+from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers, write_atomically
 from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files, source_files
@@ -167,6 +167,7 @@ def tables(
     """
     place = out / (f"{FOLDER}-quick" if quick else FOLDER)
     place.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(place)
     rows = plan(quick)
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:

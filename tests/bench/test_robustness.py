@@ -1,10 +1,11 @@
-"""Faults and hostile files in small numbers: no case goes wrong."""
+"""Faults, long use and hostile files in small numbers: no case goes wrong."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from wrf_mi_bench import faults
+import pytest
+from wrf_mi_bench import endurance, faults
 from wrf_mi_bench.hostile_files import run_readers
 from wrf_mi_bench.hostile_samples import READERS
 from wrf_mi_bench.robustness import SLOW
@@ -18,6 +19,15 @@ def test_changed_files_are_refused_in_one_line_or_read(tmp_path: Path) -> None:
     assert all(row["refused"] + row["loaded"] == INPUTS for row in rows)
 
 
-def test_killed_and_refused_trainings_go_on_as_if_left_alone(tmp_path: Path) -> None:
-    found = faults.run(tmp_path, ["kriging"], kills=2)
+@pytest.mark.parametrize(("name", "kills"), [("kriging", 2), ("correct", 1), ("tables", 1)])
+def test_commands_under_faults_give_the_results_of_undisturbed_ones(name: str, kills: int, tmp_path: Path) -> None:
+    found = faults.run(tmp_path, [name], kills)
     assert {kind: one["failed"] for kind, one in found.items() if one["failed"]} == {}
+
+
+def test_a_lost_worker_loses_and_repeats_no_row(tmp_path: Path) -> None:
+    assert endurance.lost_worker(tmp_path)["wrong"] == []
+
+
+def test_predictions_and_opened_runs_keep_no_memory(tmp_path: Path) -> None:
+    assert endurance.memory(tmp_path, predictions=300, opened=30)["wrong"] == []

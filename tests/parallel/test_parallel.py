@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -130,6 +131,21 @@ def test_waiting_for_a_worker_is_printed_once(capsys: pytest.CaptureFixture[str]
         "tracing: waiting for a worker to connect to the scheduler",
         "tracing: 1 of 2, 1 worker",
     ]
+
+
+def test_child_that_is_stopped_while_it_imports_prints_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text("import pathlib, time\npathlib.Path('begun').touch()\ntime.sleep(600)\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    call = [sys.executable, "-m", "wrf_mi.parallel.child", "0", "slow"]
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(call, cwd=tmp_path, env=environment, **pipes) as child:
+        until = time.monotonic() + SECONDS
+        while not (tmp_path / "begun").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        child.send_signal(signal.SIGINT)
+        assert child.wait(SECONDS) == 130
+        assert child.stderr is not None
+        assert child.stderr.read() == b""
 
 
 def test_child_ends_with_its_parent(tmp_path: Path) -> None:

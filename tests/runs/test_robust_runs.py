@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import refused
+from calling import contents, copied, refused
 from small_fits import settings, stop_after
 
 from wrf_mi.core import InputError
@@ -16,8 +16,10 @@ from wrf_mi.core.array_files import stored_array, stored_arrays, write_arrays
 from wrf_mi.core.files import remove_leftovers
 from wrf_mi.core.locks import LOCK, alone_in_process, locked_folder
 from wrf_mi.core.memory import require_memory
+from wrf_mi.models import MODELS
 from wrf_mi.runs import run as run_module
 from wrf_mi.runs.api import Interrupted, open_run, predict_to_file, resume, train
+from wrf_mi.runs.folder import read_fitted, write_fitted
 from wrf_mi.training.checkpoint import cut_log
 
 DEAD = 2**22 + 1
@@ -61,7 +63,10 @@ def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> 
 def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     (tmp_path / f".model.npz.{DEAD}.part").touch()
     (tmp_path / f".scene.{DEAD}.old").mkdir()
+    (tmp_path / f"..scene.{DEAD}.part.{DEAD}.part").mkdir()  # of a folder within a temporary one
     (tmp_path / ".model.npz.1.part").touch()  # process 1 runs
+    remove_leftovers(tmp_path, "scene")
+    assert contents(tmp_path) == {"scene", f".model.npz.{DEAD}.part", ".model.npz.1.part"}
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"scene", ".model.npz.1.part"}
 
@@ -82,6 +87,30 @@ def test_changed_arrays_are_noticed(kriging: Path, tmp_path: Path, capsys: pytes
     np.savez(file, **arrays | {name: arrays[name] + 1})
     refused(["evaluate", kriging], "model.npz: not readable .*another checksum.*; train the run anew", capsys)
     file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_arrays_that_are_not_finite_are_refused(name: str, tmp_path: Path) -> None:
+    """Of every model, those excepted that it states."""
+    for task in MODELS[name].tasks or ("spectrum", "rssi", "csi"):
+        entry = MODELS[name].serving(task, MODELS[name].scene == "required")
+        for value in (np.nan, np.inf, complex(0, np.nan)):
+            write_fitted(tmp_path, {"0/values": np.array([1.0, value])}, 1.0)
+            with pytest.raises(InputError, match=r"model\.npz: array 0/values: 1 of 2 values are not finite; train"):
+                read_fitted(tmp_path, entry)
+        write_fitted(tmp_path, {f"0/{gap}": np.array([1.0, np.nan]) for gap in entry.gaps}, 1.0)
+        assert len(read_fitted(tmp_path, entry)[0]) == len(set(entry.gaps))
+
+
+def test_a_run_whose_arrays_are_not_finite_is_not_opened(
+    kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = copied(kriging, tmp_path / "run") / "model.npz"
+    arrays = stored_arrays(file)
+    name = next(key for key in arrays if key.endswith("weights"))
+    arrays[name] = arrays[name] * np.nan
+    write_arrays(file, arrays, checksum=True)
+    refused(["evaluate", file.parent], f"model.npz: array {name}: .* values are not finite; train the run anew", capsys)
 
 
 @pytest.mark.parametrize("change", ["shape", "nan"])

@@ -159,10 +159,15 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
         found = LEFTOVER.fullmatch(path.name)
-        if found is None or (name is not None and found[1] != name) or _is_running(int(found[2])):
+        if found is None or _is_running(int(found[2])):
+            continue
+        last = found[1]
+        while inner := LEFTOVER.fullmatch(last):  # a temporary folder that is written atomically itself
+            last = inner[1]
+        if name is not None and last != name:
             continue
         with suppress(OSError):
-            if found[3] == "old" and not path.with_name(found[1]).exists():
+            if found[3] == "old" and last == found[1] and not path.with_name(last).exists():
                 os.replace(path, path.with_name(found[1]))
             elif path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)

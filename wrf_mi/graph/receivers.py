@@ -54,6 +54,10 @@ class ReceiverModel(Protocol):
         ...
 
 
+GAPS = ("frequencies_hz", "floor_db")
+"""Attributes of `Form` that hold NaN where they are unknown, or where there is none."""
+
+
 @dataclass(frozen=True)
 class Form:
     """Form of observations, beside the receivers' poses, antennas and arrays.

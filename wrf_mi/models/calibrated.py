@@ -13,7 +13,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tasks import task_of
 from .held_out import HeldOut, distance_to_rows, held_out_predictions, hold_out_folds
-from .intervals import Intervals, expected_size, fit_intervals
+from .intervals import GAPS, Intervals, expected_size, fit_intervals
 from .model import (
     Arrays,
     Decomposition,
@@ -104,7 +104,7 @@ def with_intervals(entry: Model) -> Model:
         if entry.check is not None:
             entry.check(problem, splits)
 
-    return replace(entry, fit=fit, load=load, check=check)
+    return replace(entry, fit=fit, load=load, check=check, gaps=(*entry.gaps, *GAPS))
 
 
 def _folds(entry: Model, problem: Problem, split: Split) -> list[Split]:

@@ -26,6 +26,8 @@ GROUP_ROWS = 12
 """Least average number of held-out observations in a group by distance."""
 MOST_VALUES = 400_000
 """Largest number of errors that are sorted; more are thinned evenly."""
+GAPS = ("distance_m",)
+"""Arrays that may hold infinity (`wrf_mi.models.model.Model.gaps`): distances to receivers without training rows."""
 SMALLEST = 1e-6
 """Smallest standard deviation, relative to the median held-out error: intervals of zero width are never stated."""
 

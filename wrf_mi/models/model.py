@@ -242,6 +242,8 @@ class Model:
         new_receivers: whether it predicts what receivers observe that it was not trained on, in a split that holds out
             receivers.
         complete: whether it needs every receiver's observation of every training row.
+        gaps: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a
+            run with such values in another array is refused.
         given: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
             ``receiver`` or ``evaluation``.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
@@ -266,6 +268,7 @@ class Model:
     headings: bool = False
     new_receivers: bool = False
     complete: bool = False
+    gaps: tuple[str, ...] = ()
     given: tuple[str, ...] = ()
     defaults: tuple[str, ...] = ()
     presets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -29,6 +29,7 @@ from ..core.files import readable, write_atomically
 from ..core.settings import with_settings
 from ..core.types import IntArray
 from ..datasets.observations import place_of
+from ..graph.receivers import GAPS
 from ..parallel import row_parts
 from ..receivers.instruments import Instrument
 from ..receivers.spreads import PathStatistics
@@ -311,6 +312,7 @@ MODEL = Model(
     scene="required",
     several_carriers=True,
     new_receivers=True,
+    gaps=GAPS,
     check=check,
     prepare=prepare,
 )

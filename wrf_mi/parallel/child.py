@@ -11,6 +11,9 @@ import signal
 import sys
 import threading
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
 
 def _end_with_parent() -> None:
     while os.read(0, 1):
@@ -23,12 +26,16 @@ def main(threads: str, module: str, *arguments: str) -> None:
     # Workers ignore Ctrl-C, and children inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    if int(threads):
-        from ..backend import init
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if int(threads):
+            from ..backend import init
 
-        init(threads=int(threads))
-    sys.argv = [module, *arguments]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+            init(threads=int(threads))
+        sys.argv = [module, *arguments]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except KeyboardInterrupt:  # while the module is imported
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

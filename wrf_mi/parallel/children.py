@@ -42,7 +42,12 @@ def run_module(
     with tempfile.TemporaryFile("w+", errors="replace") as errors:
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": errors if kept else None}
         # In a separate process group: Ctrl-C on a terminal reaches this process alone, which passes it on once.
-        child = subprocess.Popen(call, process_group=0, **streams)  # type: ignore[call-overload]
+        # It inherits that Ctrl-C is blocked, until it can end without a traceback.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            child = subprocess.Popen(call, process_group=0, **streams)  # type: ignore[call-overload]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         try:
             status = _wait(child, None if most_s is None else time.monotonic() + most_s)
         except BaseException:

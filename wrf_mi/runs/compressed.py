@@ -101,7 +101,7 @@ def compress_run(
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
     write_config(folder, replace(asked, model=settings.model, settings=settings))
-    size = write_fitted(folder, field.packed(params, how.precision), read_fitted(source)[1]).stat().st_size
+    size = write_fitted(folder, field.packed(params, how.precision), read_fitted(source, asked.entry)[1]).stat().st_size
     known = stored_metrics(source)
     ssim_before = (known or evaluate_run(source))["ssim"]["median"]
     ssim_after = evaluate_run(folder)["ssim"]["median"]

@@ -23,6 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from .. import __version__
@@ -35,6 +36,7 @@ from ..core.settings import settings_from
 from ..core.yaml_files import read_yaml
 from ..datasets import load_split, save_split
 from ..datasets.folder_files import shown
+from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
 from ..models.calibrated import with_intervals
 from ..models.model import Arrays
@@ -221,11 +223,11 @@ def write_fitted(folder: Path, arrays: Arrays, seconds: float) -> Path:
     return write_arrays(folder / FITTED, {VERSION: FORMAT, SECONDS: seconds, **arrays}, compressed=True, checksum=True)
 
 
-def read_fitted(folder: Path) -> tuple[Arrays, float]:
-    """Arrays of ``model.npz``, and the training time in seconds.
+def read_fitted(folder: Path, entry: Model) -> tuple[Arrays, float]:
+    """Arrays of ``model.npz`` of a model, and the training time in seconds.
 
     Raises:
-        InputError: missing, damaged, or of another format.
+        InputError: missing, damaged, of another format, or NaN or infinity where the model has no `Model.gaps`.
     """
     path = folder / FITTED
     missing = f"{path}: missing, the fit was stopped; finish it with train --resume"
@@ -234,4 +236,8 @@ def read_fitted(folder: Path) -> tuple[Arrays, float]:
         version, seconds = int(arrays.pop(VERSION)), float(arrays.pop(SECONDS))
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    for name, values in arrays.items():
+        numbers = values.dtype.kind in "fc" and name.rpartition("/")[2] not in entry.gaps
+        if numbers and not np.isfinite(values).all():
+            raise InputError(f"{path}: array {name}: {count_not_finite(values)}; train the run anew")
     return arrays, seconds

@@ -220,7 +220,7 @@ class Run:
 
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
     """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
-    arrays, seconds = read_fitted(part)
+    arrays, seconds = read_fitted(part, config.entry)
     seen = problem.seen(load_split(part / SPLIT))
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
         return config.entry.load(arrays, seen, part), seconds

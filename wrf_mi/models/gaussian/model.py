@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
 from ...graph.graph import Graph
-from ...graph.receivers import Form
+from ...graph.receivers import GAPS, Form
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
@@ -205,6 +205,7 @@ def _entry(name: str) -> Model:
         uplink="optional",
         several_carriers=True,
         new_receivers=True,
+        gaps=GAPS,
         given=("model", "seed", "deterministic", "receiver", "evaluation"),
         presets=PRESETS,
         check=check,

@@ -25,6 +25,7 @@ from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...tasks import task_of
+from .. import MODELS
 from ..held_out import (
     HeldOut,
     distance_to_rows,
@@ -34,7 +35,7 @@ from ..held_out import (
     labelled,
     predicted_rows,
 )
-from ..intervals import Intervals, expected_size, fit_intervals
+from ..intervals import GAPS, Intervals, expected_size, fit_intervals
 from ..model import (
     Arrays,
     Decomposition,
@@ -49,7 +50,7 @@ from ..model import (
     known_positions,
     under,
 )
-from .ingredients import from_uplink, most_trusted, problems, serving, uses_scene
+from .ingredients import INGREDIENTS, from_uplink, most_trusted, problems, serving, uses_scene
 from .mixture import Mixture, choose, constant
 
 logger = logging.getLogger(__name__)
@@ -301,6 +302,13 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         serving(problems(problem, asked), split, required=asked is not None)
 
 
+def _by_data(task: str, with_scene: bool) -> Model:
+    """The entry, whose arrays have the gaps of the ingredients' arrays."""
+    served = ((MODELS[one.model], one.scene) for one in INGREDIENTS.values() if MODELS[one.model].serves(task))
+    gaps = (name for entry, scene in served for name in entry.serving(task, scene).gaps)
+    return replace(MODEL, by_data=None, gaps=(*GAPS, *gaps))
+
+
 MODEL = Model(
     "hybrid",
     None,
@@ -314,4 +322,5 @@ MODEL = Model(
     several_carriers=True,
     new_receivers=True,
     check=check,
+    by_data=_by_data,
 )

@@ -256,4 +256,5 @@ def fit_rssi(
     return RssiPhysics(record.receivers, field, shift, widen, facts)
 
 
-MODEL = physics_model("rssi", RssiSettings, fit_rssi, RssiPhysics.from_arrays)
+# Readings that a receiver did not report at a stop.
+MODEL = physics_model("rssi", RssiSettings, fit_rssi, RssiPhysics.from_arrays, gaps=("stop.value_dbm",))

@@ -133,6 +133,7 @@ def physics_model(
     fit: Callable[[Record, IntArray, Any, Any, int, OnProgress], PhysicsModel],
     load: Callable[[Arrays], PhysicsModel],
     uses_antennas: bool = True,
+    gaps: tuple[str, ...] = (),
 ) -> Model:
     """Entry of the physics model for a task.
 
@@ -144,6 +145,7 @@ def physics_model(
             and fraction done).
         load: ``load(arrays)``, from `PhysicsModel.arrays`.
         uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
+        gaps: arrays that may hold NaN, see `Model.gaps`.
     """
 
     def fit_problem(problem: Problem, split: Split, session: Session) -> Fitted:
@@ -177,5 +179,6 @@ def physics_model(
         scene_alone=True,
         headings=True,
         new_receivers=task == "rssi",
+        gaps=gaps,
         check=check,
     )
