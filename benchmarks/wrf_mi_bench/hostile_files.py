@@ -95,7 +95,7 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
     failures: dict[str, dict[int, str]] = {name: {} for name in names}
     place, first = 0, 0
     while place < len(names):
-        write_atomically(folder / STATE, f"{names[place]} {first}")
+        write_atomically(folder / STATE, _tally(names[place], first))
         call = [sys.executable, "-m", __name__ if __name__ != "__main__" else "wrf_mi_bench.hostile_files"]
         call += [str(folder), ",".join(names[place:]), str(first), str(count)]
         with (folder / "errors.txt").open("w") as errors:
@@ -103,12 +103,15 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
             reason = _watched(child, folder / STATE)
         if reason is None:
             break
-        name, number = _state(folder)
+        last = (folder / STATE).read_text()
+        append_line(folder / RESULTS, last)
+        name, number = json.loads(last)["reader"], json.loads(last)["number"]
         failures[name][number] = reason
         place, first = names.index(name), number + 1
     found: dict[str, dict[str, Any]] = {}
     for text in (folder / RESULTS).read_text().splitlines() if (folder / RESULTS).exists() else ():
         one = json.loads(text)
+        del one["number"]
         total = found.setdefault(one["reader"], one)
         if total is not one:
             total["failed"] |= one["failed"]
@@ -116,15 +119,23 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
             total |= {key: max(total[key], one[key]) for key in ("slowest_s", "largest_mb")}
     rows = []
     for name in names:
-        empty = {"reader": name, "refused": 0, "loaded": 0, "failed": {}, "slowest_s": 0.0, "largest_mb": 0.0}
-        row = found.get(name, empty)
-        rows.append({**row, "inputs": count, "failed": row["failed"] | {str(k): v for k, v in failures[name].items()}})
+        failed = found[name]["failed"] | {str(number): reason for number, reason in failures[name].items()}
+        rows.append({**found[name], "inputs": count, "failed": failed})
     return rows
 
 
-def _state(folder: Path) -> tuple[str, int]:
-    name, number = (folder / STATE).read_text().rsplit(maxsplit=1)
-    return name, int(number)
+def _tally(
+    reader: str,
+    number: int,
+    refused: int = 0,
+    loaded: int = 0,
+    failed: Mapping[str, str] | None = None,
+    slowest_s: float = 0.0,
+    largest_mb: float = 0.0,
+) -> str:
+    """Results of a reader before an input, as JSON."""
+    counts = {"reader": reader, "number": number, "refused": refused, "loaded": loaded, "failed": failed or {}}
+    return json.dumps({**counts, "slowest_s": slowest_s, "largest_mb": largest_mb})
 
 
 def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
@@ -200,7 +211,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
     place = Path(folder)
     warm()
     _limit_memory()
-    for user in ("wrf_mi.scene.points", "wrf_mi.datasets.deepmimo"):
+    for user in ("wrf_mi.scene.points", "wrf_mi.datasets.deepmimo", "wrf_mi.viewer.map_layer"):
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):
@@ -214,7 +225,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         if (wrong := _read_one(reader, work)) is not None:
             failed["whole"] = f"the whole file is not read: {wrong}"
         for number in range(start, int(count)):
-            write_atomically(place / STATE, f"{name} {number}")
+            write_atomically(place / STATE, _tally(name, number, refused, loaded, failed, slowest, largest))
             (work / reader.file).write_bytes(mutated(whole, number, name))
             before, peak = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             wrong = _read_one(reader, work)
@@ -223,8 +234,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
             refused, loaded = refused + (wrong == ""), loaded + (wrong is None)
             if wrong:
                 failed[str(number)] = wrong
-        result: Mapping[str, Any] = {"reader": name, "refused": refused, "loaded": loaded, "failed": failed}
-        append_line(place / RESULTS, json.dumps({**result, "slowest_s": slowest, "largest_mb": largest}))
+        append_line(place / RESULTS, _tally(name, int(count), refused, loaded, failed, slowest, largest))
         start = 0
     shutil.rmtree(place / "work", ignore_errors=True)
 

@@ -165,7 +165,7 @@ def warm() -> None:
     from wrf_mi.backend import init
 
     init("llvm", threads=1)
-    for name in ("h5py", "laspy", "lazrs", "scipy.io", "sionna.rt"):
+    for name in ("h5py", "laspy", "lazrs", "scipy.io", "sionna.rt", "xarray", "zarr", "h5netcdf"):
         __import__(name)
 
 

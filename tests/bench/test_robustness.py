@@ -19,12 +19,15 @@ def test_changed_files_are_refused_in_one_line_or_read(tmp_path: Path) -> None:
     assert all(row["refused"] + row["loaded"] == INPUTS for row in rows)
 
 
-@pytest.mark.parametrize(("name", "kills"), [("kriging", 2), ("correct", 1), ("tables", 1)])
+@pytest.mark.parametrize(
+    ("name", "kills"), [("kriging", 2), ("correct", 1), pytest.param("tables", 1, marks=pytest.mark.slow)]
+)
 def test_commands_under_faults_give_the_results_of_undisturbed_ones(name: str, kills: int, tmp_path: Path) -> None:
     found = faults.run(tmp_path, [name], kills)
     assert {kind: one["failed"] for kind, one in found.items() if one["failed"]} == {}
 
 
+@pytest.mark.slow
 def test_a_lost_worker_loses_and_repeats_no_row(tmp_path: Path) -> None:
     assert endurance.lost_worker(tmp_path)["wrong"] == []
 

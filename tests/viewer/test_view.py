@@ -224,6 +224,23 @@ def test_maps_of_surfaces_and_datasets_are_points(tmp_path: Path) -> None:
     assert note == "Maps: every 2th position along each axis (every 4th point of a surface)."
 
 
+def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path: Path) -> None:
+    xarray, folder = pytest.importorskip("xarray"), tmp_path / "map.zarr"
+    pytest.importorskip("zarr")
+    power = np.random.default_rng(0).uniform(-90, -40, (2, 7, 8)).astype(np.float32)
+    axes = {"x": np.arange(8.0), "y": np.arange(7.0), "height": 1.0, "receiver": ["a", "b"]}
+    made = xarray.Dataset({"power_dbm": (("receiver", "y", "x"), power)}, axes)
+    made.to_zarr(folder, zarr_format=2)
+    found, _ = read_map(folder)
+    np.testing.assert_array_equal(found.values["power_dbm"], power)
+    assert (found.name, found.receivers, found.height_m) == ("map.zarr", ("a", "b"), 1.0)
+    chunk = folder / "power_dbm" / "0.0.0"
+    head = chunk.read_bytes()[:14]  # of Blosc, but for the higher bytes of the compressed size
+    chunk.write_bytes(head.ljust(500, b"\1"))
+    with pytest.raises(InputError, match=r"^\S+map\.zarr: its content is damaged; make the map anew$"):
+        read_map(folder)
+
+
 def test_large_maps_are_thinned(tmp_path: Path) -> None:
     found, _ = read_map(write_map(tmp_path / "map.nc"))
     (thin,), notes = thinned([found], most=20)

@@ -107,12 +107,30 @@ def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]
     coordinates of their planes.
     """
     areas = list(areas)
+    corners = [_corners(plane, area) for plane, area in zip(planes, areas, strict=True)]
     for _ in range(PASSES):
         for i, a in enumerate(planes):
             for j, b in enumerate(planes):
-                if i != j and abs(a.normal @ b.normal) < STEEPEST:
-                    areas[i] = _end_at(a, areas[i], b, areas[j], min(reach_m[i], reach_m[j]))
+                reach = min(reach_m[i], reach_m[j])
+                if i == j or abs(a.normal @ b.normal) >= STEEPEST or _beside(b, corners[i], reach):
+                    continue
+                if _beside(a, corners[j], reach):
+                    continue
+                areas[i] = _end_at(a, areas[i], b, areas[j], reach)
+                corners[i] = _corners(a, areas[i])
     return areas
+
+
+def _corners(plane: Plane, area: Any) -> FloatArray:
+    """Corners [4, 3] of a rectangle of a plane around an area; not finite for an empty one."""
+    low_u, low_v, high_u, high_v = area.bounds
+    return plane.lift(np.array([[low_u, low_v], [high_u, low_v], [low_u, high_v], [high_u, high_v]]))
+
+
+def _beside(plane: Plane, corners_m: FloatArray, reach_m: float) -> bool:
+    """Whether all of a rectangle lies on one side of a plane and out of reach: no further than a line of the plane."""
+    distance = plane.distance(corners_m)
+    return bool(distance.min() > reach_m + GRID_M or distance.max() < -reach_m - GRID_M)
 
 
 def _end_at(a: Plane, area: Any, b: Plane, other: Any, reach: float) -> Any:

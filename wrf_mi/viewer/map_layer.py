@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core import InputError
-from ..core.files import readable
+from ..core.array_files import stored_arrays
+from ..parallel import run_module
 from .content import MapContent
 
 NETCDF, ZARR = (".nc", ".nc4", ".netcdf"), ".zarr"
@@ -20,6 +23,10 @@ MAP_NUMBERS = 900_000
 """Values of all maps of a page, at most: 2.4 MB."""
 RECEIVER, POINT = "receiver", "point"
 """Dimensions of receivers and of the points of a surface."""
+FACTS, VALUES = "facts", "value/"
+"""Key of all but the arrays of a map that a child process has read, and prefix of the keys of its values."""
+MOST_S = 600.0
+"""Time of that process, which limits its processor time by the size of the file."""
 
 
 def is_map(path: Path) -> bool:
@@ -39,19 +46,27 @@ def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
         InputError: a file that cannot be read or is no such map, or xarray is not installed.
     """
     if not isinstance(source, str | Path):
-        return _content(source, "map")
+        return map_content(source, "map")
     path = Path(source)
-    try:
-        xarray = import_module("xarray")
-    except ModuleNotFoundError:
-        raise InputError(f"{path}: maps need xarray; install it: pip install 'wrf-mi[view]'") from None
-    missing = f"{path}: no such file; give a map made by wrf-mi map"
-    opened = xarray.open_zarr if path.suffix.lower() == ZARR else xarray.open_dataset
-    with readable(path, missing, "make the map anew"), opened(path) as dataset:
-        return _content(dataset.load(), path.name)
+    if find_spec("xarray") is None:
+        raise InputError(f"{path}: maps need xarray; install it: pip install 'wrf-mi[view]'")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; give a map made by wrf-mi map")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "map.npz"
+        status, message = run_module("wrf_mi.viewer.read_map_file", [str(path), str(out)], quiet=True, most_s=MOST_S)
+        if status != 0:
+            raise InputError(message if status == 1 else f"{path}: its content is damaged; make the map anew")
+        arrays = stored_arrays(out)
+    facts = json.loads(str(arrays[FACTS]))
+    axes = arrays["x_m"], arrays["y_m"], arrays.get("z_m")
+    values = {name.removeprefix(VALUES): array for name, array in arrays.items() if name.startswith(VALUES)}
+    found = path.name, facts["height_m"], *axes, tuple(facts["receivers"]), values, facts["labels"]
+    return MapContent(*found), facts["notes"]
 
 
-def _content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
+def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
+    """A map of an ``xarray.Dataset``, see `read_map`."""
     points = POINT in dataset.dims
     needed = ("x", "y", "z") if points else ("x", "y", "height")
     if lacking := [axis for axis in needed if axis not in dataset.coords]:
