@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from ..scene.xml_file import mesh_files, read_scene_xml
 from .materials import perfect_reflector, set_frequency
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
+CHECKED_FILES = 4096
+"""Files whose checks are remembered: a scene is opened once for each carrier and fold."""
 HIGHEST_M = 500.0
 """Height above which a scene counts as one in millimetres."""
 
@@ -110,7 +113,8 @@ def _from_xml(path: Path) -> Any:
     from sionna import rt
 
     for file in mesh_files(read_scene_xml(path), path.parent):
-        mesh_parts(file)  # Mitsuba follows a face to a vertex that is not there, and ends the process
+        stat = file.stat() if file.exists() else None
+        _check_mesh(file, stat and (stat.st_ino, stat.st_size, stat.st_mtime_ns))
     try:
         # Merged shapes, and with them the paths, have a random order.
         return rt.load_scene(str(path), merge_shapes=False)
@@ -121,6 +125,15 @@ def _from_xml(path: Path) -> Any:
             known = ", ".join(THICKNESS_M)
             raise InputError(f"{path}: {one_line(lines[-1])}; known are {known}, and constants of your own") from None
         raise InputError(f"{path}: cannot be opened ({one_line(lines[-1])}); correct the scene") from None
+
+
+@lru_cache(CHECKED_FILES)
+def _check_mesh(file: Path, state: tuple[int, int, int] | None) -> None:
+    """Refuse a mesh with a face of a vertex that is not there: Mitsuba follows it, and ends the process.
+
+    A file is read again if its state (inode, bytes, time of change) is another one.
+    """
+    mesh_parts(file)
 
 
 def _from_mesh(path: Path, material: str) -> Any:
