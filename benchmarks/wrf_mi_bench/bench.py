@@ -23,7 +23,7 @@ from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
 from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.fit_key import dataset_files, fit_key
-from wrf_mi.runs.folder import CONFIG, METRICS, versions
+from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
 
 from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
 
@@ -214,7 +214,7 @@ def modules_of(name: str) -> tuple[str, ...]:
 
 def _measure(name: str, folder: Path) -> dict[str, Any]:
     case = CASES[name]
-    if not (folder / METRICS).exists() or not (folder / MEASURED).exists():
+    if not is_finished(folder) or not (folder / MEASURED).exists():
         wall = run_command(case.arguments, folder, f"bench {name}: ")
         write_atomically(folder / MEASURED, json.dumps({"wall_seconds": wall, **provenance(*modules_of(name))}))
     return {

@@ -28,7 +28,7 @@ from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers, write_a
 from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files, source_files
-from wrf_mi.runs.folder import CONFIG, METRICS, package_versions
+from wrf_mi.runs.folder import CONFIG, is_finished, package_versions
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
@@ -125,7 +125,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
     source = source_digests(*modules_of_command(row.command.split()))
     folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scene[1:]])}"
     wall = None
-    if (folder / METRICS).exists():
+    if is_finished(folder):
         print(
             f"tables: {row.name}: finished before in {folder}, with the same source, data and versions", file=sys.stderr
         )

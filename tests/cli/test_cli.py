@@ -16,11 +16,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from calling import SET, SMALL, call, refused
 from made_spectra import SIZE
 
+from wrf_mi.backend.recorded import Recorded
 from wrf_mi.cli import demo
 from wrf_mi.cli.main import build_parser, main
 from wrf_mi.cli.output import Watch
@@ -371,6 +373,17 @@ def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch)
 def test_ctrl_c_before_training_starts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted(*arguments: Any) -> SimpleNamespace:
         raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "evaluate_run", interrupted)
+    assert call(["evaluate", "run"], capsys) == (130, "", "wrf-mi: interrupted\n")
+
+
+def test_ctrl_c_while_a_kernel_is_recorded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def pressed(x: Any) -> None:
+        raise KeyboardInterrupt
+
+    def interrupted(*arguments: Any) -> None:
+        Recorded(pressed)(dr.llvm.Float(1, 2))
 
     monkeypatch.setattr(runs, "evaluate_run", interrupted)
     assert call(["evaluate", "run"], capsys) == (130, "", "wrf-mi: interrupted\n")

@@ -19,7 +19,7 @@ from wrf_mi.core.memory import require_memory
 from wrf_mi.models import MODELS
 from wrf_mi.runs import run as run_module
 from wrf_mi.runs.api import Interrupted, open_run, predict_to_file, resume, train
-from wrf_mi.runs.folder import read_fitted, write_fitted
+from wrf_mi.runs.folder import is_finished, read_fitted, write_fitted
 from wrf_mi.training.checkpoint import cut_log
 
 DEAD = 2**22 + 1
@@ -41,6 +41,17 @@ def test_a_folder_has_one_writer(tmp_path: Path) -> None:
     (tmp_path / LOCK).write_text(f"{DEAD}\n")  # of a process that was killed
     with locked_folder(tmp_path):
         assert (tmp_path / LOCK).exists()
+
+
+def test_the_lock_of_a_process_that_was_killed_at_the_end_of_a_run_is_removed(kriging: Path, tmp_path: Path) -> None:
+    run = copied(kriging, tmp_path / "run")
+    assert not is_finished(tmp_path)
+    (run / LOCK).write_text(f"{DEAD}\n")
+    assert is_finished(run)
+    assert not (run / LOCK).exists()
+    with locked_folder(run):  # of one that lives
+        assert is_finished(run)
+        assert (run / LOCK).exists()
 
 
 def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:

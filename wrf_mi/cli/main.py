@@ -69,8 +69,8 @@ def build_parser() -> Parser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    a = build_parser().parse_args(arguments)
     try:
+        a = build_parser().parse_args(arguments)
         status: int = a.call(a)
         sys.stdout.flush()
         return status
@@ -79,9 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except KeyboardInterrupt:
-        print("wrf-mi: interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
     except Exception as error:
+        if _is_interrupt(error):
+            return _interrupted()
         # Errors of this package have an exit status and a message of one line; any other keeps its traceback.
         known = {InputError: 2, OSError: 2, BackendError: 1}
         found = (status for kind, status in known.items() if isinstance(error, kind))
@@ -90,3 +91,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"wrf-mi: {os_failure(error) if isinstance(error, OSError) else error}", file=sys.stderr)
         return int(exit_status)
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether Ctrl-C caused an error: Dr.Jit raises its own for one within a function that it records."""
+    return isinstance(error, KeyboardInterrupt) or (error.__cause__ is not None and _is_interrupt(error.__cause__))
+
+
+def _interrupted() -> int:
+    print("wrf-mi: interrupted", file=sys.stderr)
+    return 130

@@ -18,6 +18,7 @@ import json
 import platform
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +32,7 @@ from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import LEFTOVER, readable, write_atomically
-from ..core.locks import LOCK
+from ..core.locks import LOCK, locked_folder
 from ..core.settings import settings_from
 from ..core.yaml_files import read_yaml
 from ..datasets import load_split, save_split
@@ -209,6 +210,15 @@ def _folders(folder: Path, splits: Sequence[Split]) -> list[tuple[Path, Split]]:
 def run_parts(folder: Path) -> list[Path]:
     """Folders of a run that hold a split: the run folder, or those of its folds."""
     return [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"), key=lambda p: (len(p.name), p.name))
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a run has its metrics; what a process left there that was killed after them is removed."""
+    found = (folder / METRICS).exists()
+    if found and (folder / LOCK).exists():
+        with suppress(InputError), locked_folder(folder):  # refused while another process writes
+            pass
+    return found
 
 
 def load_rows(folder: Path, record: Record) -> Split:

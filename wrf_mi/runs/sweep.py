@@ -30,7 +30,7 @@ from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
 from .fit_key import dataset_files, scene_files
-from .folder import CONFIG, METRICS, package_versions
+from .folder import CONFIG, METRICS, is_finished, package_versions
 from .results import write_csv
 
 OPTIONS = (
@@ -219,7 +219,7 @@ def _files(sweep: Sweep) -> dict[str, list[Path]]:
 def _run(run: SweepRun) -> dict[str, Any]:
     """Run a combination in a subprocess; return its row of the table."""
     folder = run.folder
-    if (folder / METRICS).exists():
+    if is_finished(folder):
         return _row(run, "kept")
     resumable = (folder / CONFIG).exists()
     if folder.exists() and not resumable:
