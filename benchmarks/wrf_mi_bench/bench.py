@@ -116,7 +116,9 @@ _OWN: Mapping[str, Check] = {
         table="ingredients:table",
     ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
-    "new-carriers": _here("carriers without measurements", "unmeasured:carriers", resumes=True),
+    "new-carriers": _here(
+        "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
+    ),
     "new-receivers": _here("receivers without measurements, and with few", "unmeasured:receivers", FLAT, resumes=True),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),

@@ -195,20 +195,43 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
     }
 
 
-def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     digits = TASKS[found[0]["task"]].digits
-    inside = np.mean([one["inside_90"] for one in found])
-    lines = []
+    inside = float(np.mean([one["inside_90"] for one in found]))
+    rows = []
     for name, (median, mean, gain) in gains(found).items():
         value = f"median {median:.{digits}f}, mean {mean:.{digits}f}"
         asked = f"{inside:.0%} inside (80 to 97 %)" if gain is None else f"hybrid better by {gain}"
-        lines.append(line(f"{what}: {name}", value, asked))
-    return lines
+        figures = {"at": what, "method": name, "median": median, "mean": mean, "inside": inside, "digits": digits}
+        interval = None if gain is None else [gain.value, gain.low, gain.high]
+        rows.append({**line(f"{what}: {name}", value, asked), **figures, "gain": interval})
+    return rows
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table: median (mean) score of each method, and the hybrid's mean gain with its 95 % interval."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [
+        f"| held out | {HYBRID} | inside | {' | '.join(methods[1:])} |",
+        f"| {' | '.join(['---'] * (len(methods) + 2))} |",
+    ]
+    for at in dict.fromkeys(row["at"] for row in rows):
+        cells = [at]
+        for row in (row for row in rows if row["at"] == at):
+            digits = row["digits"]
+            score = f"{row['median']:.{digits}f} ({row['mean']:.{digits}f})"
+            if row["gain"] is None:
+                cells += [f"**{score}**", f"{row['inside']:.0%}"]
+            else:
+                value, low, high = (f"{part:.{digits}f}" for part in row["gain"])
+                cells.append(f"{score} [{value}: {low} to {high}]")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def carriers() -> dict[str, Any]:
     """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, str]](), list[dict[str, Any]]()
+    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
     for held in CARRIERS:
         hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
         for fold in range(held.folds):
@@ -225,7 +248,7 @@ def carriers() -> dict[str, Any]:
 def receivers() -> dict[str, Any]:
     """Measure receivers held out in turn, without and with few rows of their own, three seeds, as `carriers`."""
     data_folder(FLAT)
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, str]](), list[dict[str, Any]]()
+    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
     for held in RECEIVERS:
         for left in LEFT:
             found = []

@@ -53,6 +53,7 @@ ON_PAGE = {
     "stress": "numerics.md",
     "elsewhere": "numerics.md",
     "rooms": "correction.md",
+    "new-carriers": "hybrid.md",
     "locate": "locate.md",
     "phase-error": "physics.md",
     "sentinels": "results.md",
