@@ -17,6 +17,7 @@ from wrf_mi.core.files import remove_leftovers
 from wrf_mi.core.locks import LOCK, alone_in_process, locked_folder
 from wrf_mi.core.memory import require_memory
 from wrf_mi.models import MODELS
+from wrf_mi.runs import folder as folder_module
 from wrf_mi.runs import run as run_module
 from wrf_mi.runs.api import Interrupted, open_run, predict_to_file, resume, train
 from wrf_mi.runs.folder import is_finished, read_fitted, write_fitted
@@ -52,6 +53,20 @@ def test_the_lock_of_a_process_that_was_killed_at_the_end_of_a_run_is_removed(kr
     with locked_folder(run):  # of one that lives
         assert is_finished(run)
         assert (run / LOCK).exists()
+
+
+def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(
+    flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(folder_module, "write_configs", pressed)
+        with pytest.raises(KeyboardInterrupt):
+            train(flat_folder, tmp_path / "run", "idw")
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [LOCK, "split.npz"]
+    assert not (train(flat_folder, tmp_path / "run", "idw").folder / LOCK).exists()
 
 
 def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:

@@ -70,7 +70,15 @@ def build_parser() -> Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     try:
-        a = build_parser().parse_args(arguments)
+        return _run(arguments)
+    except KeyboardInterrupt:  # anywhere, also while another error is reported
+        print("wrf-mi: interrupted", file=sys.stderr)
+        return 130
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    a = build_parser().parse_args(arguments)
+    try:
         status: int = a.call(a)
         sys.stdout.flush()
         return status
@@ -78,11 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of the output has gone; Python flushes again on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except KeyboardInterrupt:
-        return _interrupted()
     except Exception as error:
         if _is_interrupt(error):
-            return _interrupted()
+            raise KeyboardInterrupt from None
         # Errors of this package have an exit status and a message of one line; any other keeps its traceback.
         known = {InputError: 2, OSError: 2, BackendError: 1}
         found = (status for kind, status in known.items() if isinstance(error, kind))
@@ -96,8 +102,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _is_interrupt(error: BaseException) -> bool:
     """Whether Ctrl-C caused an error: Dr.Jit raises its own for one within a function that it records."""
     return isinstance(error, KeyboardInterrupt) or (error.__cause__ is not None and _is_interrupt(error.__cause__))
-
-
-def _interrupted() -> int:
-    print("wrf-mi: interrupted", file=sys.stderr)
-    return 130

@@ -24,6 +24,8 @@ _fitting = threading.RLock()
 def locked_folder(folder: Path) -> Iterator[None]:
     """A block that alone writes into a folder, without the temporary files of processes that ended in theirs.
 
+    The lock file remains where `KeyboardInterrupt` ends the block.
+
     Raises:
         InputError: another process, or another block of this process, writes into it.
     """
@@ -34,13 +36,18 @@ def locked_folder(folder: Path) -> Iterator[None]:
     except Timeout:
         who = f"process {pid}" if (pid := _holder(file)) else "another process"
         raise InputError(f"{folder}: {who} writes into it; wait for its end, or stop it") from None
+    remains = False
     try:
         file.write_text(f"{os.getpid()}\n")
         remove_leftovers(folder)
         yield
+    except KeyboardInterrupt:
+        remains = True  # as after a kill: it tells an unfinished folder from one of other files
+        raise
     finally:
-        # Removed before it is free: whoever waits for it makes another file.
-        file.unlink(missing_ok=True)
+        if not remains:
+            # Removed before it is free: whoever waits for it makes another file.
+            file.unlink(missing_ok=True)
         with suppress(OSError):
             lock.release()
 
