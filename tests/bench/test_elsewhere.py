@@ -9,6 +9,7 @@ import pytest
 from wrf_mi_bench import elsewhere
 
 
+@pytest.mark.slow
 def test_two_threads_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images, spectra and metrics have equal bits; a change of one of them is reported."""
     both = [one for one in elsewhere.variants((1, 2)) if one.kind == "threads"]

@@ -10,7 +10,7 @@ from wrf_mi_bench.hostile_files import run_readers
 from wrf_mi_bench.hostile_samples import READERS
 from wrf_mi_bench.robustness import SLOW
 
-INPUTS = 10
+INPUTS = 5
 
 
 def test_changed_files_are_refused_in_one_line_or_read(tmp_path: Path) -> None:
@@ -20,7 +20,8 @@ def test_changed_files_are_refused_in_one_line_or_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kills"), [("kriging", 2), ("correct", 1), pytest.param("tables", 1, marks=pytest.mark.slow)]
+    ("name", "kills"),
+    [("kriging", 2), *(pytest.param(name, 1, marks=pytest.mark.slow) for name in ("correct", "tables"))],
 )
 def test_commands_under_faults_give_the_results_of_undisturbed_ones(name: str, kills: int, tmp_path: Path) -> None:
     found = faults.run(tmp_path, [name], kills)

@@ -21,6 +21,7 @@ def test_rows_needed_are_where_the_curve_reaches_the_score(score: Any, goal: flo
     assert rows_needed((10, 20, 40), lower, -goal, False) == (None if rows is None else pytest.approx(rows))
 
 
+@pytest.mark.slow
 def test_a_cell_is_measured_with_all_starts_and_the_paths_alone(tmp_path: Path) -> None:
     found = measure(Cell(LAB, "official", 5), 0, tmp_path / "cell", steps=2)
     assert {*CURVES, IDW, "task"} == set(found)
