@@ -10,7 +10,7 @@ from wrf_mi_bench.hostile_files import run_readers
 from wrf_mi_bench.hostile_samples import READERS
 from wrf_mi_bench.robustness import SLOW
 
-INPUTS = 5
+INPUTS = 10
 
 
 def test_changed_files_are_refused_in_one_line_or_read(tmp_path: Path) -> None:
