@@ -152,6 +152,16 @@ def test_receivers_poses_are_trained_where_a_rate_is_given(rooms: dict[str, Path
         assert np.abs(params[name]).max() > 0, name
 
 
+def test_run_that_validated_no_step_opens_with_an_infinite_reach(
+    rooms: dict[str, Path], data: Path, tmp_path: Path
+) -> None:
+    own = config("steps=20", "validate_every=1000", "patience=0", "optimiser.warm_up=5")
+    train(str(data), tmp_path / "run", settings=own, scene=rooms["known"])
+    run = open_run(tmp_path / "run")
+    assert np.isinf(run.fitted.arrays()["reach_m"])
+    assert np.isfinite(run.predict(np.array([[1.9, 2.9, 1.5]])).mean).all()
+
+
 def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, capsys: Any) -> None:
     settings = [part for one in ("steps=20", *SETTINGS[1:]) for part in ("--set", one)]
     asked = ["train", data, "--receiver", "array", "--out", tmp_path / "run", *settings]

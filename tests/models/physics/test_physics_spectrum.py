@@ -13,6 +13,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.models import MODELS
 from wrf_mi.models.interpolation.kriging import Kriging
 from wrf_mi.models.physics import spectrum_rays
 from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum, groups
@@ -29,6 +30,7 @@ from wrf_mi.models.physics.spectrum_fit import (
 from wrf_mi.models.physics.spectrum_model import Fit, SpectrumModel, begin
 from wrf_mi.models.physics.spectrum_search import KnownPaths, Search
 from wrf_mi.models.physics.spectrum_waves import Grid, Spectrometer
+from wrf_mi.runs.folder import read_fitted, write_fitted
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6
@@ -198,6 +200,22 @@ def test_amplitudes_learn_a_chain_that_is_too_weak(bare: SpectrumModel) -> None:
     found = bare.replaced(maps=fit_maps(waves, shapes, bare.constants, maps, 0.2, 60))
     before, after = (grid.loss(m.signals(waves), shapes)[0].mean() for m in (bare, found))
     assert after < before / 3
+
+
+def test_learned_amplitudes_and_residuals_are_read_from_a_run(bare: SpectrumModel, tmp_path: Path) -> None:
+    waves = bare.waves(places(80, 5))
+    model = bare.replaced(maps=map_centres(waves.paths, bare.table.length, 1.0, 0))
+    record = record_of(bare, places(40, 6))
+    rows = np.arange(30), np.arange(30, 40)
+    fit = Fit(INSTRUMENT, record.tx_pos_m, record.observation[0], *rows, SpectrumSettings())
+    model = fit.with_residual(model, rows[0], RESIDUALS[0])
+    write_fitted(tmp_path, SpectrumPhysics((model,), {}).arrays(), 0.0)
+    arrays, _ = read_fitted(tmp_path, MODELS["physics"].serving("spectrum", True))
+    again = SpectrumPhysics.from_arrays(arrays).models[0]
+    assert again.maps is not None
+    assert model.maps is not None
+    np.testing.assert_array_equal(again.maps.centre_m, model.maps.centre_m)
+    assert np.isnan(again.maps.centre_m).any()
 
 
 @pytest.fixture(scope="module")

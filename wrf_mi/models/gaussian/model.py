@@ -36,6 +36,8 @@ from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
 PARAM = "param/"
 """Prefix of a parameter's array in ``model.npz``."""
+REACH = "reach_m"
+"""Array of the reach in metres: infinite where no validation chose a finite one."""
 
 
 class FittedField(Fitted):
@@ -106,14 +108,14 @@ def _reach_arrays(reach: Reach | None) -> Arrays:
     if reach is None:
         return {}
     counts = np.array([len(known) for known in reach.known_m])
-    return {"reach_m": np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
+    return {REACH: np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
 
 
 def _reach(arrays: Arrays) -> Reach | None:
-    if "reach_m" not in arrays:
+    if REACH not in arrays:
         return None
     known = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
-    return Reach(tuple(known), float(arrays["reach_m"]))
+    return Reach(tuple(known), float(arrays[REACH]))
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
@@ -205,7 +207,7 @@ def _entry(name: str) -> Model:
         uplink="optional",
         several_carriers=True,
         new_receivers=True,
-        gaps=GAPS,
+        gaps=(*GAPS, REACH),
         given=("model", "seed", "deterministic", "receiver", "evaluation"),
         presets=PRESETS,
         check=check,

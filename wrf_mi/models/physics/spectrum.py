@@ -188,7 +188,7 @@ def fit_spectrum(
     return SpectrumPhysics(tuple(models), facts)
 
 
-MODEL = physics_model("spectrum", SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays)
+MODEL = physics_model("spectrum", SpectrumSettings, fit_spectrum, SpectrumPhysics.from_arrays, gaps=("map_centre_m",))
 
 
 def _fitted(fit: Fit, model: SpectrumModel, seed: int, on_progress: OnProgress) -> tuple[SpectrumModel, dict[str, Any]]:
