@@ -1,59 +1,62 @@
-"""Measured tables of the documents are made from stored results, or state how and when they were measured."""
+"""Measured tables of the documents are made from stored results."""
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_readme import CHECKOUT, DOCUMENTS, prose
 
+EARLIER = sorted((CHECKOUT / "benchmarks" / "results" / "earlier").glob("*.json"))
+"""What was measured at a commit, and is kept as it was found then."""
 DECIMAL = re.compile(r"\d\.\d")
-SOURCE = re.compile(r"`(?:wrf-mi|make) [^`]+`|\(commit [0-9a-f]{7}\)|[Tt]he commands:|Measured at two commits")
-"""A command, or the commit of a measurement."""
+BLOCK = re.compile(r"<!-- ([\w/-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)
 STATED = {
     *(("conventions.md", "score"), ("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
-    *(
-        ("numerics.md", ""),
-        ("model.md", "constant"),
-        ("plugins.md", "parameter"),
-        ("speed.md", "omitted"),
-        ("tables.md", "question"),
-    ),
+    *(("changelog.md", "0.1.0"), ("model.md", "constant"), ("model.md", "setting"), ("numerics.md", "")),
+    *(("plugins.md", "parameter"), ("speed.md", "omitted"), ("tables.md", "question")),
+    *(("mesh.md", "you have"), ("receiver.md", "what")),
 }
 """Page and first cell of tables of definitions, settings and bounds, which nobody measures."""
 
 
 def unsourced(text: str, page: str) -> list[str]:
-    """First lines of the tables with decimal figures outside markers, and without a source in a paragraph beside."""
-    text = re.sub(r"<!-- ([\w-]+) -->\n.*?<!-- /\1 -->", "", text, flags=re.DOTALL)
-    parts = [part for part in re.split(r"\n\s*\n", text) if part.strip() and not part.startswith("![")]
-    found = []
-    for number, part in enumerate(parts):
-        lines = part.strip("\n").split("\n")
-        first = next((at for at, line in enumerate(lines) if line.lstrip().startswith("|")), None)
-        if first is None or not DECIMAL.search("\n".join(lines[first:])):
-            continue
-        beside = " ".join([*parts[max(number - 1, 0) : number], *lines[:first], *parts[number + 1 : number + 2]])
-        beside = " ".join(line for line in beside.split("\n") if not line.lstrip().startswith("|"))
-        if not SOURCE.search(beside) and (page, lines[first].split("|")[1].strip()) not in STATED:
-            found.append(lines[first])
-    return found
+    """First lines of the tables with decimal figures outside blocks that are made from results."""
+    tables = re.findall(r"(?:^ *\|.*\n?)+", BLOCK.sub("", text), re.MULTILINE)
+    first = {table: table.strip().split("\n")[0] for table in tables if DECIMAL.search(table)}
+    return [line for line in first.values() if (page, line.split("|")[1].strip()) not in STATED]
+
+
+def made(name: str, result: Mapping[str, Any]) -> str:
+    """The block of a document that shows an earlier measurement."""
+    cells = [result["columns"], ["---"] * len(result["columns"]), *result["rows"]]
+    table = "\n".join("|" + "".join(f" {cell} |" if cell else " |" for cell in row) for row in cells)
+    source = f"Measured {result['date']} (commit {result['commit']})"
+    source += f" by `{result['command']}`." if result["command"] else "."
+    return f"<!-- earlier/{name} -->\n{table}\n\n{source}\n<!-- /earlier/{name} -->"
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(CHECKOUT)))
-def test_measured_tables_have_a_source(path: Path) -> None:
-    assert unsourced(prose(path), path.name) == []
+def test_measured_tables_are_made_from_results(path: Path) -> None:
+    text = prose(path)
+    assert unsourced(text, path.name) == []
+    assert BLOCK.findall(text) == re.findall(r"<!-- ([\w-][\w/-]*) -->", text)
 
 
-def test_table_without_source_is_found() -> None:
+@pytest.mark.parametrize("path", EARLIER, ids=lambda path: path.stem)
+def test_earlier_measurements_are_shown_as_stored(path: Path) -> None:
+    result = json.loads(path.read_text(encoding="utf-8"))
+    if "rows" in result:
+        assert made(path.stem, result) in (CHECKOUT / result["page"]).read_text(encoding="utf-8")
+
+
+def test_table_without_a_result_is_found() -> None:
     table = "| what | error |\n| --- | --- |\n| a | 0.1 |"
-    assert unsourced(f"Errors:\n\n{table}\n\nSmall.", "page.md") == ["| what | error |"]
-    for text in (
-        f"By `wrf-mi bench stress`:\n\n{table}",
-        f"{table}\n\nMeasured 2026-01-01 (commit 0123abc).",
-        f"<!-- made -->\n{table}\n<!-- /made -->",
-        table.replace("0.1", "one"),
-    ):
+    assert unsourced(f"By `wrf-mi bench stress`:\n\n{table}\n\nSmall.", "page.md") == ["| what | error |"]
+    for text in (f"<!-- made -->\n{table}\n<!-- /made -->", table.replace("0.1", "one")):
         assert unsourced(text, "page.md") == []
