@@ -20,10 +20,6 @@ from .hostile_samples import READERS
 
 INPUTS, QUICK_INPUTS = 2000, 50
 """Inputs of each reader."""
-SLOW = {
-    "run: operator0.npz": 0.1,
-}
-"""Share of the inputs for readers that take long: one builds an operator."""
 QUICK_KILLS, TOGETHER = 3, 8
 """Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")
@@ -79,11 +75,9 @@ def main() -> dict[str, Any]:
         long.append(kept(place / f"{work.__name__}.json", partial(work, folder)))
         shutil.rmtree(folder, ignore_errors=True)
     files = []
-    fast = [name for name in READERS if name not in SLOW]
-    groups = [(fast[k : k + TOGETHER], INPUTS) for k in range(0, len(fast), TOGETHER)]
-    groups += [([name], round(INPUTS * share)) for name, share in SLOW.items()]
-    for number, (names, count) in enumerate(groups):
-        files += kept(place / f"readers{number}.json", partial(run_readers, place / "files", names, count))
+    groups = [list(READERS)[k : k + TOGETHER] for k in range(0, len(READERS), TOGETHER)]
+    for number, names in enumerate(groups):
+        files += kept(place / f"readers{number}.json", partial(run_readers, place / "files", names, INPUTS))
     shutil.rmtree(place / "files", ignore_errors=True)
     return _result(found, files, long)
 
@@ -99,9 +93,7 @@ def quick(
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         found = faults.run(place / "faults", names, kills)
-        fast = [name for name in READERS if name not in SLOW]
-        files = run_readers(place / "files", fast, inputs)
-        files += run_readers(place / "files", list(SLOW), max(inputs // 10, 2))
+        files = run_readers(place / "files", list(READERS), inputs)
         long = [endurance.lost_worker(place / "lost"), endurance.memory(place / "memory", *QUICK_CALLS)]
     figures = _result(found, files, long)
     if "failed" in figures:
