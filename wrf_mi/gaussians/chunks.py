@@ -1,7 +1,7 @@
 """Gaussians of a field in chunks: a network keeps some numbers of every layer for each Gaussian and transmitter.
 
-Those of WRF-GS+ are 4 kB per pair. In chunks, memory grows only with the Gaussians themselves. Without gradients,
-which need all layers of all chunks.
+Those of WRF-GS+ are some kilobytes per pair. In chunks, memory grows only with the Gaussians themselves. Without
+gradients, which need all layers of all chunks.
 """
 
 from __future__ import annotations
