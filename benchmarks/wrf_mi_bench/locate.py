@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,7 @@ PHYSICS = partial(Cell, "physics, knows walls", "physics")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
 SEEDS = (0, 1, 2)
 CELLS = (
-    *(kind(ROWS, seed) for seed in SEEDS for kind in (PHYSICS, KRIGING)),
+    *(kind(ROWS, seed) for kind in (PHYSICS, KRIGING) for seed in SEEDS),
     PHYSICS(None),
 )
 
@@ -115,18 +115,21 @@ def best_neighbours(record: Record, rows: IntArray, observed_dbm: FloatArray, tr
     return np.asarray(min(errors, key=lambda one: float(one.mean())), float)
 
 
-def stretches(values: Sequence[float] | FloatArray) -> FloatArray:
-    """Means of stretches of `STRETCH` consecutive rows; the last has up to twice as many."""
-    every = np.asarray(values, float)
+def stretches(values: FloatArray) -> FloatArray:
+    """Means of stretches of `STRETCH` consecutive rows of values [draws, rows]; the last has up to twice as many."""
+    every = values.mean(axis=0)
     return np.array([part.mean() for part in np.split(every, range(STRETCH, len(every) - STRETCH + 1, STRETCH))])
 
 
-def row_of(cell: Cell, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Row of the table."""
-    error, near = (np.asarray(found[key], float) for key in ("error_m", "neighbours_error_m"))
-    best = np.asarray(found["best_neighbours_error_m"], float)
+def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Row of the table: one draw of the training rows, or all draws pooled, which score the same test rows."""
+
+    def of(key: str) -> FloatArray:
+        return np.array([found[key] for found in draws], float)
+
+    error, near, best = of("error_m"), of("neighbours_error_m"), of("best_neighbours_error_m")
     gain, over_best = (bootstrap(stretches(other - error), np.mean) for other in (near, best))
-    inside = bootstrap(stretches(found["inside"]), np.mean)
+    inside = bootstrap(stretches(of("inside")), np.mean)
     figures = {
         "median_m": float(np.median(error)),
         "mean_m": float(error.mean()),
@@ -136,16 +139,17 @@ def row_of(cell: Cell, found: Mapping[str, Any]) -> dict[str, Any]:
         "gain_m": [gain.value, gain.low, gain.high],
         "gain_over_best_m": [over_best.value, over_best.low, over_best.high],
         "inside": [inside.value, inside.low, inside.high],
-        "area_m2": float(np.median(found["area_m2"])),
-        "radius_m": float(np.median(found["radius_m"])),
+        "area_m2": float(np.median(of("area_m2"))),
+        "radius_m": float(np.median(of("radius_m"))),
     }
-    what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, seed {cell.seed}"
+    which = f"seed {cell.seed}" if len(draws) == 1 else f"{len(draws)} draws"
+    what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, {which}"
     value = (
         f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN {figures['neighbours_median_m']:.2f} m "
     )
     value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside.value:.0%} inside"
     asked = f"gain {gain.value:.2f} m ({gain.low:.2f} to {gain.high:.2f}), 85 to 95 % inside"
-    return {**line(what, value, asked), **figures, "likelihood": found["calibration"]["likelihood"], "cell": cell.name}
+    return {**line(what, value, asked), **figures}
 
 
 def _show(name: str) -> Any:
@@ -163,32 +167,39 @@ def main() -> dict[str, Any]:
     """Measure all cells, those that this code has measured before excepted; `InputError` where data are missing.
 
     Returns:
-        ``rows``; ``cells``: errors and regions of every test row; ``failed`` where nearest neighbours are not clearly
-        worse with `ROWS` rows and the walls, or regions do not hold 85 to 95 % of the true positions.
+        ``rows``; ``calibration`` of each cell; ``failed`` where nearest neighbours are not clearly worse with `ROWS`
+        rows and the walls, or regions do not hold 85 to 95 % of the true positions, draws pooled.
     """
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
     scene = scene_of(next(part for part in PARTS if part.dataset == FLAT), place)[1]
-    rows, cells = [], {}
+    found: dict[Cell, dict[str, Any]] = {}
     for number, cell in enumerate(CELLS, 1):
         print(f"locate: {number} of {len(CELLS)}: {cell.name}", file=sys.stderr, flush=True)
-        found = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
-        rows.append(row_of(cell, found))
-        cells[cell.name] = found["calibration"]
-        print(f"locate: {rows[-1]['what']}: {rows[-1]['value']}; {rows[-1]['asked']}", file=sys.stderr, flush=True)
-    return {"rows": rows, "calibration": cells, **_verdict(rows)}
+        found[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
+        row = row_of(cell, [found[cell]])
+        print(f"locate: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
+    return {"calibration": {cell.name: one["calibration"] for cell, one in found.items()}, **summary(found)}
 
 
-def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    few = [row for row, cell in zip(rows, CELLS, strict=True) if cell.n_train == ROWS and cell.scene]
-    worse = [row["what"] for row in few if row["gain_m"][1] <= 0]
-    outside = [row["what"] for row in rows if not INSIDE[0] <= row["inside"][0] <= INSIDE[1]]
-    found: dict[str, Any] = {"not_clearly_better": worse, "coverage_outside": outside}
+def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
+    """Rows of the table, draws of the same kind pooled after them, and the verdict on pooled rows."""
+    kinds: dict[Cell, list[Cell]] = {}
+    for cell in found:
+        kinds.setdefault(replace(cell, seed=0), []).append(cell)
+    rows, pooled = [], {}
+    for kind, cells in kinds.items():
+        rows += [row_of(cell, [found[cell]]) for cell in cells]
+        pooled[kind] = row_of(kind, [found[cell] for cell in cells])
+        rows += [pooled[kind]] * (len(cells) > 1)
+    worse = [row["what"] for kind, row in pooled.items() if kind.n_train and kind.scene and row["gain_m"][1] <= 0]
+    outside = [row["what"] for row in pooled.values() if not INSIDE[0] <= row["inside"][0] <= INSIDE[1]]
+    verdict: dict[str, Any] = {"not_clearly_better": worse, "coverage_outside": outside}
     if worse or outside:
-        found["failed"] = (
+        verdict["failed"] = (
             f"not clearly better than kNN: {worse or 'none'}; coverage outside 85 to 95 %: {outside or 'none'}"
         )
-    return found
+    return {"rows": rows, **verdict}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
