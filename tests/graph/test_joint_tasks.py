@@ -96,7 +96,9 @@ def score(record: Record, trainer: Trainer) -> float:
     return value if task.higher_is_better else -value
 
 
-@pytest.mark.parametrize(("task", "antennas"), [("rssi", 1), ("csi", 1), ("csi", 2)])
+@pytest.mark.parametrize(
+    ("task", "antennas"), [("rssi", 1), ("csi", 1), pytest.param("csi", 2, marks=pytest.mark.slow)]
+)
 def test_joint_training_predicts_better_than_either_side(task: str, antennas: int, rooms: dict[str, Path]) -> None:
     record = measured(task, rooms["whole"], antennas)
     both = trained(record, rooms["known"])

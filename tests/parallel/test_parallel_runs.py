@@ -116,6 +116,7 @@ def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, 
     assert_same_bits(*both(serial, positions(load(flat)), two, tmp_path))
 
 
+@pytest.mark.slow
 def test_parallel_trace_of_random_paths_equals_serial(
     flat: Path, room: Path, two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

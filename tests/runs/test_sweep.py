@@ -118,6 +118,7 @@ def test_table_contains_the_scores_of_the_runs(swept: Path) -> None:
     assert len({len(line.split("|")) for line in lines}) == 1
 
 
+@pytest.mark.slow
 def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
     folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

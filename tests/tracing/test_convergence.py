@@ -56,6 +56,7 @@ def test_smaller_error_takes_more_depth(shoebox: Any) -> None:
     assert good.error_db < rough.error_db
 
 
+@pytest.mark.slow
 def test_diffraction_is_switched_on_where_it_counts(shoebox: Any, tmp_path: Path) -> None:
     """Not in a closed box; behind a partition that reaches the ceiling, where only paths round its edge arrive."""
     choice = choose_options(shoebox, inside(2), RX, 4.0, PLAIN, kinds=("diffraction",))

@@ -154,6 +154,7 @@ def test_other_search_of_paths_keeps_the_gaussians(scene: Any, tmp_path: Path) -
     assert side.arrays[-1].each % NEAREST == 0
 
 
+@pytest.mark.slow
 def test_calibration_learns_a_patch_that_no_surface_has(tmp_path: Path) -> None:
     """Half of the metal ceiling is plasterboard, which the scene does not say: channels away from the training rows.
 

@@ -10,7 +10,7 @@ import pytest
 from box_room import CEILING, PARTITION, THICKNESS_M, WALLS, receiver, transmitters
 from traced_rooms import write_xml
 
-from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.solve import Prepared
 from wrf_mi.tracing.traced_carriers import traced_fields
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
@@ -49,6 +49,19 @@ def response(field: TracedField, parameters: dict[str, Any]) -> np.ndarray:
     gain = paths.gain[0].numpy() + 1j * paths.gain[1].numpy()
     phase = np.exp(-2j * np.pi * field.frequency_hz / 299792458 * paths.length_m.numpy())
     return (gain * phase).reshape(len(field), -1).sum(axis=1)
+
+
+def test_a_trace_at_another_carrier_compiles_nothing_anew(xml: Path) -> None:
+    """Carrier and constants of materials are no literals of the kernels."""
+
+    def kernels(carrier_hz: float) -> set[int]:
+        scene = open_scene(xml, carrier_hz, THICKNESS_M)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            trace_paths(scene, transmitters(5), receiver(), OPTIONS)
+            return {one["hash"] for one in dr.kernel_history([dr.KernelType.JIT])}
+
+    assert kernels(LOW_HZ) == kernels(MIDDLE_HZ) == kernels(HIGH_HZ)
 
 
 @pytest.mark.parametrize("faint", [0.0, 0.1])

@@ -54,6 +54,10 @@ def perfect_reflector() -> Any:
     )
 
 
+CONSTANTS = ("relative_permittivity", "conductivity", "thickness")
+"""Constants of a radio material that differ between materials."""
+
+
 def set_frequency(
     scene: Any,
     frequency_hz: float,
@@ -101,6 +105,26 @@ def set_frequency(
             ", ".join(sorted(constant)),
         )
     scene.frequency = frequency_hz
+    _share_kernels(scene, frequency_hz)
+
+
+def _share_kernels(scene: Any, frequency_hz: float) -> None:
+    """Make carrier and constants inputs of Dr.Jit's kernels.
+
+    As literals they are part of the compiled code, which LLVM then compiles for each material and carrier anew.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    values = [
+        (material, name, float(getattr(material, name)[0]))
+        for material in scene.radio_materials.values()
+        for name in CONSTANTS
+        if hasattr(material, name)
+    ]
+    scene.frequency = dr.opaque(mi.Float, frequency_hz)
+    for material, name, value in values:
+        setattr(material, name, dr.opaque(mi.Float, value))
 
 
 def _follow(material: Any, exponent: float, carrier_hz: float) -> None:
