@@ -122,7 +122,7 @@ def _share_kernels(scene: Any, frequency_hz: float) -> None:
         for name in CONSTANTS
         if hasattr(material, name)
     ]
-    scene.frequency = dr.opaque(mi.Float, frequency_hz)
+    scene._frequency = dr.opaque(mi.Float, frequency_hz)  # the setter would evaluate all materials again, in float32
     for material, name, value in values:
         setattr(material, name, dr.opaque(mi.Float, value))
 
