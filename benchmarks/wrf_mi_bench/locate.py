@@ -191,7 +191,8 @@ def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
     for kind, cells in kinds.items():
         rows += [row_of(cell, [found[cell]]) for cell in cells]
         pooled[kind] = row_of(kind, [found[cell] for cell in cells])
-        rows += [pooled[kind]] * (len(cells) > 1)
+        if len(cells) > 1:
+            rows.append(pooled[kind])
     worse = [row["what"] for kind, row in pooled.items() if kind.n_train and kind.scene and row["gain_m"][1] <= 0]
     outside = [row["what"] for row in pooled.values() if not INSIDE[0] <= row["inside"][0] <= INSIDE[1]]
     verdict: dict[str, Any] = {"not_clearly_better": worse, "coverage_outside": outside}

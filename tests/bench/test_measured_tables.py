@@ -49,9 +49,12 @@ def test_measured_tables_are_made_from_results(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", EARLIER, ids=lambda path: path.stem)
-def test_earlier_measurements_are_shown_as_stored(path: Path) -> None:
+def test_earlier_measurements_are_stated_and_shown(path: Path) -> None:
     result = json.loads(path.read_text(encoding="utf-8"))
-    if "rows" in result:
+    for one in result.get("measurements", [result]):
+        assert re.fullmatch(r"\d{4}-\d{2}-\d{2} [0-9a-f]{7}", f"{one['date']} {one['commit']}"), one
+        assert one.get("rows") or (one["what"] and one["figures"] not in ([], {})), one
+    if "measurements" not in result:
         assert made(path.stem, result) in (CHECKOUT / result["page"]).read_text(encoding="utf-8")
 
 

@@ -22,7 +22,9 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits, write_spectrum_folder
+from wrf_mi.models import MODELS
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
+from wrf_mi.runs.folder import read_fitted, write_fitted
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.config import TrainConfig, default_config
@@ -159,7 +161,12 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(
     train(str(data), tmp_path / "run", settings=own, scene=rooms["known"])
     run = open_run(tmp_path / "run")
     assert np.isinf(run.fitted.arrays()["reach_m"])
-    assert np.isfinite(run.predict(np.array([[1.9, 2.9, 1.5]])).mean).all()
+    position = np.array([[1.9, 2.9, 1.5]])
+    assert np.isfinite(run.predict(position).mean).all()
+    arrays, seconds = read_fitted(run.folder, MODELS["wrf-gs+"].serving("spectrum", True))
+    write_fitted(run.folder, arrays | {"reach_m": np.array(np.nan)}, seconds)
+    with pytest.raises(InputError, match="reach_m: not a number"):
+        open_run(run.folder).predict(position)
 
 
 def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, capsys: Any) -> None:

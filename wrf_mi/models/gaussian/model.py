@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Antenna, Prediction, Split, receiver_arrays, stored_receivers
+from ...core import Antenna, InputError, Prediction, Split, receiver_arrays, stored_receivers
 from ...graph.graph import Graph
 from ...graph.receivers import GAPS, Form
 from ...tasks import TASKS
@@ -115,7 +115,9 @@ def _reach(arrays: Arrays) -> Reach | None:
     if REACH not in arrays:
         return None
     known = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
-    return Reach(tuple(known), float(arrays[REACH]))
+    if np.isnan(length_m := float(arrays[REACH])):
+        raise InputError(f"array {REACH}: not a number; train the run anew")
+    return Reach(tuple(known), length_m)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
