@@ -14,7 +14,7 @@ help:
 	@echo "make docs-quick the same without executing notebooks"
 	@echo "make package-test  wheel and source distribution, tested in empty environments; minutes"
 	@echo "make bench      every stored figure, run time against error among them; hours"
-	@echo "make bench-quick  ratios of run times against the stored ones, numbers under stress; two minutes"
+	@echo "make bench-quick  ratios of run times against the stored ones; a minute"
 	@echo "make setup      only the set-up that the others begin with"
 	@echo "make clean      remove .venv, caches and packages; runs stay"
 
@@ -64,7 +64,6 @@ bench: $(READY)
 
 bench-quick: $(READY)
 	$(BIN)/wrf-mi bench --quick
-	$(BIN)/wrf-mi bench stress --quick
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache docs/_build docs/notebooks docs/api
