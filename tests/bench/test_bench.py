@@ -57,6 +57,7 @@ ON_PAGE = {
     "locate": "locate.md",
     "phase-error": "physics.md",
     "sentinels": "results.md",
+    "robustness": "robustness.md",
 }
 """Pages that show a check's table; all others are in `docs/results.md`."""
 
