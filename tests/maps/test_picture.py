@@ -38,7 +38,7 @@ def mapped(data: Any, folder: Path, capsys: Any, *more: Any) -> tuple[xr.Dataset
 def dots(figure: Figure, panel: int) -> dict[str, np.ndarray]:
     """Levels of the measured rows of a panel: those of training rows and all others."""
     drawn = [one for one in figure.axes[panel].collections if isinstance(one, PathCollection)]
-    circles, squares = (np.asarray(one.get_array()) for one in drawn[1:])
+    squares, circles = (np.asarray(one.get_array()) for one in drawn[1:])
     return {"trained": circles, "other": squares}
 
 

@@ -79,7 +79,8 @@ def _show(figures: dict[str, Any]) -> None:
         print(f"{text} (default: the run has too few training rows to hold any out)")
     else:
         share = f"{held['inside']:.0%} inside their 90 % regions"
-        print(f"{text}, chosen by {held['rows']} held-out training rows: {share}, mean error {held['error_m']:.2f} m")
+        what = f"{held['rows']} predictions of held-out training rows"
+        print(f"{text}, chosen by {what}: {share}, mean error {held['error_m']:.2f} m")
     title = f"{figures['n']} positions"
     print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
     known = {

@@ -46,7 +46,8 @@ def view_command(a: Arguments) -> int:
     if a.json:
         print_json({"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes})
         return 0
-    print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in found.counts.items()))
+    names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in found.counts}
+    print(", ".join(f"{count} {names[name][: -1 if count == 1 else None]}" for name, count in found.counts.items()))
     for note in found.content.notes:
         print(note)
     print(f"view: {out} ({size / 1e6:.1f} MB)")

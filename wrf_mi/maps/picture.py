@@ -34,8 +34,8 @@ PANEL_IN, COLUMNS = 3.2, 3
 """Width of a panel, and number of panels in a line."""
 MOST_PANELS = 12
 """Largest number of receivers that are drawn, the first ones."""
-MOST_POINTS = 400
-"""Largest number of measured points of a panel."""
+MOST_POINTS = 200
+"""Largest number of training rows of a panel, and of other measured rows."""
 TAIL = 1.0
 """Percentage of values beyond either end of the colour scale."""
 MEASURED_TAIL = 10.0
@@ -89,8 +89,10 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=6)
         if flat:
-            axes.set_xlabel("x (m)" if place + columns >= len(panels) else "", fontsize=7)
-            axes.set_ylabel("y (m)" if place % columns == 0 else "", fontsize=7)
+            lowest, leftmost = place + columns >= len(panels), place % columns == 0
+            axes.set_xlabel("x (m)" if lowest else "", fontsize=7)
+            axes.set_ylabel("y (m)" if leftmost else "", fontsize=7)
+            axes.tick_params(labelbottom=lowest, labelleft=leftmost)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     bar = figure.colorbar(colours, ax=list(grid.flat), shrink=0.8, extend="both", pad=0.02 if flat else 0.12)
@@ -182,10 +184,11 @@ def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
     known = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)
     if record.carriers_hz is not None and FREQUENCY in dataset.attrs:
         known &= np.isclose(record.carriers_hz, dataset.attrs[FREQUENCY], rtol=SAME_CARRIER, atol=0)
-    rows = np.flatnonzero(known)
-    rows = rows[:: max(1, -(-len(rows) // MOST_POINTS))]
-    trained = split.left[split.left[:, 0] == index, 1] if index in split.held_receivers else split.all_train
-    return _Measured(record.tx_pos_m[rows], level[rows], np.isin(rows, trained))
+    used = split.left[split.left[:, 0] == index, 1] if index in split.held_receivers else split.all_train
+    trained = np.isin(np.arange(len(known)), used)
+    kinds = (np.flatnonzero(known & part) for part in (trained, ~trained))
+    rows = np.concatenate([part[:: max(1, -(-len(part) // MOST_POINTS))] for part in kinds])
+    return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
 
 
 def _draw_points(
@@ -199,5 +202,6 @@ def _draw_points(
     if measured is None:
         return
     shades = {"cmap": colours.cmap, "norm": colours.norm}
-    for rows, mark in ((measured.trained, TRAINED), (~measured.trained, OTHER)):
+    # Training rows, often the fewer, lie above the others.
+    for rows, mark in ((~measured.trained, OTHER), (measured.trained, TRAINED)):
         axes.scatter(*measured.points_m[rows].T[:dims], c=measured.level[rows], **shades, **mark, zorder=4)
