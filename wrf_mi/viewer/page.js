@@ -412,7 +412,7 @@
   const axis = (name) => ({ title: { text: `${name} (m)` }, backgroundcolor: "#fff", gridcolor: "#e5e7eb", zeroline: false, showspikes: false });
   const layout = {
     margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, uirevision: "kept", hoverlabel: { align: "left" },
-    scene: { aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), camera: { eye: { x: 0.85, y: -1.25, z: 1.1 }, projection: { type: "perspective" } } },
+    scene: { aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), camera: { eye: { x: 1.05, y: -1.55, z: 1.35 }, projection: { type: "perspective" } } },
   };
   const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["resetCameraLastSave3d"] };
   let pending = false;
