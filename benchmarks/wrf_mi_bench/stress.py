@@ -153,7 +153,7 @@ PARTS: Sequence[tuple[Callable[..., list[Row]], tuple[Any, ...], tuple[Any, ...]
     (of_fields, (50, 5), (2, 1)),
     (derivatives, (2,), (1, ("spectrum", "RSSI"), ("random", *HARDEST[:1]))),
     (of_paths, (25,), (1,)),
-    (losses, (10,), (1,)),
+    (losses, (10,), (2,)),
     (phases, (), (5,)),
     (joint, (), (1, (COPLANAR, CANCELLING), ("RSSI",))),
     (plugin_images, (50, 5), (2, 1, 0)),

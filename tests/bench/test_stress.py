@@ -33,6 +33,18 @@ def test_few_cases_of_each_part_keep_their_bounds(part: Callable[..., list[Row]]
         assert held(row), row
 
 
+@pytest.mark.parametrize("name", HARD)
+def test_images_of_ill_conditioned_fields_equal_the_reference(name: str) -> None:
+    for seed in range(2):
+        field = HARD[name](np.random.default_rng(seed))
+        for blending in stress_fields.BLENDINGS:
+            truth, clear = reference(field, blending, (30, 60))
+            found = image(field, blending, (30, 60))
+            assert np.isfinite(found).all()
+            assert np.linalg.norm((found - truth)[clear]) <= stress_rows.IMAGE * np.linalg.norm(truth)
+            assert clear.mean() > 0.9
+
+
 def test_order_of_ties_in_depth_equals_the_reference() -> None:
     """Permuted and mirrored offsets have equal distances, so that positions decide the order."""
     field = HARD["exact ties in depth"](np.random.default_rng(5))
@@ -65,6 +77,25 @@ def test_fits_end_finite_or_name_the_group_that_is_not() -> None:
     value = bench_stress.fits(4)[0]["value"]
     assert value.endswith(" 0 did neither")
     assert "4 ended finite" not in value
+
+
+def assert_joint_rows_are_held(rows: list[dict[str, str]], count: int) -> None:
+    assert len(rows) == 2 * count
+    for row in rows:
+        assert held(row), row
+
+
+def test_joint_graph_keeps_its_bounds() -> None:
+    """Values and derivatives with coplanar planes, by all receiver models."""
+    assert_joint_rows_are_held(joint(2, [stress_joint.COPLANAR]), 1)
+
+
+# Four cases compile some 600 kernels, 15 seconds. The same code and bounds as above, and as in `wrf-mi bench stress`.
+@pytest.mark.slow
+def test_joint_graph_keeps_its_bounds_in_the_other_cases() -> None:
+    """Values and derivatives, by two receiver models."""
+    others = [*(name for name in stress_joint.CASES if name != stress_joint.COPLANAR), "many paths"]
+    assert_joint_rows_are_held(joint(2, others, ("array", "RSSI")), len(others))
 
 
 def test_joint_rows_detect_a_wrong_shift_and_a_missing_gradient(monkeypatch: pytest.MonkeyPatch) -> None:

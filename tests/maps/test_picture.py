@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi, write_spectrum_folder
+from wrf_mi.maps import picture
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.maps.picture import map_figure
 
@@ -59,6 +60,18 @@ def test_picture_of_spectra_states_a_relative_level(tmp_path: Path, capsys: Any)
         "trained": len(split.all_train),
         "other": len(split.test),
     }
+
+
+def test_training_rows_are_thinned_apart_from_other_rows(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(picture, "MOST_POINTS", 12)
+    data = write_spectrum_folder(tmp_path / "data", wave_record(receivers=1))
+    _, figure, run = mapped(data, tmp_path, capsys, "--threshold", "-10")
+    split = make_splits(run.problem.record, "official")[0]
+    assert len(split.test) <= 12 < len(split.all_train)
+    shown = {name: len(values) for name, values in dots(figure, 0).items()}
+    assert shown == {"trained": -(-len(split.all_train) // 3), "other": len(split.test)}
 
 
 def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, capsys: Any) -> None:
