@@ -151,20 +151,21 @@ def test_new_receivers_decide_where_receivers_are_held_out(tmp_path: Path) -> No
     """Half of the trained receivers judge, with the mean gain of the others."""
     true = stated_scene(tmp_path / "true", TRUE_MATERIALS)
     one = strengths(channels(true, 80))
-    places = np.array([[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0]])
-    receivers = tuple(replace(one.receivers[0], name=f"rx{k}", position_m=place) for k, place in enumerate(places))
+    places = [[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0], [2.0, 3.9, 1.5]]
+    places.append([4.5, 0.6, 2.3])
+    receivers = tuple(replace(one.receivers[0], name=f"rx{k}", position_m=np.array(p)) for k, p in enumerate(places))
     tracer = RayTracer(true, PowerInstrument(receivers, np.array([CARRIER_HZ])), TraceOptions(max_depth=2, rays=4096))
     observed = tracer(one.tx_pos_m) - 40.0
     record = replace(one, receivers=receivers, observation=observed.astype(np.float32))
     scene, split = stated_scene(tmp_path / "scene"), make_splits(record, "receiver:0")[0]
     found = correct_scene(scene, record, split, replace(default_options(record), rays=4096, depth=2))
     for score in found.scores.values():
-        judged = np.isfinite(score.reshape(5, -1)).any(axis=1)
-        assert judged.sum() == 2
+        judged = np.isfinite(score.reshape(7, -1)).any(axis=1)
+        assert judged.sum() == 3
         assert not judged[0]
     assert found.kept == "materials+gain"
     names = found.facts["held_out_receivers"]
-    assert len(names) == 2
+    assert len(names) == 3
     assert "rx0" not in names
     write_page(found, tmp_path / "page", False)
     page = (tmp_path / "page" / "correction.md").read_text()

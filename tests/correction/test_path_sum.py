@@ -1,4 +1,4 @@
-"""Sums over paths compared with the tracer: trial residuals and derivatives of channels."""
+"""Sums over paths compared with the tracer: trial residuals and derivatives of channels and strengths."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
+from wrf_mi.correction.correct import default_options
 from wrf_mi.correction.misfit import Misfit, search_options
-from wrf_mi.correction.options import CorrectionOptions
+from wrf_mi.correction.options import GAIN, MATERIALS, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
@@ -17,6 +18,8 @@ from wrf_mi.tracing.plane_parameters import SHIFT, TILT
 
 ROUNDING = 1e-5
 """Single precision of the tracer's residuals and parameters, k d of 1e3 rad."""
+DECIBEL = 1e-4
+"""Single precision of strengths of -100 dB and of logarithms of materials."""
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +77,67 @@ def test_derivatives_are_those_of_the_tracer(misfit: Misfit, trial: bool) -> Non
             found[..., part], expected[..., part], atol=0.03 * np.abs(expected[..., part]).max(), err_msg=name
         )
     assert (found[3] == 0).all()
+
+
+@pytest.fixture(scope="module")
+def strengths(tmp_path_factory: pytest.TempPathFactory) -> Misfit:
+    """Strengths in dB of three receivers, of which one has no row."""
+    scene = stated_scene(tmp_path_factory.mktemp("strengths") / "scene")
+    record = channels(scene, 24)
+    power = 10 * np.log10(np.square(np.abs(record.observation)).mean(axis=-1)).astype(np.float32)
+    observed = np.concatenate([power + 1, np.full_like(power, np.nan), power - 2])
+    observed[0, 3] = np.nan
+    first = record.receivers[0]
+    receivers = tuple(
+        replace(first, name=name, position_m=first.position_m + shift)
+        for name, shift in (("first", [0, 0, 0]), ("silent", [0.1, 0, 0]), ("third", [0.3, 0.2, 0]))
+    )
+    carrier_hz = np.array([CARRIER_HZ])
+    record = replace(record, task="rssi", observation=observed, receivers=receivers, frequencies_hz=carrier_hz)
+    options = replace(default_options(record), rays=8192, parts=(MATERIALS, GAIN))
+    opened = open_scene(scene, CARRIER_HZ)
+    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
+
+
+def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
+    """A vector of other materials and gains, and one with one more material and gain that differ."""
+    vector = misfit.start + np.random.default_rng(1).normal(0, 0.05, len(misfit.start))
+    there = vector.copy()
+    there[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    there[misfit.parts[misfit.sides[1].gain_name].start] += 0.4
+    return vector, there
+
+
+def test_strengths_are_those_of_the_tracer(strengths: Misfit) -> None:
+    vector, there = changed(strengths)
+    trials = PathSum(strengths, vector)
+    for tried in (vector, there):
+        np.testing.assert_allclose(trials.residual(tried), strengths.residual(tried), atol=DECIBEL)
+    assert np.nanmax(np.abs(strengths.residual(there) - strengths.residual(vector))) > 1
+    trials.accept(there)
+    np.testing.assert_allclose(trials.residual(vector), strengths.residual(vector), atol=DECIBEL)
+
+
+def test_derivatives_of_strengths_are_those_of_the_tracer(strengths: Misfit) -> None:
+    vector, there = changed(strengths)
+    columns = np.arange(len(vector))
+    expected, found = strengths.jacobian(there, columns), PathSum(strengths, vector).jacobian(there, columns)
+    for name, part in strengths.parts.items():
+        most = np.abs(expected[..., part]).max()
+        np.testing.assert_allclose(found[..., part], expected[..., part], atol=0.01 * most + DECIBEL, err_msg=name)
+    assert (found[3] == 0).all()
+
+
+def test_receivers_without_rows_are_parameters_but_not_traced(strengths: Misfit) -> None:
+    assert [receiver.name for receiver in strengths.receivers] == ["first", "third"]
+    assert "receiver.silent.gain" in strengths.parts
+    assert np.isnan(strengths.residual(strengths.start)[16:32]).all()
+
+
+@pytest.mark.parametrize("part", ["pose", "planes"])
+def test_a_sum_over_paths_does_not_serve_what_it_cannot_follow(strengths: Misfit, part: str) -> None:
+    options = replace(default_options(strengths.record), rays=8192, parts=(MATERIALS, part))
+    opened = strengths.sides[0].scene
+    other = Misfit(strengths.record, np.arange(16), opened, search_options(options), options.changes)
+    assert PathSum.serves(strengths)
+    assert not PathSum.serves(other)

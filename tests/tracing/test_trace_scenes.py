@@ -16,7 +16,7 @@ from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.surfaces import Surface
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.devices import before_walls, check_devices, solids, winding_number
+from wrf_mi.tracing.devices import before_walls, check_devices, winding_number
 from wrf_mi.tracing.surfaces import find_planes, scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -168,7 +168,7 @@ def test_antenna_in_a_solid_object_is_refused(tmp_path: Path, caplog: pytest.Log
     shell = in_a_room(tmp_path / "a", box((-0.2, -0.2, -0.2), (6.2, 5.2, 3.2)))
     check_devices(shell, np.array([[1.0, 1, 1]]), ["transmitter 1"])
     surfaces = in_a_room(tmp_path / "b", box((2, 2, 0), (3, 2.5, 1.2)), box((4, 1, 0), (4.15, 4, 3)))
-    assert len(solids(surfaces)) == 2
+    assert len(surfaces.solids) == 2
     places = np.array([[1.0, 1, 1], [4.07, 2, 1.5], [2.5, 2.2, 0.6]])
     with pytest.raises(InputError, match=r"receiver b at \(4.07, 2.00, 1.50\) m is inside the solid 'part1'") as error:
         check_devices(surfaces, places, ["receiver a", "receiver b", "receiver c"])

@@ -228,9 +228,32 @@ def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypat
     assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, max_depth=0)).paths) == 2
     assert len(trace_paths(empty, tx, rx, replace(UPRIGHT, scattering=True, rays="auto")).paths) == 2
     with pytest.raises(AssertionError, match="searched"):
-        trace_paths(shoebox, tx, rx, UPRIGHT)
+        trace_paths(shoebox, tx, receiver([1.2, 0.9, 1.1]), UPRIGHT)  # whose chains are not kept
     without = replace(UPRIGHT, line_of_sight=False, reflection=False)
     assert not len(trace_paths(shoebox, tx, rx, without).paths)
+
+
+def test_rays_are_shot_once_for_a_geometry(shoebox: Any, divided: Any, monkeypatch: pytest.MonkeyPatch):
+    """Another trace of equal surfaces shoots none; another receiver, seed or geometry does; memory is bounded."""
+    shots = list[object]()
+    shoot = search_module._shoot
+    monkeypatch.setattr(search_module, "_shoot", lambda *given: shots.append(given) or shoot(*given))
+    tx, rx = inside(3), receiver([1.3, 0.8, 1.2])
+
+    def shot(scene: Any, at: Any = rx, seed: int = 11) -> int:
+        before = len(shots)
+        trace_paths(scene, tx, at, replace(UPRIGHT, seed=seed))
+        return len(shots) - before
+
+    assert shot(shoebox) > 0
+    assert shot(shoebox) == 0
+    assert shot(divided) > 0
+    assert shot(shoebox, receiver([1.3, 0.8, 1.25])) > 0
+    assert shot(shoebox, seed=12) > 0
+    monkeypatch.setattr(search_module, "MOST_KEPT", 1)
+    assert shot(shoebox, seed=13) > 0
+    assert len(search_module._kept) == 1
+    assert shot(shoebox) > 0
 
 
 def test_number_of_rays_converges(shoebox: Any, divided: Any):

@@ -61,7 +61,9 @@ def test_a_trace_at_another_carrier_compiles_nothing_anew(xml: Path) -> None:
             trace_paths(scene, transmitters(5), receiver(), OPTIONS)
             return {one["hash"] for one in dr.kernel_history([dr.KernelType.JIT])}
 
-    assert kernels(LOW_HZ) == kernels(MIDDLE_HZ) == kernels(HIGH_HZ)
+    first = kernels(LOW_HZ)
+    assert kernels(MIDDLE_HZ) <= first  # rays are shot once
+    assert kernels(HIGH_HZ) <= first
 
 
 @pytest.mark.parametrize("faint", [0.0, 0.1])

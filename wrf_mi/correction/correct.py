@@ -28,6 +28,7 @@ from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
 from ..tracing.solve import Prepared
+from ..tracing.traced_field import gain_name
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
@@ -193,12 +194,8 @@ class _Parts(NamedTuple):
 
     def with_mean_gain(self, vector: FloatArray, misfit: Misfit) -> FloatArray:
         """A vector with the mean gain of the receivers that were fitted at those that were not."""
-        gains = {
-            receiver.name: side.gain_name
-            for receiver, side in zip(misfit.receivers, misfit.sides[:: misfit.carriers], strict=True)
-            if side.gain_name in misfit.parts
-        }
-        if not self.out or not gains:
+        gains = {receiver.name: gain_name(receiver) for receiver in self.known.receivers}
+        if not self.out or not set(gains.values()) <= set(misfit.parts):
             return vector
         found = vector.copy()
         mean = np.mean([vector[misfit.parts[gains[receiver]]] for receiver in self.fitted], axis=0)

@@ -7,7 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +30,7 @@ from ..tracing import TraceOptions
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField, TracedOptions
+from ..tracing.traced_field import TracedField, TracedOptions, instrument_parameters
 from .options import PATTERNS, CorrectionOptions
 
 LATTICE = (12, 40)
@@ -52,7 +52,9 @@ class Misfit:
         prepared: shared state of the scene.
 
     Attributes:
-        sides: traced side of each receiver at each carrier, receiver by receiver.
+        receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
+            parameters are entries of the vector.
+        sides: traced side of each of these at each carrier, receiver by receiver.
         models: receiver models of the sides.
         places: entries of ``observed`` of each side.
         start: stated values of the vector [p].
@@ -71,7 +73,10 @@ class Misfit:
         prepared: Prepared | None = None,
     ) -> None:
         self.record, self.rows, task = record, rows, task_of(record)
-        self.receivers = placed_receivers(record, by_uplink=False)
+        placed = placed_receivers(record, by_uplink=False)
+        known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
+        seen = np.flatnonzero(known) if known.any() else np.arange(len(placed))
+        self.receivers = [placed[number] for number in seen]
         self._image = task.image
         shared = prepared or Prepared(scene)
         shape = record.observation.shape[2:]
@@ -86,16 +91,19 @@ class Misfit:
         self.sides, self.places = list[TracedField](), list[IntArray]()
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
-        for number, receiver in enumerate(self.receivers):
+        for number, receiver in zip(seen, self.receivers, strict=True):
             self.sides += traced_fields(scene, record.tx_pos_m[rows], receiver, options, shared, heading, carriers)
             for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))
                 self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
                 self.places.append(number * len(rows) + which)
-        values: dict[str, NDArray[np.float32]] = {}
-        for side in self.sides:
-            values |= {name: value for name, value in side.parameters().items() if wanted(name)}
+        # The same order of entries whichever receivers are seen.
+        own = instrument_parameters(self.receivers[0], options)
+        every = {name: value for name, value in self.sides[0].parameters().items() if name not in own}
+        for receiver in placed:
+            every |= instrument_parameters(receiver, options)
+        values = {name: value for name, value in every.items() if wanted(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
@@ -172,12 +180,22 @@ class Misfit:
             found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
         return found / self.unit[:, None] - self.observed
 
-    def gains(self, vector: FloatArray) -> NDArray[np.complex128]:
-        """Gains of the paths of a vector, receiver by receiver, without exp(-j k length)."""
-        params, found = self._device(vector), list[NDArray[np.complex128]]()
-        for side, gain in zip(self.sides, self._gains, strict=True):
-            real, imaginary = gain(params)
-            found.append((np.asarray(real) + 1j * np.asarray(imaginary))[side.exists])
+    def entries(self) -> list[IntArray]:
+        """Places of each side's paths among the entries of its `wrf_mi.tracing.traced_field.TracedPaths`."""
+        return [np.flatnonzero(side.exists) for side in self.sides]
+
+    def gains(self, vector: FloatArray, entries: Sequence[IntArray]) -> NDArray[np.complex128]:
+        """Gains of some paths of a vector, side by side, without exp(-j k length).
+
+        Args:
+            vector: parameters [p].
+            entries: paths of each side, of `entries`.
+        """
+        params, found = self._device(vector), [np.zeros(0, complex)]
+        for gain, places in zip(self._gains, entries, strict=True):
+            if len(places):
+                real, imaginary = gain(params, mi.UInt32(places.astype(np.uint32)))
+                found.append(np.asarray(real) + 1j * np.asarray(imaginary))
         return np.concatenate(found)
 
     def jacobian(
@@ -200,7 +218,7 @@ class Misfit:
         task, params = task_of(self.record), self._device(vector)
         seen = self.record.observation[:, self.rows]
         seen = seen.reshape(-1, *seen.shape[2:])
-        found = np.zeros(len(seen))
+        found = np.full(len(seen), np.nan)
         for side, model, places in zip(self.sides, self._whole, self.places, strict=True):
             with dr.suspend_grad():
                 report = model(side(params), None).numpy()
@@ -233,11 +251,11 @@ class Misfit:
 
 
 def _recorded_gain(side: TracedField) -> Recorded:
-    """Function of parameters: real and imaginary parts of the gains of all paths."""
+    """Function of parameters and of places of paths: real and imaginary parts of their gains."""
 
-    def gain(params: Mapping[str, Any]) -> Any:
+    def gain(params: Mapping[str, Any], entries: Any) -> Any:
         with dr.suspend_grad():
-            found = side(params).gain
+            found = side(params, entries=entries).gain
             dr.eval(found)
         return found
 

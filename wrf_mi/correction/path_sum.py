@@ -1,14 +1,16 @@
-"""Channels of single antennas as sums over paths, for trial values of a few parameters at a time.
+"""Channels and strengths of single antennas as sums over paths, for trial values of a few parameters at a time.
 
 A channel is the sum of g exp(-j k L) over paths. A shift s and tilts t of a plane change the length L of a path that
 travels along u and meets the plane at p by 2 u . n (s - t . a (p - c)), with the normal n, the axes a and the centre c:
-by Fermat's principle the displacement of the plane at the point counts. Materials change g, which is traced once for
-each alternative of a surface. So a trial costs one exponential for each path that meets the plane, and no trace.
+by Fermat's principle the displacement of the plane at the point counts. A strength is the sum of abs(g)^2, which has no
+phase; planes are no parameters then. Materials change g, which is traced once for each alternative of a surface, along
+the paths that meet it. So a trial costs one exponential for each of these paths, and no other path is evaluated. The
+gain of a receiver is a factor of its sums.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..graph.combine import LEAST_POWER, SILENCE, PowerReceiver
 from ..tasks import task_of
 from ..tracing.image_method import mirrored
 from ..tracing.material_parameters import PREFIX
@@ -27,51 +30,73 @@ if TYPE_CHECKING:
     from .misfit import Misfit
 
 Complex = NDArray[np.complex128]
-STEP = 3e-3
-"""Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: 0.3 %, where
-rounding to single precision is below 1e-3 of it."""
+STEP = 1e-4
+"""Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
+centimetres resonate within a few per cent of their thickness."""
 
 
 class PathSum:
     """Residuals of a misfit near one vector.
 
     Args:
-        misfit: residuals of channels of single antennas; only materials and planes are parameters (`serves`).
+        misfit: residuals of single antennas (`serves`).
         vector: vector [p] about which lengths are linear.
     """
 
     def __init__(self, misfit: Misfit, vector: FloatArray) -> None:
-        self.misfit, self.at = misfit, np.array(vector, float)
-        hz = misfit.record.frequencies_hz
-        assert hz is not None
-        self._k = 2 * np.pi * np.asarray(hz, float) / speed_of_light
-        sides = [_geometry(misfit, number, vector) for number in range(len(misfit.sides))]
-        joined = (np.concatenate(each) for each in zip(*sides, strict=True))
-        self._length, self.slope, self._planes, self._slabs, self._row = joined
-        self._gains: dict[bytes, Complex] = {}
+        self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
+        self._entries = misfit.entries()
+        self._side = np.repeat(np.arange(len(misfit.sides)), [len(entries) for entries in self._entries])
+        self._first = np.searchsorted(self._side, np.arange(len(misfit.sides) + 1))
+        self._slabs, self._row = _met(misfit, self._entries)
+        self._strengths = task_of(misfit.record).in_decibel
+        self._plane_places, self._planes = misfit.plane_entries, np.zeros((len(self._row), 0), np.int64)
+        if not self._strengths:
+            hz = misfit.record.frequencies_hz
+            assert hz is not None
+            self._k = 2 * np.pi * np.asarray(hz, float) / speed_of_light
+            sides = [_geometry(misfit, number, entries, vector) for number, entries in enumerate(self._entries)]
+            joined = (np.concatenate(each) for each in zip(*sides, strict=True))
+            self._length, self.slope, self._planes = joined
+        self._gains: dict[tuple[bytes, bytes], Complex] = {}
         self._touched: dict[tuple[bytes, bytes], IntArray] = {}
         self._phase: tuple[tuple[bytes, ...], Complex] = (), np.zeros((0, 0), complex)
         count = len(misfit.sides[0].surfaces.normal)
-        self._plane_places = misfit.plane_entries
-        self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])
+        self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])[: len(self._plane_places)]
         material = [part for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         self._material = np.array([np.arange(part.start, part.stop) for part in material]).reshape(len(material), -1)
-        self._start = self.at.copy()
-        self._gain = self.misfit.gains(self.at)
-        self._waves = self._gain[:, None] * np.exp(-1j * self._length[:, None] * self._k)
-        self._total = self._sums(self._waves, np.arange(len(self._row)))
+        self._factors = [
+            (misfit.parts[side.gain_name], places)
+            for side, places in zip(misfit.sides, misfit.places, strict=True)
+            if side.gain_name in misfit.parts
+        ]
+        self._gain = self.misfit.gains(self.at, self._entries)
+        every = np.arange(len(self._row))
+        self._waves = self._waves_of(self._gain, self._phases(every, vector[self._plane_places] * 0, ()))
+        self._total = self._sums(self._waves, every)
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
-        """Whether a misfit is of channels of single antennas, with materials and planes as its only parameters."""
-        known = all(name in (SHIFT, TILT) or name.startswith(PREFIX) for name in misfit.parts)
-        record = misfit.record
-        return known and SHIFT in misfit.parts and task_of(record).is_complex and record.observation.ndim == 3
+        """Whether a misfit is of channels by materials, planes and gains, or of strengths by materials and gains."""
+        record, gains = misfit.record, {side.gain_name for side in misfit.sides}
+        known = {SHIFT, TILT} if task_of(record).is_complex else set()
+        others = {name for name in misfit.parts if not name.startswith((PREFIX, "receiver."))} - known
+        devices = {name for name in misfit.parts if name.startswith("receiver.") and not name.endswith(".gain")}
+        if others or devices or len(gains) * misfit.carriers < len(misfit.sides):
+            return False
+        if task_of(record).in_decibel:
+            powers = (isinstance(model, PowerReceiver) and not model.interference for model in misfit.models)
+            return all(powers)
+        channels = task_of(record).is_complex and record.observation.ndim == 3
+        return channels and SHIFT in misfit.parts and misfit.carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
+        return self._residual(self._total_at(vector), vector)
+
+    def _total_at(self, vector: FloatArray) -> Complex:
         touched, waves = self._changed(vector)
-        return self._residual(self._total + self._sums(waves - self._waves[touched], touched))
+        return self._total + self._sums(waves - self._waves[touched], touched)
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
@@ -80,18 +105,27 @@ class PathSum:
         touched, waves = self._changed(vector)
         present = self._waves.copy()
         present[touched] = waves
+        total = self._total_at(vector)
+        receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
         slopes = np.zeros((*self.misfit.observed.shape, len(columns)), np.float32)
         for number, column in enumerate(columns):
-            if column in self._plane_places:
+            change = np.zeros_like(total)
+            if column in receiver:
+                imaginary, places = receiver[column]
+                if not (imaginary and self._strengths):
+                    change[places] = total[places] * (2 if self._strengths else 1j if imaginary else 1)
+            elif column in self._plane_places:
                 slope = self.slope[:, np.flatnonzero(self._plane_places == column)[0]]
                 moved = np.flatnonzero(slope)
-                change = present[moved] * (-1j * slope[moved, None] * self._k)
+                change = self._sums(present[moved] * (-1j * slope[moved, None] * self._k), moved)
             else:
                 there = vector.copy()
                 there[column] += STEP
                 moved, waves = self._changed(there)
-                change = (waves - present[moved]) / STEP
-            slopes[..., number] = _pairs(self._sums(change, moved))
+                # Parameters are rounded to single precision, gains are not.
+                step = float(np.float32(there[column])) - float(np.float32(vector[column]))
+                change = self._sums((waves - present[moved]) / step, moved)
+            slopes[..., number] = self._slope(total, change, vector)
             on_column(number)
         slopes /= self.misfit.unit[:, None, None]
         slopes[~np.isfinite(self.misfit.observed).all(axis=1)] = 0
@@ -106,16 +140,44 @@ class PathSum:
         self.at = np.array(vector, float)
         self._gains.clear()
 
-    def _residual(self, channel: Complex) -> FloatArray:
-        return _pairs(channel) / self.misfit.unit[:, None] - self.misfit.observed
+    def _factor(self, vector: FloatArray) -> Complex:
+        """Gains of the receivers relative to the first vector's, [rows, 1]."""
+        found = np.ones((len(self.misfit.observed), 1), complex)
+        for part, places in self._factors:
+            amplitude, phase = (vector - self._start)[part]
+            found[places] = np.exp(amplitude + 1j * phase)
+        return found
+
+    def _residual(self, total: Complex, vector: FloatArray) -> FloatArray:
+        total = total * (np.abs(self._factor(vector)) ** 2 if self._strengths else self._factor(vector))
+        report = self._in_decibel(total) if self._strengths else _pairs(total)
+        return report / self.misfit.unit[:, None] - self.misfit.observed
+
+    def _slope(self, total: Complex, change: Complex, vector: FloatArray) -> FloatArray:
+        """Derivative of a report by that of its sum."""
+        if not self._strengths:
+            return _pairs(change * self._factor(vector))
+        scale = np.abs(self._factor(vector)) ** 2
+        power, slope = total.real * scale + LEAST_POWER, change.real * scale
+        return np.where(power > SILENCE, 10 / np.log(10) * slope / (power + LEAST_POWER), 0)
+
+    def _in_decibel(self, total: Complex) -> FloatArray:
+        """Powers as `wrf_mi.graph.combine.PowerReceiver` reports them."""
+        power = total.real + LEAST_POWER
+        found = np.empty_like(power)
+        for model, places in zip(self.misfit.models, self.misfit.places, strict=True):
+            assert isinstance(model, PowerReceiver)
+            here = power[places]
+            found[places] = 10 * np.log10(np.where(here > SILENCE, here + LEAST_POWER, model.floor))
+        return found
 
     def _sums(self, waves: Complex, which: IntArray) -> Complex:
-        """Sums [rows, frequencies] of waves of some paths."""
-        total = np.zeros((len(self.misfit.observed), len(self._k)), complex)
+        """Sums [rows, frequencies] of waves of some paths; of strengths [rows, 1]."""
+        total = np.zeros((len(self.misfit.observed), waves.shape[1]), complex)
         if len(which):
             row = self._row[which]
             first = np.flatnonzero(np.diff(row, prepend=-1))
-            total[row[first]] = np.add.reduceat(waves, first, axis=0)
+            np.add.at(total, row[first], np.add.reduceat(waves, first, axis=0))
         return total
 
     def _changed(self, vector: FloatArray) -> tuple[IntArray, Complex]:
@@ -128,12 +190,22 @@ class PathSum:
             met = np.isin(self._planes, planes).any(axis=1) | np.isin(self._slabs, slabs).any(axis=1)
             self._touched[key] = np.flatnonzero(met)
         touched = self._touched[key]
-        shifts = (vector - self._start)[self._plane_places]
+        phases = self._phases(touched, (vector - self._start)[self._plane_places], key)
+        return touched, self._waves_of(self._gain_at(vector, touched), phases)
+
+    def _phases(self, which: IntArray, shifts: FloatArray, key: tuple[bytes, ...]) -> Complex:
+        """Factors exp(-j k L) of some paths, which ``key`` identifies; kept for the next call."""
+        if self._strengths:
+            return np.ones((1, 1), complex)
         name = (*key, shifts.tobytes())
         if self._phase[0] != name:
-            length = self._length[touched] + self.slope[touched] @ shifts
+            length = self._length[which] + self.slope[which] @ shifts
             self._phase = name, np.exp(-1j * length[:, None] * self._k)
-        return touched, self._gain_at(vector, touched)[:, None] * self._phase[1]
+        return self._phase[1]
+
+    def _waves_of(self, gain: Complex, phases: Complex) -> Complex:
+        """What is summed: waves [paths, frequencies], or powers [paths, 1]."""
+        return (np.abs(gain[:, None]) ** 2).astype(complex) if self._strengths else gain[:, None] * phases
 
     def _gain_at(self, vector: FloatArray, touched: IntArray) -> Complex:
         materials = self._material.ravel()
@@ -141,10 +213,17 @@ class PathSum:
             return self._gain[touched]
         there = self._start.copy()  # angles of all gains are those of the first vector
         there[materials] = vector[materials]
-        key = there[materials].tobytes()
+        key = touched.tobytes(), there[materials].tobytes()
         if key not in self._gains:
-            self._gains[key] = self.misfit.gains(there)
-        return self._gains[key][touched]
+            bounds = np.searchsorted(touched, self._first)
+            which = [
+                entries[touched[low:high] - first]
+                for entries, first, low, high in zip(
+                    self._entries, self._first[:-1], bounds[:-1], bounds[1:], strict=True
+                )
+            ]
+            self._gains[key] = self.misfit.gains(there, which)
+        return self._gains[key]
 
 
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
@@ -157,17 +236,31 @@ def _pairs(channel: Complex) -> FloatArray:
     return np.ascontiguousarray(channel).view(float)
 
 
+def _met(misfit: Misfit, entries: Sequence[IntArray]) -> tuple[IntArray, IntArray]:
+    """Slabs that each path meets [n, depth], -1 for none, and its row of `Misfit.residual` [n]."""
+    depth = max(len(side.chains.levels) for side in misfit.sides)
+    slabs, rows = list[IntArray](), list[IntArray]()
+    for side, exists, places in zip(misfit.sides, entries, misfit.places, strict=True):
+        met = np.full((len(exists), depth), -1)
+        for k, level in enumerate(side.chains.levels):
+            used = (np.asarray(level.reflects) | np.asarray(level.transmits))[exists]
+            met[:, k] = np.where(used, np.asarray(level.material)[exists].astype(np.int64), -1)
+        slabs.append(met)
+        rows.append(places[exists // (len(side.exists) // len(places))])
+    return np.concatenate(slabs), np.concatenate(rows)
+
+
 def _geometry(
-    misfit: Misfit, number: int, vector: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray, IntArray, IntArray]:
-    """Paths of one receiver.
+    misfit: Misfit, number: int, exists: IntArray, vector: FloatArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Paths ``exists`` of one side.
 
     Returns:
-        Lengths [n], their derivatives by shifts, then tilts [n, 3 q], reflecting planes and slabs met at each
-        interaction [n, depth], -1 for none, and rows of `Misfit.residual` [n].
+        Lengths [n], their derivatives by shifts, then tilts [n, 3 q], and reflecting planes at each interaction
+        [n, depth], -1 for none; the depth is the largest of all sides.
     """
-    side, receiver = misfit.sides[number], misfit.receivers[number]
-    surfaces, count, exists = side.surfaces, len(side.surfaces.normal), np.flatnonzero(side.exists)
+    side, receiver = misfit.sides[number], misfit.sides[number].receiver
+    surfaces, count = side.surfaces, len(side.surfaces.normal)
     centre = plane_centres(surfaces)[0]
     shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
     change = np.column_stack([shift, tilt.reshape(count, 2)])
@@ -176,11 +269,10 @@ def _geometry(
     def taken(values: Any) -> NDArray[Any]:
         return np.asarray(values)[exists]
 
-    plane, slab = list[IntArray](), list[IntArray]()
-    for level in side.chains.levels:
-        reflects, passes = taken(level.reflects), taken(level.transmits)
-        plane.append(np.where(reflects, taken(level.plane).astype(np.int64), -1))
-        slab.append(np.where(reflects | passes, taken(level.material).astype(np.int64), -1))
+    depth = max(len(side.chains.levels) for side in misfit.sides)
+    plane = np.full((depth, len(exists)), -1)
+    for k, level in enumerate(side.chains.levels):
+        plane[k] = np.where(taken(level.reflects), taken(level.plane).astype(np.int64), -1)
     point = np.stack([taken(c) for c in side.chains.source_m], axis=-1)
     image = np.repeat(np.asarray(receiver.position_m, float)[None], len(point), axis=0)
     for at in plane[::-1]:
@@ -198,7 +290,4 @@ def _geometry(
         for axis in range(2):
             slope[row, count + 2 * q + axis] -= 2 * along * flat[:, axis]
         way[row] = mirrored(way[row], n)
-    each = len(side.exists) // len(misfit.rows)
-    empty = np.zeros((len(point), 0), np.int64)
-    planes, slabs = (np.column_stack([empty, *columns]) for columns in (plane, slab))
-    return length, slope, planes, slabs, exists // each + number * len(misfit.rows)
+    return length, slope, plane.T

@@ -6,21 +6,16 @@ import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..scene.surfaces import bodies
 from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-SOLID_M = 0.5
-"""Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
-room of 3 x 3 x 2.5 m 0.94 m."""
 NEAREST_M = 0.01
 """Shortest segment of a path that Sionna RT keeps."""
 INSIDE_M = 1e-4
@@ -89,18 +84,11 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
-    """Object of the solid around each position [n, 3], -1 for none; see `solids`."""
+    """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.surfaces.Surfaces`."""
     thing = np.full(len(positions_m), -1)
-    for face in solids(surfaces):
+    for face in surfaces.solids:
         thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
     return thing
-
-
-def solids(surfaces: Surfaces) -> list[IntArray]:
-    """Faces of each closed, consistently oriented body that is an object rather than a room."""
-    area = trimesh.triangles.area(surfaces.triangles)
-    found = bodies(surfaces.triangles)
-    return [face for face, closed, volume in found if closed and 0 < 2 * abs(volume) < SOLID_M * area[face].sum()]
 
 
 def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
@@ -23,6 +24,9 @@ END_M = 1e-4
 
 MARGIN_M = 1e-3
 """Slack of the bounds of planes."""
+MOST_KEPT = 1 << 27
+"""Bytes of chains that a process keeps."""
+_kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ def shoot(
     """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
     Rays leave on a randomly rotated Fibonacci lattice. Where waves are also transmitted (``depth`` is more than
-    ``reflections``), the rays are shot once for each choice of the hits that reflect.
+    ``reflections``), the rays are shot once for each choice of the hits that reflect. What they found is kept in the
+    process for `MOST_KEPT` bytes of the last calls: models, folds and carriers trace the same rooms from the same
+    receivers.
 
     Args:
         scene: ``sionna.rt.Scene``.
@@ -65,8 +71,22 @@ def shoot(
         seed: seed of the lattice's random rotation.
 
     Returns:
-        Shape [c, reflections], -1 beyond the last; in lexical order.
+        Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
     """
+    key = surfaces.digest, source_m.tobytes(), rays, depth, reflections, seed
+    if key in _kept:
+        _kept.move_to_end(key)
+    else:
+        _kept[key] = _chains(scene, surfaces, source_m, rays, depth, reflections, seed)
+        _kept[key].flags.writeable = False
+        while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
+            _kept.popitem(last=False)
+    return _kept[key]
+
+
+def _chains(
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, depth: int, reflections: int, seed: int
+) -> IntArray:
     found = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
         return found[0]

@@ -196,12 +196,12 @@ class TracedField:
     @property
     def gain_name(self) -> str:
         """Name of the parameter [2]: logarithm of the instrument's amplitude, and its phase in rad."""
-        return f"receiver.{self.receiver.name}.gain"
+        return gain_name(self.receiver)
 
     @property
     def pattern_name(self) -> str:
         """Name of the parameter [2, c] of the receiver's pattern, see `wrf_mi.tracing.pattern_parameters`."""
-        return f"receiver.{self.receiver.name}.pattern"
+        return _pattern_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
@@ -212,11 +212,8 @@ class TracedField:
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
-        values = self.slabs.parameters(self.options.thickness, self.options.exponent) | pose_parameters(self.receiver)
-        values[self.gain_name] = np.array([np.log(self.options.gain), 0], np.float32)
-        if self.options.pattern_degree:
-            names = self.pattern_name, TX_PATTERN
-            values |= {name: pattern_coefficients(self.options.pattern_degree) for name in names}
+        values = self.slabs.parameters(self.options.thickness, self.options.exponent)
+        values |= instrument_parameters(self.receiver, self.options)
         if self.options.planes:
             values |= self._planes.parameters()
         return values
@@ -233,23 +230,30 @@ class TracedField:
         self.search(here)
         return True
 
-    def __call__(self, parameters: Mapping[str, Any], rows: Any | None = None) -> TracedPaths:
+    def __call__(
+        self, parameters: Mapping[str, Any], rows: Any | None = None, entries: Any | None = None
+    ) -> TracedPaths:
         """Paths of some transmitters with the given parameters. Differentiable in all parameters.
 
         Args:
             parameters: Dr.Jit tensors by the names of `parameters`; missing ones keep their initial values.
             rows: transmitters of the batch, an unsigned integer array; None: all.
+            entries: paths of the batch by their places in `exists`, an unsigned integer array, in place of ``rows``:
+                each counts as a transmitter's only path. None: all paths of ``rows``.
         """
-        chains, batch, chosen = self.chains, len(self), None
+        chains, batch, each, chosen = self.chains, len(self), self._each, entries
         if rows is not None:
             batch = dr.width(rows)
-            slot = dr.arange(mi.UInt32, batch * self._each)
-            row = dr.gather(mi.UInt32, rows, slot // self._each)
-            chosen = row * self._each + slot % self._each
+            slot = dr.arange(mi.UInt32, batch * each)
+            row = dr.gather(mi.UInt32, rows, slot // each)
+            chosen = row * each + slot % each
+        if entries is not None:
+            batch, each = dr.width(entries), 1
+        if chosen is not None:
             chains = chains.select(chosen)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
         tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
-        pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * self._each)
+        pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
@@ -264,7 +268,7 @@ class TracedField:
                 gain = times(gain, pattern_factor(parameters[name], direction))
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
-        return TracedPaths(gain, paths.length_m, paths.arrival, batch, self._each)
+        return TracedPaths(gain, paths.length_m, paths.arrival, batch, each)
 
     def pose(self, parameters: Mapping[str, Any], float_type: Any = mi.Float) -> Pose:
         """Corrected pose of the receiver, for Gaussians."""
@@ -367,6 +371,24 @@ class TracedField:
             kind = self.scene.objects[name].radio_material.name
             raise InputError(f"object {name}: material {kind} is not a slab; give it one of ITU-R P.2040")
         return number
+
+
+def gain_name(receiver: Receiver) -> str:
+    """Name of the parameter of a receiver's gain, see `TracedField.gain_name`."""
+    return f"receiver.{receiver.name}.gain"
+
+
+def _pattern_name(receiver: Receiver) -> str:
+    return f"receiver.{receiver.name}.pattern"
+
+
+def instrument_parameters(receiver: Receiver, options: TracedOptions) -> dict[str, NDArray[np.float32]]:
+    """Initial values of the parameters of a receiver and of the antennas, of those of `TracedField.parameters`."""
+    values = pose_parameters(receiver) | {gain_name(receiver): np.array([np.log(options.gain), 0], np.float32)}
+    if options.pattern_degree:
+        names = _pattern_name(receiver), TX_PATTERN
+        values |= {name: pattern_coefficients(options.pattern_degree) for name in names}
+    return values
 
 
 def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
