@@ -84,16 +84,20 @@ def _transmissions(
     depth: int,
 ) -> IntArray:
     """Number of surfaces that a path passes before its first reflection, after it, and so on: [n, reflections + 1]."""
-    length = _lengths(chains, chain)
-    through = np.zeros((len(chain), chains.plane.shape[1] + 1), np.int64)
-    there = targets_m[target].copy()
-    for level in reversed(range(chains.plane.shape[1])):
-        has = length > level
-        plane, image = chains.plane[chain[has], level], chains.image[chain[has], level]
-        here = meeting_point(there[has], image, surfaces.normal[plane], surfaces.offset[plane])[0]
-        through[has, level + 1] = crossings(here, there[has], depth)
-        there[has] = here
-    through[:, 0] = crossings(np.broadcast_to(source_m, there.shape), there, depth)
+    length, levels = _lengths(chains, chain), chains.plane.shape[1]
+    there, legs = targets_m[target].copy(), list[tuple[FloatArray, FloatArray]]()
+    met = [np.flatnonzero(length >= level) for level in range(levels + 1)]  # paths with a leg after so many reflections
+    for level in reversed(range(levels)):
+        row = met[level + 1]
+        plane, image = chains.plane[chain[row], level], chains.image[chain[row], level]
+        here = meeting_point(there[row], image, surfaces.normal[plane], surfaces.offset[plane])[0]
+        legs.append((here, there[row]))
+        there[row] = here
+    legs.append((np.broadcast_to(source_m, there.shape), there))
+    start, end = (np.concatenate(points) for points in zip(*legs[::-1], strict=True))
+    through = np.zeros((len(chain), levels + 1), np.int64)
+    after = np.repeat(np.arange(levels + 1), [len(row) for row in met])
+    through[np.concatenate(met), after] = crossings(start, end, depth)
     return through
 
 

@@ -110,6 +110,7 @@ def trace_paths(
     first_row: int = 0,
     tx_antenna: Antenna = ANTENNA,
     check: bool = True,
+    gains: bool = True,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
@@ -134,6 +135,7 @@ def trace_paths(
         first_row: number of the first transmitter in error messages, from 0.
         tx_antenna: antenna of the transmitters; receivers hold their antennas.
         check: refuse antennas inside solids, warn of those near surfaces.
+        gains: evaluate the gains of the paths; otherwise they are NaN, for callers that need geometry alone.
 
     Returns:
         The paths, reproducible for a seed whatever the chunks. Lengths and directions are float64: a float32 length
@@ -160,7 +162,8 @@ def trace_paths(
     rays = shared.rays(sources, targets, options)
     with scattering_materials(scene, options):
         legs = _search(scene, shared, sources, targets, options, rays, progress)
-        gain = path_gains(scene, shared.surfaces, legs, ends, rays)
+        unknown = np.full(len(legs), np.nan, np.complex128)
+        gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
     paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
     primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)
     hz, arrays = float(scene.frequency[0]), (primitives, legs.probability, legs.wedge)

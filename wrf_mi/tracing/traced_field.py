@@ -306,6 +306,7 @@ class TracedField:
             prepared=self._prepared,
             tx_antenna=self.options.tx_antenna,
             check=self._prepared is None,
+            gains=self.options.faint > 0,
         )
         self._take(found, here_m)
         self.searches += 1
