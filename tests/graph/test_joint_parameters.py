@@ -159,6 +159,21 @@ def small(tmp_path: Path, *settings: str) -> Trainer:
     return Trainer(record, all_of(record), config, scene=known)
 
 
+def test_validation_of_paths_alone_searches_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of held-out rows by the paths known from the start: those of predictions, which search."""
+    part = small(tmp_path)
+    observed = part.record.observation.copy()
+    observed[1, 9] = np.nan
+    record = replace(part.record, observation=observed)
+    split = Split("parts", 0, np.array([0, 2, 3, 6, 7, 8, 10]), np.array([1, 4, 5, 9, 11]), np.zeros(0, np.int64))
+    trainer = Trainer(record, split, part.config, scene=part.graph.scene)
+    predict = trainer.predictor()
+    found = np.stack([predict.of_rows(record, split.validation, r) for r in range(2)])
+    expected = np.nanmedian(trainer.task.training_score(found, observed[:, split.validation]))
+    monkeypatch.setattr(trainer.graph, "trace", lambda *_: pytest.fail("searched"))
+    assert trainer.validate() == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_receivers_share_materials_and_steps_are_recorded_once(tmp_path: Path) -> None:
     """Later batches and rates replay recorded steps."""
     trainer = small(tmp_path)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..backend import init
 from ..backend.device import to_float, to_tensor
 from ..core import InputError, Record, Split
+from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..gaussians import InitialGaussians
 from ..gaussians.density import adapt, reset_opacity
@@ -306,9 +307,7 @@ class Trainer(TrainingLoop):
         reach = reach.of_ports(self.graph.carriers)
 
         def score(port: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
-            slots = np.searchsorted(self._known[port], rows[port])
-            found = predict.of_side(record.tx_pos_m[rows[port]], port, self._sides[port], slots, weight)
-            return self.task.training_score(found, record.observation[port // self.graph.carriers, rows[port]])
+            return self._traced_scores(predict, port, rows[port], weight)
 
         held = [record.tx_pos_m[chosen_rows] for chosen_rows in rows]
         lengths = [reach.length_m]
@@ -321,6 +320,14 @@ class Trainer(TrainingLoop):
             state.baseline = found
         return found
 
+    def _traced_scores(
+        self, predict: Predictor, port: int, rows: IntArray, weight: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float64]:
+        """Scores of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
+        record, slots = self.record, np.searchsorted(self._known[port], rows)
+        found = predict.of_side(record.tx_pos_m[rows], port, self._sides[port], slots, weight)
+        return self.task.training_score(found, record.observation[port // self.graph.carriers, rows])
+
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
         if self.graph.corrects:
@@ -330,10 +337,14 @@ class Trainer(TrainingLoop):
         if not len(rows):
             return float("nan")
         predict = self.predictor()
-        scores = [
-            self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
-            for r in range(len(record.receivers))
-        ]
+        if self.graph.scene is not None:
+            known = [self.targets.received(port, rows) for port in range(self.targets.ports)]
+            scores = [self._traced_scores(predict, port, some) for port, some in enumerate(known)]
+        else:
+            scores = [
+                self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
+                for r in range(len(record.receivers))
+            ]
         return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
 
     def choose(self, score: float) -> bool:
