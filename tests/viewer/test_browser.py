@@ -76,6 +76,8 @@ CONTROLS = """
 })()
 """
 
+EYE = """Math.hypot(...Object.values(document.getElementById("scene")._fullLayout.scene.camera.eye))"""
+
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
@@ -131,3 +133,21 @@ def test_channels_are_drawn_over_subcarriers(browser: Browser, tmp_path: Path) -
     assert (first["images"], first["lines"], first["layers"]) == (0, [8, 8], 3)
     assert tab.complaints() == []
     tab.close()
+
+
+def test_a_map_alone_is_seen_from_further_back(browser: Browser, tmp_path: Path) -> None:
+    """Plotly draws flat scenes wider than rooms: their corners would lie outside the picture."""
+    whole = made_view()
+    low = whole.receivers_m * [1, 1, 0] + [0, 0, 0.5]
+    flat = replace(whole, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=whole.maps[:1])
+    away = []
+    for number, content in enumerate((whole, flat)):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "view.html").write_text(page(content))
+        tab = browser.open(tmp_path / str(number) / "view.html", *LAPTOP)
+        assert tab.run(READY)
+        away.append(tab.run(EYE))
+        assert tab.complaints() == []
+        tab.close()
+    assert away[0] == pytest.approx(np.linalg.norm([1.05, 1.55, 1.35]))
+    assert away[1] > 1.2 * away[0]

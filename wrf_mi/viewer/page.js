@@ -414,6 +414,7 @@
     margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, uirevision: "kept", hoverlabel: { align: "left" },
     scene: { aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), camera: { eye: { x: 1.05, y: -1.55, z: 1.35 }, projection: { type: "perspective" } } },
   };
+  const FITTING_DIAGONAL = 2.2; // of a box that the camera above sees whole, in Plotly's unit
   const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["resetCameraLastSave3d"] };
   let pending = false;
 
@@ -438,6 +439,14 @@
       input.value = place;
       input.dispatchEvent(new Event("input"));
     });
+    // Plotly's boxes have one volume: that of a flat scene, a map alone, is wider than a room's. Stand further back.
+    const { x, y, z } = scene._fullLayout.scene.aspectratio;
+    const back = Math.hypot(x, y, z) / FITTING_DIAGONAL;
+    if (back > 1) {
+      const eye = layout.scene.camera.eye;
+      return Plotly.relayout(scene, { "scene.camera.eye": { x: back * eye.x, y: back * eye.y, z: back * eye.z } });
+    }
+  }).then(() => {
     document.body.dataset.ready = "true";
   });
 })();
