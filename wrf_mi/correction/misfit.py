@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import to_tensor
+from ..backend.device import to_tensor, to_uint
 from ..backend.recorded import Recorded
 from ..core import Record
 from ..core.angles import FloatArray
@@ -194,7 +194,7 @@ class Misfit:
         params, found = self._device(vector), [np.zeros(0, complex)]
         for gain, places in zip(self._gains, entries, strict=True):
             if len(places):
-                real, imaginary = gain(params, mi.UInt32(places.astype(np.uint32)))
+                real, imaginary = gain(params, to_uint(places))
                 found.append(np.asarray(real) + 1j * np.asarray(imaginary))
         return np.concatenate(found)
 

@@ -73,22 +73,6 @@ class TraceResult:
         paths = replace(found.paths, tx=row % len(which), n_tx=len(which))
         return replace(found, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
 
-    def without_faint(self, share: float) -> TraceResult:
-        """Drop the weakest paths of each transmitter at each receiver.
-
-        Args:
-            share: amplitudes of the dropped paths add up to less than this share of the amplitudes of all, which
-                bounds the error of a sum of the paths, whatever their phases.
-        """
-        pair, amplitude = self.paths.tx + self.paths.n_tx * self.paths.rx, np.abs(self.paths.gain)
-        order = np.lexsort((amplitude, pair))
-        ordered, upto = pair[order], np.cumsum(amplitude[order])
-        first = np.searchsorted(ordered, ordered)
-        upto -= (upto - amplitude[order])[first]
-        kept = np.empty(len(pair), bool)
-        kept[order] = upto >= share * np.bincount(pair, amplitude)[ordered]
-        return self.select(kept)
-
     def legs(self, surfaces: Surfaces) -> Legs:
         """The paths in the direction of the search, for Sionna RT.
 

@@ -62,8 +62,8 @@ def traced_fields(
         from_m = here_m if moved else stated_m
         if moved not in found:
             there = replace(receiver, position_m=from_m)
-            how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna, "check": False}
-            how["gains"] = options.faint > 0
+            how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna}
+            how |= {"check": False, "gains": False}
             found[moved] = trace_paths(scene, distinct, there, options.trace, **how)
         given = positions[rows], receiver, options, None if heading is None else heading[rows]
         traced = found[moved].of_transmitters(number[rows])

@@ -306,62 +306,79 @@ class TracedField:
             prepared=self._prepared,
             tx_antenna=self.options.tx_antenna,
             check=self._prepared is None,
-            gains=self.options.faint > 0,
+            gains=False,
         )
         self._take(found, here_m)
         self.searches += 1
 
     def _take(self, traced: TraceResult, here_m: FloatArray) -> None:
         """Lay out paths on the device, with as many entries for each transmitter as the largest number of paths."""
-        if self.options.faint:
-            traced = traced.without_faint(self.options.faint)
-        surfaces, types = self.surfaces, traced.paths.interactions
+        surfaces, types, tx = self.surfaces, traced.paths.interactions, traced.paths.tx
         legs = traced.legs(surfaces)
         face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
-        tx, used = traced.paths.tx, types != 0
-        material = self._slab(face)
+        found = self._chains_of(tx, types, face)
+        if self.options.faint:
+            kept = np.flatnonzero(_without_faint(tx, self._amplitudes(found), self.options.faint))
+            tx, types, face = tx[kept], types[kept], face[kept]
+            vertices_m = traced.paths.vertices_m[kept]
+        else:
+            kept, vertices_m = np.arange(len(tx)), traced.paths.vertices_m
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
-        count = len(self) * each
-
-        def laid_out(values: ArrayLike, kind: Any) -> Any:
-            given = np.asarray(values)
-            array = np.zeros(count, given.dtype)
-            array[entry] = given
-            return on_device(array, kind)
-
-        def repeated(values: FloatArray) -> Any:
-            return on_device(np.repeat(values, each), Float64)
-
-        levels = []
-        for k in range(types.shape[1] if used.any() else 0):
-            plane = np.append(surfaces.plane, 0)[face[:, k]]
-            normal = surfaces.normal[plane] * used[:, k, None]
-            levels.append(
-                Level(
-                    [laid_out(c, Float64) for c in normal.T],
-                    laid_out(surfaces.offset[plane] * used[:, k], Float64),
-                    laid_out(types[:, k] == SPECULAR, mi.Bool),
-                    laid_out(types[:, k] == TRANSMISSION, mi.Bool),
-                    laid_out(material[:, k].astype(np.uint32), mi.UInt32),
-                    laid_out(plane.astype(np.uint32), mi.UInt32),
-                )
-            )
+        place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
+        place[entry], present[entry] = kept, True
         self._each, self.searched_at_m = each, np.array(here_m, float)
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
-        self._met = Interactions(traced.paths.vertices_m[met], normal)
+        self._met = Interactions(vertices_m[met], normal)
         self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
         if self._gaussians is not None:
             self.attach(self._gaussians)
-        self.chains = Chains(
-            [repeated(c) for c in self.tx_pos_m.T],
-            (repeated(np.cos(self.heading_rad)), repeated(np.sin(self.heading_rad))),
-            laid_out(np.ones(len(tx)), Float64),
-            levels,
-        )
+        # Place holders have a transmitter, too: lengths of zero have no direction.
+        sources = self._sources(np.repeat(np.arange(len(self)), each))
+        self.chains = Chains(*sources, dr.zeros(Float64, len(place)), [])
+        if len(kept):
+            index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)
+            self.chains.exists = dr.gather(Float64, found.exists, index, mask)
+            self.chains.levels = [dr.gather(Level, level, index, mask) for level in found.levels]
+        dr.eval(self.chains)
+
+    def _chains_of(self, tx: IntArray, types: NDArray[np.uint8], face: IntArray) -> Chains:
+        """Chains of paths from transmitters [p] with interactions [p, depth] at faces [p, depth]."""
+        surfaces, used = self.surfaces, types != 0
+        plane, material = np.append(surfaces.plane, 0)[face], self._slab(face).astype(np.uint32)
+        levels = [
+            Level(
+                [on_device(c, Float64) for c in (surfaces.normal[plane[:, k]] * used[:, k, None]).T],
+                on_device(surfaces.offset[plane[:, k]] * used[:, k], Float64),
+                on_device(types[:, k] == SPECULAR, mi.Bool),
+                on_device(types[:, k] == TRANSMISSION, mi.Bool),
+                on_device(material[:, k], mi.UInt32),
+                on_device(plane[:, k].astype(np.uint32), mi.UInt32),
+            )
+            for k in range(types.shape[1] if used.any() else 0)
+        ]
+        return Chains(*self._sources(tx), on_device(np.ones(len(tx)), Float64), levels)
+
+    def _sources(self, tx: IntArray) -> tuple[Vector, Complex]:
+        """Positions of transmitters, and cosine and sine of their headings."""
+        heading = self.heading_rad[tx]
+        position = [on_device(c, Float64) for c in self.tx_pos_m[tx].T]
+        return position, (on_device(np.cos(heading), Float64), on_device(np.sin(heading), Float64))
+
+    def _amplitudes(self, chains: Chains) -> FloatArray:
+        """Amplitudes of paths as stated."""
+        if not dr.width(chains.exists):
+            return np.zeros(0)
+        pose = _spread(receiver_pose(self.receiver, {}, Float64), dr.width(chains.exists))
+        tables = self.slabs.tables({}, self._constants, self.frequency_hz / self._stated_hz)
+        antennas = self.receiver.antenna, self.options.tx_antenna
+        with dr.suspend_grad():
+            real, imaginary = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas).gain
+            power = real * real + imaginary * imaginary
+        return np.sqrt(power.numpy())
 
     def _slab(self, face: IntArray) -> IntArray:
         """Index of the material at each interaction, 0 for none (face -1)."""
@@ -372,6 +389,20 @@ class TracedField:
             kind = self.scene.objects[name].radio_material.name
             raise InputError(f"object {name}: material {kind} is not a slab; give it one of ITU-R P.2040")
         return number
+
+
+def _without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[np.bool_]:
+    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all.
+
+    That bounds the error of a sum of the paths, whatever their phases.
+    """
+    order = np.lexsort((amplitude, tx))
+    ordered, upto = tx[order], np.cumsum(amplitude[order])
+    first = np.searchsorted(ordered, ordered)
+    upto -= (upto - amplitude[order])[first]
+    kept = np.empty(len(tx), bool)
+    kept[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
+    return kept
 
 
 def gain_name(receiver: Receiver) -> str:
