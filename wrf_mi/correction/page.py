@@ -4,7 +4,8 @@ The folder is a scene folder (`wrf_mi.scene.folder`), which plain Sionna RT and 
 
 correction.md    what was changed, by how much, how certain it is, and the scores before and after
 correction.json  the same for programs, all parameters among them
-correction.png   the scene, coloured by how far its surfaces were moved, and the scores of the held-out rows
+correction.png   the scene, coloured by how far its surfaces were moved or how their materials changed, and the scores
+                 of the held-out rows
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgba
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
@@ -29,7 +32,7 @@ from ..tracing.corrected_scene import (
     moved_triangles,
     write_corrected_scene,
 )
-from ..tracing.material_parameters import SURFACE, name_of
+from ..tracing.material_parameters import SURFACE, name_of, slabs_of_faces
 from ..tracing.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
@@ -40,6 +43,9 @@ from .search import ABSENT, CONSTANTS, QUANTITIES
 PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
 SUPPORTED = 0.5
 """Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
+AS_STATED, FITTED, ANOTHER, LEFT_OUT = "as stated", "constants fitted", "another material", "left out"
+CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OUT: "tab:red"}
+"""Colours of the changes of materials."""
 
 
 def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:
@@ -264,22 +270,38 @@ def _with_sd(value: float, sd: float) -> str:
     return f"{value:.1f} ± {sd:.1f}" if math.isfinite(sd) else "not fixed by any plane"
 
 
+def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> tuple[str, list[str]]:
+    """Title, and the change of the material of each face, a key of `CHANGES`."""
+    side = correction.misfit.sides[0]
+    slab_of_face = slabs_of_faces(side.scene, side.surfaces, "surface")[1]
+    of_slab = [AS_STATED] * len(facts["materials"])
+    for index, one in enumerate(facts["materials"]):
+        if one["sd_log"] is not None:
+            of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
+    return "materials of surfaces", [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
+
+
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
-    """The scene coloured by the shifts of its planes, and the held-out scores."""
+    """The scene coloured by the shifts of its planes, or of its materials alone, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
     triangles = moved_triangles(surfaces, correction.parameters if correction.kept else {})
     shift = np.array([plane["shift_mm"] for plane in facts["planes"]]) if facts["planes"] else None
-    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
     shown = [
         k
         for k in range(len(triangles))
         if correction.kinds.get(surfaces.names[surfaces.object_of(np.array([k]))[0]]) != "ceiling"
     ]
-    most = max(1.0, float(np.abs(shift).max())) if shift is not None else 1.0
-    shades = ScalarMappable(Normalize(-most, most), "RdBu")
-    face = np.zeros(len(triangles)) if shift is None else shift[surfaces.plane]
-    colours = shades.to_rgba(face[shown], alpha=0.45)
+    if shift is None:
+        label, which = _changes_of_materials(correction, facts)
+        colours = np.array([to_rgba(CHANGES[one], alpha=0.45) for one in which])[shown]
+        room.legend(handles=[Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES], fontsize=8)
+    else:
+        label, most = "shifts of planes along their normals", max(1.0, float(np.abs(shift).max()))
+        shades = ScalarMappable(Normalize(-most, most), "RdBu")
+        colours = shades.to_rgba(shift[surfaces.plane][shown], alpha=0.45)
+        figure.colorbar(shades, ax=room, shrink=0.6, label="shift (mm)")
     room.add_collection3d(Poly3DCollection(triangles[shown], facecolors=colours, edgecolors="0.4", linewidths=0.3))
     room.plot(*correction.misfit.record.tx_pos_m[correction.misfit.rows].T, ",", color="0.2")
     for receiver in correction.misfit.receivers:
@@ -288,8 +310,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     for axis, a, b in zip("xyz", low, high, strict=True):
         room.set(**{f"{axis}lim": (a, b), f"{axis}label": f"{axis} (m)"})
     room.set_box_aspect(np.maximum(high - low, 0.1))
-    room.set_title("shifts of planes along their normals")
-    figure.colorbar(shades, ax=room, shrink=0.6, label="shift (mm)")
+    room.set_title(label)
     axes = figure.add_subplot(1, 2, 2)
     for stage, score in correction.scores.items():
         values: FloatArray = np.sort(score[np.isfinite(score)])
