@@ -25,6 +25,7 @@ import mitsuba as mi
 from sionna.rt.utils import itu_coefficients_single_layer_slab
 
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
+from wrf_mi.tracing import traced_field as traced_field_module
 from wrf_mi.tracing.buffer import to_buffer
 from wrf_mi.tracing.fields import field_of
 from wrf_mi.tracing.pattern_parameters import pattern_coefficients, pattern_factor
@@ -349,3 +350,16 @@ def test_wrong_arguments_are_refused(scene: Any) -> None:
     elsewhere = receiver(position=(4.0, 2.0, 1.0))
     with pytest.raises(InputError, match="trace these"):
         TracedField(scene, transmitters(2), elsewhere, TracedOptions(OPTIONS), traced=found)
+
+
+def test_gains_that_are_not_numbers_are_refused(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would all count as faint, and no path would be left."""
+    evaluate = traced_field_module.evaluate_paths
+
+    def broken(*given: Any) -> Any:
+        paths = evaluate(*given)
+        return replace(paths, gain=(paths.gain[0] * dr.nan, paths.gain[1]))
+
+    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
+    with pytest.raises(InputError, match="gains that are not numbers"):
+        TracedField(scene, transmitters(2), receiver(), TracedOptions(OPTIONS, faint=1e-3))

@@ -27,8 +27,8 @@ from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
+from ..tracing.instrument_parameters import gain_name
 from ..tracing.solve import Prepared
-from ..tracing.traced_field import gain_name
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options

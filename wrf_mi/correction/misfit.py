@@ -27,10 +27,11 @@ from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
+from ..tracing.instrument_parameters import instrument_parameters
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField, TracedOptions, instrument_parameters
+from ..tracing.traced_field import TracedField, TracedOptions
 from .options import PATTERNS, CorrectionOptions
 
 LATTICE = (12, 40)
@@ -99,10 +100,10 @@ class Misfit:
                 self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
                 self.places.append(number * len(rows) + which)
         # The same order of entries whichever receivers are seen.
-        own = instrument_parameters(self.receivers[0], options)
+        own = instrument_parameters(self.receivers[0], options.gain, options.pattern_degree)
         every = {name: value for name, value in self.sides[0].parameters().items() if name not in own}
         for receiver in placed:
-            every |= instrument_parameters(receiver, options)
+            every |= instrument_parameters(receiver, options.gain, options.pattern_degree)
         values = {name: value for name, value in every.items() if wanted(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])

@@ -10,10 +10,10 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
+from ..tracing.instrument_parameters import TX_PATTERN
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.traced_field import TX_PATTERN
 
 FRAME = "frame"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"

@@ -270,15 +270,15 @@ def _with_sd(value: float, sd: float) -> str:
     return f"{value:.1f} ± {sd:.1f}" if math.isfinite(sd) else "not fixed by any plane"
 
 
-def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> tuple[str, list[str]]:
-    """Title, and the change of the material of each face, a key of `CHANGES`."""
+def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list[str]:
+    """The change of the material of each face, a key of `CHANGES`."""
     side = correction.misfit.sides[0]
     slab_of_face = slabs_of_faces(side.scene, side.surfaces, "surface")[1]
     of_slab = [AS_STATED] * len(facts["materials"])
     for index, one in enumerate(facts["materials"]):
         if one["sd_log"] is not None:
             of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
-    return "materials of surfaces", [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
+    return [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
 
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
@@ -294,7 +294,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
         if correction.kinds.get(surfaces.names[surfaces.object_of(np.array([k]))[0]]) != "ceiling"
     ]
     if shift is None:
-        label, which = _changes_of_materials(correction, facts)
+        label, which = "materials of surfaces", _changes_of_materials(correction, facts)
         colours = np.array([to_rgba(CHANGES[one], alpha=0.45) for one in which])[shown]
         room.legend(handles=[Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES], fontsize=8)
     else:

@@ -72,7 +72,7 @@ class PathSum:
         ]
         self._gain = self.misfit.gains(self.at, self._entries)
         every = np.arange(len(self._row))
-        self._waves = self._waves_of(self._gain, self._phases(every, vector[self._plane_places] * 0, ()))
+        self._waves = self._waves_of(self._gain, self._phases(every, np.zeros(len(self._plane_places)), ()))
         self._total = self._sums(self._waves, every)
 
     @staticmethod
@@ -92,11 +92,10 @@ class PathSum:
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
-        return self._residual(self._total_at(vector), vector)
-
-    def _total_at(self, vector: FloatArray) -> Complex:
         touched, waves = self._changed(vector)
-        return self._total + self._sums(waves - self._waves[touched], touched)
+        total, factor = self._total + self._sums(waves - self._waves[touched], touched), self._factor(vector)
+        report = self._in_decibel(total * np.abs(factor) ** 2) if self._strengths else _pairs(total * factor)
+        return report / self.misfit.unit[:, None] - self.misfit.observed
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
@@ -105,7 +104,8 @@ class PathSum:
         touched, waves = self._changed(vector)
         present = self._waves.copy()
         present[touched] = waves
-        total = self._total_at(vector)
+        total = self._total + self._sums(waves - self._waves[touched], touched)
+        factor = self._factor(vector)
         receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
         slopes = np.zeros((*self.misfit.observed.shape, len(columns)), np.float32)
         for number, column in enumerate(columns):
@@ -125,7 +125,7 @@ class PathSum:
                 # Parameters are rounded to single precision, gains are not.
                 step = float(np.float32(there[column])) - float(np.float32(vector[column]))
                 change = self._sums((waves - present[moved]) / step, moved)
-            slopes[..., number] = self._slope(total, change, vector)
+            slopes[..., number] = self._slope(total, change, factor)
             on_column(number)
         slopes /= self.misfit.unit[:, None, None]
         slopes[~np.isfinite(self.misfit.observed).all(axis=1)] = 0
@@ -148,16 +148,11 @@ class PathSum:
             found[places] = np.exp(amplitude + 1j * phase)
         return found
 
-    def _residual(self, total: Complex, vector: FloatArray) -> FloatArray:
-        total = total * (np.abs(self._factor(vector)) ** 2 if self._strengths else self._factor(vector))
-        report = self._in_decibel(total) if self._strengths else _pairs(total)
-        return report / self.misfit.unit[:, None] - self.misfit.observed
-
-    def _slope(self, total: Complex, change: Complex, vector: FloatArray) -> FloatArray:
+    def _slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
         """Derivative of a report by that of its sum."""
         if not self._strengths:
-            return _pairs(change * self._factor(vector))
-        scale = np.abs(self._factor(vector)) ** 2
+            return _pairs(change * factor)
+        scale = np.abs(factor) ** 2
         power, slope = total.real * scale + LEAST_POWER, change.real * scale
         return np.where(power > SILENCE, 10 / np.log(10) * slope / (power + LEAST_POWER), 0)
 

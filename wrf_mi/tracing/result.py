@@ -193,3 +193,17 @@ def load_trace(file: str | Path) -> TraceResult:
         )
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None
+
+
+def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[np.bool_]:
+    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all.
+
+    That bounds the error of a sum of the paths, whatever their phases.
+    """
+    order = np.lexsort((amplitude, tx))
+    ordered, upto = tx[order], np.cumsum(amplitude[order])
+    first = np.searchsorted(ordered, ordered)
+    upto -= (upto - amplitude[order])[first]
+    kept = np.empty(len(tx), bool)
+    kept[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
+    return kept

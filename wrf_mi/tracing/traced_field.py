@@ -36,17 +36,18 @@ from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
 from .devices import NEAREST_M
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
+from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters, pattern_name
 from .material_parameters import MaterialGrouping, slabs_of_faces
 from .options import FACTOR
-from .pattern_parameters import pattern_coefficients, pattern_factor
+from .pattern_parameters import pattern_factor
 from .plane_parameters import PlaneTables
-from .pose import component, moved_m, pose_parameters, receiver_pose
+from .pose import component, moved_m, receiver_pose
+from .result import without_faint
 from .solve import Prepared
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 from .surfaces import Surfaces, scene_surfaces
 
 Float64: Any = dr.float64_array_t(mi.Float)
-TX_PATTERN = "pattern.transmitter"
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,7 @@ class TracedField:
     @property
     def pattern_name(self) -> str:
         """Name of the parameter [2, c] of the receiver's pattern, see `wrf_mi.tracing.pattern_parameters`."""
-        return _pattern_name(self.receiver)
+        return pattern_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
@@ -213,7 +214,7 @@ class TracedField:
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
         values = self.slabs.parameters(self.options.thickness, self.options.exponent)
-        values |= instrument_parameters(self.receiver, self.options)
+        values |= instrument_parameters(self.receiver, self.options.gain, self.options.pattern_degree)
         if self.options.planes:
             values |= self._planes.parameters()
         return values
@@ -319,12 +320,10 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         found = self._chains_of(tx, types, face)
-        if self.options.faint:
-            kept = np.flatnonzero(_without_faint(tx, self._amplitudes(found), self.options.faint))
-            tx, types, face = tx[kept], types[kept], face[kept]
-            vertices_m = traced.paths.vertices_m[kept]
-        else:
-            kept, vertices_m = np.arange(len(tx)), traced.paths.vertices_m
+        share, kept = self.options.faint, np.arange(len(tx))
+        if share:
+            kept = np.flatnonzero(without_faint(tx, self._amplitudes(found), share))
+        tx, types, face, vertices_m = tx[kept], types[kept], face[kept], traced.paths.vertices_m[kept]
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
@@ -369,7 +368,11 @@ class TracedField:
         return position, (on_device(np.cos(heading), Float64), on_device(np.sin(heading), Float64))
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
-        """Amplitudes of paths as stated."""
+        """Amplitudes of paths as stated.
+
+        Raises:
+            InputError: one that is not a number.
+        """
         if not dr.width(chains.exists):
             return np.zeros(0)
         pose = _spread(receiver_pose(self.receiver, {}, Float64), dr.width(chains.exists))
@@ -378,7 +381,10 @@ class TracedField:
         with dr.suspend_grad():
             real, imaginary = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas).gain
             power = real * real + imaginary * imaginary
-        return np.sqrt(power.numpy())
+        amplitude: FloatArray = np.sqrt(power.numpy())
+        if not np.isfinite(amplitude).all():
+            raise InputError("gains that are not numbers: give materials other constants")
+        return amplitude
 
     def _slab(self, face: IntArray) -> IntArray:
         """Index of the material at each interaction, 0 for none (face -1)."""
@@ -389,38 +395,6 @@ class TracedField:
             kind = self.scene.objects[name].radio_material.name
             raise InputError(f"object {name}: material {kind} is not a slab; give it one of ITU-R P.2040")
         return number
-
-
-def _without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[np.bool_]:
-    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all.
-
-    That bounds the error of a sum of the paths, whatever their phases.
-    """
-    order = np.lexsort((amplitude, tx))
-    ordered, upto = tx[order], np.cumsum(amplitude[order])
-    first = np.searchsorted(ordered, ordered)
-    upto -= (upto - amplitude[order])[first]
-    kept = np.empty(len(tx), bool)
-    kept[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
-    return kept
-
-
-def gain_name(receiver: Receiver) -> str:
-    """Name of the parameter of a receiver's gain, see `TracedField.gain_name`."""
-    return f"receiver.{receiver.name}.gain"
-
-
-def _pattern_name(receiver: Receiver) -> str:
-    return f"receiver.{receiver.name}.pattern"
-
-
-def instrument_parameters(receiver: Receiver, options: TracedOptions) -> dict[str, NDArray[np.float32]]:
-    """Initial values of the parameters of a receiver and of the antennas, of those of `TracedField.parameters`."""
-    values = pose_parameters(receiver) | {gain_name(receiver): np.array([np.log(options.gain), 0], np.float32)}
-    if options.pattern_degree:
-        names = _pattern_name(receiver), TX_PATTERN
-        values |= {name: pattern_coefficients(options.pattern_degree) for name in names}
-    return values
 
 
 def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:

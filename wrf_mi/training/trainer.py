@@ -320,9 +320,7 @@ class Trainer(TrainingLoop):
             state.baseline = found
         return found
 
-    def _traced_scores(
-        self, predict: Predictor, port: int, rows: IntArray, weight: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float64]:
+    def _traced_scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
         """Scores of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
         record, slots = self.record, np.searchsorted(self._known[port], rows)
         found = predict.of_side(record.tx_pos_m[rows], port, self._sides[port], slots, weight)
