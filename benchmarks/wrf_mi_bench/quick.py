@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -100,11 +101,11 @@ def _training() -> tuple[Call, Call]:
 
 
 def _batch() -> tuple[Call, Call]:
-    count, rng = 16, np.random.default_rng(0)
-    trainer = Trainer(record(count), make_splits(record(count), "random")[0], TrainConfig())
+    number, rng = 16, np.random.default_rng(0)
+    trainer = Trainer(record(number), make_splits(record(number), "random")[0], TrainConfig())
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     pose, plane = device_pose(RECEIVER), perception_plane(HEIGHT, WIDTH, mi.Float)
-    positions = transmitter_path(count)[rng.permutation(count)]
+    positions = transmitter_path(number)[rng.permutation(number)]
     dr.eval(params)
 
     def spectra(params: Any, tx_pos: Any, pose: Any, plane: Any) -> Any:
@@ -121,11 +122,16 @@ def _batch() -> tuple[Call, Call]:
     return ours, theirs
 
 
+def _new_rays() -> Iterator[TraceOptions]:
+    """Options whose rays no call has shot yet: what rays found is kept in the process."""
+    return (replace(OPTIONS, seed=seed) for seed in count(OPTIONS.seed + 1))
+
+
 def _kept_rays() -> tuple[Call, Call]:
-    kept, tx_pos_m = tracer(OPTIONS), transmitter_path(1)
+    kept, tx_pos_m, new = tracer(OPTIONS), transmitter_path(1), _new_rays()
 
     def theirs() -> Any:
-        paths = trace_paths(kept.scene, tx_pos_m, kept.instrument.receivers, kept.options).paths
+        paths = trace_paths(kept.scene, tx_pos_m, kept.instrument.receivers, next(new)).paths
         return kept.instrument.observe(paths)
 
     return lambda: kept(tx_pos_m), theirs
@@ -133,8 +139,8 @@ def _kept_rays() -> tuple[Call, Call]:
 
 def _gains() -> tuple[Call, Call]:
     scene, tx = open_scene("laboratory", FREQUENCY_HZ), transmitter_path(64)
-    traced = trace_paths(scene, tx, RECEIVER, OPTIONS)
-    return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, OPTIONS)
+    traced, new = trace_paths(scene, tx, RECEIVER, OPTIONS), _new_rays()
+    return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, next(new))
 
 
 def _physics() -> tuple[Call, Call]:
