@@ -220,8 +220,8 @@ def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypat
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("searched")
 
-    for name in ("_shoot", "_count_crossings"):
-        monkeypatch.setattr(search_module, name, refuse)
+    monkeypatch.setattr(search_module, "_shoot", refuse)
+    monkeypatch.setattr(images_module, "crossings", refuse)
     monkeypatch.setattr(solve_module, "sampled_paths", refuse)
     tx, rx = inside(2), receiver([1.0, 1.0, 1.0])
     assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, reflection=False)).paths) == 2
@@ -355,3 +355,17 @@ def test_wrong_arguments_are_refused(empty: Any):
         with pytest.raises(InputError, match=next(iter(setting))):
             TraceOptions(**setting)
     assert THICKNESS_M["itu_brick"] == 0.1
+
+
+def test_recorded_tests_of_candidates_find_the_paths_of_unrecorded_ones(shoebox: Any, divided: Any):
+    """In two scenes in turn; a new `Prepared` records nothing in its first trace."""
+    tx, rx = inside(5, 3), receiver([1.0, 4.0, 2.0])
+    shared = {scene: solve_module.Prepared(scene) for scene in (shoebox, divided)}
+    for row in range(len(tx)):
+        for scene, prepared in shared.items():
+            known = trace_paths(scene, tx[row : row + 1], rx, UPRIGHT, prepared=prepared).paths
+            new = trace_paths(scene, tx[row : row + 1], rx, UPRIGHT, prepared=solve_module.Prepared(scene)).paths
+            np.testing.assert_array_equal(known.objects, new.objects)
+            np.testing.assert_array_equal(known.length_m, new.length_m)
+            np.testing.assert_array_equal(known.gain, new.gain)
+    assert all(prepared._test._recorded.n_recordings for prepared in shared.values())

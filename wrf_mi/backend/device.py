@@ -9,6 +9,8 @@ kernels depend on the alignment of memory, so that another process compiles them
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from operator import and_, mul
 from typing import Any
 
 import drjit as dr
@@ -29,14 +31,18 @@ HOST: dict[Any, type[np.generic]] = {
 
 def on_device(values: ArrayLike, kind: Any) -> Any:
     """All values as a flat, evaluated array of type ``kind``: floats, integers of 32 bits or a mask."""
-    wrapped = kind(with_room(values, HOST[dr.type_v(kind)]))
-    if not dr.width(wrapped):
-        return wrapped
+    return columns_on_device([np.ravel(values)], kind)[0]
+
+
+def columns_on_device(columns: Iterable[ArrayLike], kind: Any) -> list[Any]:
+    """The arrays of `on_device` of several columns, copied by one kernel if they have the same length."""
+    wrapped = [kind(with_room(column, HOST[dr.type_v(kind)])) for column in columns]
     # Dr.Jit removes a gather of all values or a sum with zero, and would return the wrapped array.
-    copy = wrapped & dr.opaque(kind, True) if dr.is_mask_v(kind) else wrapped * dr.opaque(kind, 1)
-    dr.eval(copy)
+    neutral, join = (dr.opaque(kind, True), and_) if dr.is_mask_v(kind) else (dr.opaque(kind, 1), mul)
+    copies = [join(array, neutral) if dr.width(array) else array for array in wrapped]
+    dr.eval(copies)
     dr.sync_thread()
-    return copy
+    return copies
 
 
 def with_room(values: ArrayLike, kind: type[np.generic]) -> NDArray[Any]:
@@ -66,7 +72,7 @@ def to_tensor(values: ArrayLike, kind: Any = None) -> Any:
 
 def to_vectors(rows: ArrayLike, kind: Any) -> Any:
     """Dr.Jit vectors of type ``kind`` (``mi.Point3f``, ...) of rows [n, dimensions]."""
-    return kind(*(on_device(column, dr.value_t(kind)) for column in np.asarray(rows).T))
+    return kind(*columns_on_device(np.asarray(rows).T, dr.value_t(kind)))
 
 
 def quads(float_type: Any) -> Any:

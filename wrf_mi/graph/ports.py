@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.constants import speed_of_light
 
-from ..backend.device import on_device
+from ..backend.device import columns_on_device, on_device
 from ..core.angles import FloatArray, solid_angles
 from ..receivers.array import array_response
 from ..tracing.field_calculator import Complex
@@ -37,7 +37,7 @@ class Ports:
 
     def __init__(self, offset_m: FloatArray, frequency_hz: FloatArray) -> None:
         self.count = len(frequency_hz)
-        self.offset_m = [on_device(c, Float64) for c in np.transpose(np.asarray(offset_m, float))]
+        self.offset_m = columns_on_device(np.transpose(np.asarray(offset_m, float)), Float64)
         self.wavenumber = on_device(2 * np.pi / speed_of_light * np.asarray(frequency_hz, float), Float64)
 
     @property

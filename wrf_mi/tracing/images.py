@@ -9,11 +9,11 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, join, specular_legs, to_buffer
+from .buffer import SPECULAR, TRANSMISSION, Legs, SpecularTest, join, specular_legs
 from .fields import point_array
 from .image_method import meeting_point
 from .options import TraceOptions
-from .search import Crossings, ReflectionChains, possible
+from .search import ReflectionChains, crossings, possible
 from .surfaces import Surfaces
 
 CANDIDATES_PER_CHUNK = 1 << 20
@@ -25,7 +25,7 @@ PARALLEL = 1e-9
 def specular_paths(
     scene: Any,
     surfaces: Surfaces,
-    crossings: Crossings,
+    test: SpecularTest,
     chains: ReflectionChains,
     source_m: FloatArray,
     targets_m: FloatArray,
@@ -36,7 +36,7 @@ def specular_paths(
     Args:
         scene: ``sionna.rt.Scene``.
         surfaces: surfaces of the scene.
-        crossings: count of the surfaces between points of the scene.
+        test: test of candidates in the scene.
         chains: chains from this source, see `wrf_mi.tracing.search.shoot`.
         source_m: position [3], metres.
         targets_m: positions [n, 3], metres.
@@ -56,11 +56,11 @@ def specular_paths(
         chain, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         through = np.zeros((len(chain), chains.plane.shape[1] + 1), np.int64)
         if options.transmission:
-            through = _transmissions(crossings, surfaces, chains, chain, target, source_m, targets_m, depth)
+            through = _transmissions(scene, surfaces, chains, chain, target, source_m, targets_m, depth)
             short = through.sum(axis=1) + _lengths(chains, chain) <= depth
             chain, target, through = chain[short], target[short], through[short]
         legs, plane = _candidates(surfaces, chains, chain, target, through, depth)
-        kept, found = exact_paths(scene, surfaces, to_buffer(legs, surfaces, valid=False), *ends)
+        kept, found = test(legs, *ends)
         # Sionna RT accepts a face that mirrors the source within 1 cm of the expected one; another chain has that path.
         expected = plane[kept]
         same = ((expected < 0) | (np.append(surfaces.plane, -1)[found.face] == expected)).all(axis=1)
@@ -74,7 +74,7 @@ def _lengths(chains: ReflectionChains, chain: IntArray) -> IntArray:
 
 
 def _transmissions(
-    crossings: Crossings,
+    scene: Any,
     surfaces: Surfaces,
     chains: ReflectionChains,
     chain: IntArray,
@@ -97,7 +97,7 @@ def _transmissions(
     start, end = (np.concatenate(points) for points in zip(*legs[::-1], strict=True))
     through = np.zeros((len(chain), levels + 1), np.int64)
     after = np.repeat(np.arange(levels + 1), [len(row) for row in met])
-    through[np.concatenate(met), after] = crossings(start, end, depth)
+    through[np.concatenate(met), after] = crossings(scene, start, end, depth)
     return through
 
 

@@ -20,7 +20,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import on_device
+from ..backend.device import columns_on_device
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .materials import conductivity_exponent
@@ -88,7 +88,7 @@ class SlabMaterials:
     def constants(self, float_type: Any) -> list[Any]:
         """Stated permittivity, conductivity, thickness, reflected share and exponent, [n] each, on the device."""
         columns = self.permittivity, self.conductivity, self.thickness_m, self.reflected, self.exponent
-        return [on_device(c, float_type) for c in columns]
+        return columns_on_device(columns, float_type)
 
     def tables(
         self, parameters: Mapping[str, Any], stated: Sequence[Any], frequency_ratio: float = 1.0

@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import on_device
+from ..backend.device import columns_on_device, on_device
 from .field_calculator import Level, Vector
 from .surfaces import Surfaces
 from .walls import plane_centres
@@ -55,7 +55,7 @@ class PlaneTables:
         """Tables of a scene's surfaces."""
 
         def columns(vectors: NDArray[Any]) -> Vector:
-            return [on_device(c, Float64) for c in vectors.T]
+            return columns_on_device(vectors.T, Float64)
 
         axes = [columns(surfaces.axes[:, k]) for k in range(2)]
         offset = on_device(surfaces.offset, Float64)

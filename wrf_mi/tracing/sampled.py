@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..core.angles import FloatArray
-from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, join
+from .buffer import SPECULAR, TRANSMISSION, Legs, exact_paths, from_buffer, join
 from .fields import point_array
 from .options import TraceOptions
 from .surfaces import Surfaces
@@ -59,7 +59,7 @@ def sampled_paths(
         buffer.schedule()
         dr.eval()
         buffer.shrink()
-        _, found = exact_paths(scene, surfaces, buffer, *ends)
+        _, found = from_buffer(exact_paths(scene.mi_scene, buffer, *ends), surfaces)
         types = found.interactions
         found = found.select(((types != 0) & (types != SPECULAR) & (types != TRANSMISSION)).any(axis=1))
         parts.append(replace(found, target=found.target + start))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from typing import Any
 
@@ -45,10 +46,20 @@ class ReflectionChains:
         """Number of chains."""
         return len(self.plane)
 
-    @property
+    @cached_property
     def length(self) -> IntArray:
         """Number of reflections of each chain, shape [c]."""
         return np.count_nonzero(self.plane >= 0, axis=1)
+
+    @cached_property
+    def on_device(self) -> tuple[Any, list[Any], list[Any]]:
+        """Numbers of reflections; planes, and images of the source, of each reflection: Dr.Jit arrays [c]."""
+        import mitsuba as mi
+
+        from ..backend.device import columns_on_device, to_uint, to_vectors
+
+        planes = columns_on_device(np.maximum(self.plane, 0).T, mi.UInt32)
+        return to_uint(self.length), planes, [to_vectors(image, mi.Point3f) for image in self.image.swapaxes(0, 1)]
 
 
 def shoot(
@@ -184,93 +195,78 @@ def possible(
         targets_m: positions [n, 3], metres.
 
     Yields:
-        Indices of chains and of targets, in chunks.
+        Indices of chains and of targets, in chunks; in a chunk by the number of reflections.
     """
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_float, to_uint, to_vectors
+    from ..backend.device import to_float, to_vectors
 
-    length, count = chains.length, len(targets_m)
-    targets = to_vectors(targets_m, mi.Point3f)
-    planes: tuple[Any, ...] = (
+    length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
+    reflections, planes, images = chains.on_device
+    tables: tuple[Any, ...] = (
         to_vectors(surfaces.normal, mi.Vector3f),
         to_float(surfaces.offset),
-        to_vectors(surfaces.axes[:, 0], mi.Vector3f),
-        to_vectors(surfaces.axes[:, 1], mi.Vector3f),
+        *(to_vectors(surfaces.axes[:, side], mi.Vector3f) for side in range(2)),
         to_vectors(surfaces.low - MARGIN_M, mi.Point2f),
         to_vectors(surfaces.high + MARGIN_M, mi.Point2f),
     )
-    step = max(1, PAIRS_PER_CHUNK // count)
-    for reflections in range(1, chains.plane.shape[1] + 1):
-        members = np.flatnonzero(length == reflections)
-        for start in range(0, len(members), step):
-            part = members[start : start + step]
-            lane = dr.arange(mi.UInt32, len(part) * count)
-            row: Any = lane // count
-            point: Any = dr.gather(mi.Point3f, targets, lane - row * count)
-            valid: Any = dr.full(mi.Bool, True, len(part) * count)
-            for level in reversed(range(reflections)):
-                plane = dr.gather(mi.UInt32, to_uint(chains.plane[part, level]), row)
-                image: Any = dr.gather(mi.Point3f, to_vectors(chains.image[part, level], mi.Point3f), row)
-                n, d, u, v, low, high = (dr.gather(type(values), values, plane) for values in planes)
-                here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
-                valid &= here * there < 0
-                point += (image - point) * (here / (here - there))
-                along = mi.Point2f(dr.dot(u, point), dr.dot(v, point))
-                valid &= dr.all(along >= low) & dr.all(along <= high)
-            kept = np.asarray(dr.compress(valid), np.int64)
-            yield part[kept // count], kept % count
+    step = max(1, PAIRS_PER_CHUNK // len(targets_m))
+    # As data, not as code: the same kernel serves all numbers of targets.
+    count = dr.opaque(mi.UInt32, len(targets_m))
+    for start in range(0, len(chains), step):
+        part = min(step, len(chains) - start)
+        lane = dr.arange(mi.UInt32, part * len(targets_m))
+        row: Any = lane // count
+        point: Any = dr.gather(mi.Point3f, targets, lane - row * count)
+        row += dr.opaque(mi.UInt32, start)
+        reflects = dr.gather(mi.UInt32, reflections, row)
+        valid: Any = dr.full(mi.Bool, True, part * len(targets_m))
+        for level in reversed(range(len(planes))):
+            active = level < reflects
+            plane = dr.gather(mi.UInt32, planes[level], row, active)
+            image = dr.gather(mi.Point3f, images[level], row, active)
+            n, d, u, v, low, high = (dr.gather(type(table), table, plane, active) for table in tables)
+            here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
+            met: Any = point + (image - point) * (here / (here - there))
+            along = mi.Point2f(dr.dot(u, met), dr.dot(v, met))
+            valid &= ~active | ((here * there < 0) & dr.all(along >= low) & dr.all(along <= high))
+            point = dr.select(active, met, point)
+        found = np.asarray(dr.compress(valid), np.int64)
+        chain, target = found // len(targets_m) + start, found % len(targets_m)
+        order = np.argsort(length[chain], kind="stable")
+        yield chain[order], target[order]
 
 
-class Crossings:
-    """Counts the surfaces of a scene between pairs of points.
-
-    Rays are recorded at the first call: to trace the operations of each hit takes longer than to shoot a few thousand
-    rays.
+def crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
+    """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
 
     Args:
-        scene: ``sionna.rt.Scene`` of constant geometry.
+        scene: ``sionna.rt.Scene``.
+        start_m: first points [n, 3], metres.
+        end_m: second points [n, 3], metres.
+        most: largest number that is counted.
     """
-
-    def __init__(self, scene: Any) -> None:
-        from ..backend.recorded import Recorded
-
-        self._scene = scene
-        self._count = Recorded(_count_crossings)
-
-    def __call__(self, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
-        """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
-
-        Args:
-            start_m: first points [n, 3], metres.
-            end_m: second points [n, 3], metres.
-            most: largest number that is counted.
-        """
-        import mitsuba as mi
-
-        from ..backend.device import to_vectors
-
-        if not len(start_m) or not self._scene.objects:
-            return np.zeros(len(start_m), np.int64)
-        start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
-        return np.asarray(self._count(self._scene.mi_scene, start, end, most), np.int64)
-
-
-def _count_crossings(mi_scene: Any, start: Any, end: Any, most: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    way = end - start
-    length = dr.norm(way)
-    direction = way / length
-    ray = mi.Ray3f(start + direction * END_M, direction)
-    active: Any = length > 2 * END_M
-    crossings: Any = dr.zeros(mi.UInt32, dr.width(start))
-    for _ in range(most + 1):
-        hit = mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
+    from ..backend.device import to_vectors
+
+    if not len(start_m) or not scene.objects:
+        return np.zeros(len(start_m), np.int64)
+    start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
+    length = dr.norm(end - start)
+    direction = (end - start) / length
+    limit = dr.opaque(mi.UInt32, most)
+
+    def body(active: Any, count: Any, origin: Any) -> tuple[Any, Any, Any]:
+        ray = mi.Ray3f(origin, direction)
+        hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
         # From the start: the ray's origin is moved off the last surface by up to a millimetre.
-        active &= hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
-        crossings += dr.select(active, mi.UInt32(1), mi.UInt32(0))
-        ray = hit.spawn_ray(direction)
-    return crossings
+        inside = active & hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
+        count += dr.select(inside, mi.UInt32(1), mi.UInt32(0))
+        return inside & (count <= limit), count, hit.spawn_ray(direction).o
+
+    none = dr.zeros(mi.UInt32, len(start_m))
+    first = length > 2 * END_M, none, start + direction * END_M
+    return np.asarray(dr.while_loop(first, lambda active, *_: active, body)[1], np.int64)

@@ -16,15 +16,17 @@ from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from .buffer import Legs, join
+from .buffer import Legs, SpecularTest, join
 from .devices import before_walls, check_devices
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
+from .material_parameters import MaterialGrouping
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
 from .sampled import sampled_paths
-from .search import Crossings, ReflectionChains, shoot
+from .scene_tables import SceneTables
+from .search import ReflectionChains, shoot
 from .surfaces import Surfaces, scene_surfaces
 
 logger = logging.getLogger(__name__)
@@ -43,14 +45,15 @@ class Prepared:
     """State that the traces of a scene share: its planes, and chains of planes that rays from fixed points have found.
 
     Args:
-        scene: a ``sionna.rt.Scene`` of constant geometry.
+        scene: a ``sionna.rt.Scene`` of constant geometry and, for traced fields, materials.
     """
 
     def __init__(self, scene: Any) -> None:
-        self.surfaces, self.crossings = scene_surfaces(scene), Crossings(scene)
-        self._scene = scene
+        self.surfaces: Surfaces = scene_surfaces(scene)
+        self._scene, self._test = scene, SpecularTest(scene, self.surfaces)
         self._chains: dict[tuple[bytes, TraceOptions, int], ReflectionChains] = {}
         self._rays: dict[TraceOptions, int] = {}
+        self._tables: dict[MaterialGrouping, SceneTables] = {}
         self._checked: set[bytes] = set()
 
     def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
@@ -82,22 +85,38 @@ class Prepared:
         moved = tuple(replace(rx, position_m=position) for rx, position in zip(receivers, positions, strict=True))
         return before_walls(self.surfaces, tx_pos_m), moved
 
+    def tables(self, grouping: MaterialGrouping) -> SceneTables:
+        """Materials and planes as traced fields read them, those of the first call."""
+        if grouping not in self._tables:
+            self._tables[grouping] = SceneTables.of(self._scene, self.surfaces, grouping)
+        return self._tables[grouping]
+
     def rays(self, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
         """Number of rays per search; for ``"auto"`` that which converged for the positions of the first call."""
         if options.rays != "auto":
             return options.rays
         if options not in self._rays:
-            self._rays[options] = converged_rays(
-                self._scene, self.surfaces, self.crossings, sources_m, targets_m, options
-            )
+            self._rays[options] = converged_rays(self, sources_m, targets_m, options)
         return self._rays[options]
 
     def chains(self, source_m: FloatArray, options: TraceOptions, rays: int) -> ReflectionChains:
         """Sequences of planes that rays from a point [3] meet."""
         key = source_m.tobytes(), options, rays
         if key not in self._chains:
-            self._chains[key] = _chains(self._scene, self.surfaces, source_m, options, rays, options.seed)
+            self._chains[key] = self.new_chains(source_m, options, rays, options.seed)
         return self._chains[key]
+
+    def new_chains(self, source_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
+        """Chains from a point [3] by rays of any seed, not kept here."""
+        met, surfaces = options.max_depth if options.transmission else options.reflections, self.surfaces
+        plane = shoot(self._scene, surfaces, source_m, rays, met, options.reflections, seed)
+        return ReflectionChains(plane, image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:])
+
+    def specular_paths(
+        self, chains: ReflectionChains, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions
+    ) -> Legs:
+        """Paths from a point [3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
+        return specular_paths(self._scene, self.surfaces, self._test, chains, source_m, targets_m, options)
 
 
 def trace_paths(
@@ -188,7 +207,7 @@ def _search(
             chains = shared.chains(source, options, rays)
             for start in range(0, len(targets), TARGETS_PER_CHUNK):
                 batch = targets[start : start + TARGETS_PER_CHUNK]
-                found = [specular_paths(scene, shared.surfaces, shared.crossings, chains, source, batch, options)]
+                found = [shared.specular_paths(chains, source, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
                     found.append(sampled_paths(scene, shared.surfaces, source, batch, options, rays))
                 legs = join(found, depth)
@@ -197,22 +216,7 @@ def _search(
     return join(parts, depth)
 
 
-def _chains(
-    scene: Any, surfaces: Surfaces, source: FloatArray, options: TraceOptions, rays: int, seed: int
-) -> ReflectionChains:
-    met = options.max_depth if options.transmission else options.reflections
-    plane = shoot(scene, surfaces, source, rays, met, options.reflections, seed)
-    return ReflectionChains(plane, image_sources(surfaces.normal, surfaces.offset, plane, source)[:, 1:])
-
-
-def converged_rays(
-    scene: Any,
-    surfaces: Surfaces,
-    crossings: Crossings,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
-    options: TraceOptions,
-) -> int:
+def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
     """Number of rays that find (nearly) every path, judged on up to 4 sources and 256 targets.
 
     The number is doubled, from 2^14, until in two consecutive doublings neither the number of paths nor the power
@@ -222,7 +226,7 @@ def converged_rays(
     Returns:
         The last number but two, as further doublings found nothing; 2^24 at most, with a warning.
     """
-    if not len(surfaces.plane) or not options.reflections:
+    if not len(shared.surfaces.plane) or not options.reflections:
         return FIRST_RAYS
     sources = sources_m[spread(len(sources_m), SAMPLE[0])]
     targets = targets_m[spread(len(targets_m), SAMPLE[1])]
@@ -231,8 +235,8 @@ def converged_rays(
     while True:
         found = np.zeros(2)
         for source in sources:
-            chains = _chains(scene, surfaces, source, plain, rays, options.seed + rays.bit_length())
-            legs = specular_paths(scene, surfaces, crossings, chains, source, targets, plain)
+            chains = shared.new_chains(source, plain, rays, options.seed + rays.bit_length())
+            legs = shared.specular_paths(chains, source, targets, plain)
             found += len(legs), (_lengths(legs, source[None], targets) ** -2).sum()
         calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
         best = np.maximum(best, found)

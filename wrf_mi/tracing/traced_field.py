@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..backend.device import on_device
+from ..backend.device import columns_on_device, on_device
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
@@ -37,12 +37,12 @@ from .buffer import SPECULAR, TRANSMISSION
 from .devices import NEAREST_M
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters, pattern_name
-from .material_parameters import MaterialGrouping, slabs_of_faces
+from .material_parameters import MaterialGrouping
 from .options import FACTOR
 from .pattern_parameters import pattern_factor
-from .plane_parameters import PlaneTables
 from .pose import component, moved_m, receiver_pose
 from .result import without_faint
+from .scene_tables import SceneTables
 from .solve import Prepared
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 from .surfaces import Surfaces, scene_surfaces
@@ -172,9 +172,10 @@ class TracedField:
             n, m = len(traced.tx_pos_m), len(traced.receivers)
             text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
             raise InputError(f"{text}; trace these")
-        self.slabs, self._slab_of_face = slabs_of_faces(scene, self.surfaces, options.materials)
-        self._constants = self.slabs.constants(Float64)
-        self._planes = PlaneTables.of(self.surfaces)
+        kind = options.materials
+        tables = prepared.tables(kind) if prepared else SceneTables.of(scene, self.surfaces, kind)
+        self.slabs, self._slab_of_face = tables.slabs, tables.slab_of_face
+        self._constants, self._planes = tables.constants, tables.planes
         if traced is None:
             self.search(here)
         else:
@@ -350,12 +351,10 @@ class TracedField:
         plane, material = np.append(surfaces.plane, 0)[face], self._slab(face).astype(np.uint32)
         levels = [
             Level(
-                [on_device(c, Float64) for c in (surfaces.normal[plane[:, k]] * used[:, k, None]).T],
+                columns_on_device((surfaces.normal[plane[:, k]] * used[:, k, None]).T, Float64),
                 on_device(surfaces.offset[plane[:, k]] * used[:, k], Float64),
-                on_device(types[:, k] == SPECULAR, mi.Bool),
-                on_device(types[:, k] == TRANSMISSION, mi.Bool),
-                on_device(material[:, k], mi.UInt32),
-                on_device(plane[:, k].astype(np.uint32), mi.UInt32),
+                *columns_on_device((types[:, k] == SPECULAR, types[:, k] == TRANSMISSION), mi.Bool),
+                *columns_on_device((material[:, k], plane[:, k]), mi.UInt32),
             )
             for k in range(types.shape[1] if used.any() else 0)
         ]
@@ -364,8 +363,8 @@ class TracedField:
     def _sources(self, tx: IntArray) -> tuple[Vector, Complex]:
         """Positions of transmitters, and cosine and sine of their headings."""
         heading = self.heading_rad[tx]
-        position = [on_device(c, Float64) for c in self.tx_pos_m[tx].T]
-        return position, (on_device(np.cos(heading), Float64), on_device(np.sin(heading), Float64))
+        position = columns_on_device(self.tx_pos_m[tx].T, Float64)
+        return position, tuple(columns_on_device((np.cos(heading), np.sin(heading)), Float64))
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
         """Amplitudes of paths as stated.
