@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.correction.correct import default_options
 from wrf_mi.correction.misfit import Misfit, search_options
-from wrf_mi.correction.options import GAIN, MATERIALS, CorrectionOptions
+from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
@@ -101,7 +102,7 @@ def strengths(tmp_path_factory: pytest.TempPathFactory) -> Misfit:
 
 def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
     """A vector of other materials and gains, and one with one more material and gain that differ."""
-    vector = misfit.start + np.random.default_rng(1).normal(0, 0.05, len(misfit.start))
+    vector = changed_material(misfit)
     there = vector.copy()
     there[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
     there[misfit.parts[misfit.sides[1].gain_name].start] += 0.4
@@ -126,6 +127,53 @@ def test_derivatives_of_strengths_are_those_of_the_tracer(strengths: Misfit) -> 
         most = np.abs(expected[..., part]).max()
         np.testing.assert_allclose(found[..., part], expected[..., part], atol=0.01 * most + DECIBEL, err_msg=name)
     assert (found[3] == 0).all()
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["planes", "materials"])
+def spectra(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Misfit:
+    """Spectra of two arrays at two carriers."""
+    scene = stated_scene(tmp_path_factory.mktemp("spectra") / "scene")
+    record = channels(scene, 24)
+    first = replace(record.receivers[0], array_m=planar_array(3, 2, 0.03))
+    second = replace(first, name="second", position_m=np.add(first.position_m, [0.3, 0.2, 0]))
+    observed = np.random.default_rng(0).random((2, 24, 9, 36)).astype(np.float32)
+    carriers_hz = np.where(np.arange(24) % 3, CARRIER_HZ, 1.5 * CARRIER_HZ)
+    kinds = {"task": "spectrum", "receivers": (first, second), "frequencies_hz": None, "carriers_hz": carriers_hz}
+    record = replace(record, observation=observed, **kinds)
+    parts = (MATERIALS, PLANES) if request.param else (MATERIALS,)
+    options = CorrectionOptions(parts, depth=2, rays=8192, faint=0.0)
+    opened = open_scene(scene, CARRIER_HZ)
+    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
+
+
+def test_spectra_are_those_of_the_tracer(spectra: Misfit) -> None:
+    """Materials exactly; the planes' shifts to second order and to the change of the angle of arrival."""
+    assert PathSum.serves(spectra)
+    vector, there = spectra.start.copy(), spectra.start.copy()
+    there[spectra.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    trials = PathSum(spectra, vector)
+    for tried in (vector, there):
+        np.testing.assert_allclose(trials.residual(tried), spectra.residual(tried), atol=10 * ROUNDING)
+    assert np.abs(spectra.residual(there) - spectra.residual(vector)).max() > 0.05
+    trials.accept(there)
+    np.testing.assert_allclose(trials.residual(vector), spectra.residual(vector), atol=10 * ROUNDING)
+    if SHIFT in spectra.parts:
+        there[spectra.parts[SHIFT].start + 2] += 0.003
+        expected, before = spectra.residual(there), spectra.residual(vector)
+        np.testing.assert_allclose(trials.residual(there), expected, atol=0.05 * np.abs(expected - before).max())
+
+
+def test_derivatives_of_spectra_are_those_of_the_tracer(spectra: Misfit) -> None:
+    vector = moved(spectra) if SHIFT in spectra.parts else changed_material(spectra)
+    columns = np.arange(len(vector))
+    expected, found = spectra.jacobian(vector, columns), PathSum(spectra, vector).jacobian(vector, columns)
+    for name, part in spectra.parts.items():
+        most = np.abs(expected[..., part]).max()
+        np.testing.assert_allclose(found[..., part], expected[..., part], atol=0.05 * most + DECIBEL, err_msg=name)
+
+
+def changed_material(misfit: Misfit) -> np.ndarray:
+    return misfit.start + np.random.default_rng(1).normal(0, 0.05, len(misfit.start))
 
 
 def test_receivers_without_rows_are_parameters_but_not_traced(strengths: Misfit) -> None:

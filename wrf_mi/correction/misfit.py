@@ -22,6 +22,7 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from ..core.types import IntArray
+from ..graph.combine import ArrayReceiver
 from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
 from ..tasks import task_of
@@ -198,6 +199,27 @@ class Misfit:
                 real, imaginary = gain(params, to_uint(places))
                 found.append(np.asarray(real) + 1j * np.asarray(imaginary))
         return np.concatenate(found)
+
+    def unit_signals(self, vector: FloatArray, entries: Sequence[IntArray]) -> list[NDArray[np.complex128]]:
+        """Signals [paths, elements] of some paths of each side at an array's elements, for gains of one.
+
+        Args:
+            vector: parameters [p].
+            entries: paths of each side, of `entries`.
+        """
+        params, found = self._device(vector), list[NDArray[np.complex128]]()
+        for side, model, places in zip(self.sides, self.models, entries, strict=True):
+            assert isinstance(model, ArrayReceiver)
+            signals = np.zeros((len(places), len(model.elements_m)), complex)
+            if len(places):
+                with dr.suspend_grad():
+                    traced = side(params, entries=to_uint(places))
+                    one = dr.ones(type(traced.length_m), len(places))
+                    alone = replace(traced, gain=(one, dr.zeros(type(one), len(places))))
+                    real, imaginary = model.elements(alone, type(one))
+                signals = (np.asarray(real) + 1j * np.asarray(imaginary)).reshape(signals.shape)
+            found.append(signals)
+        return found
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None

@@ -1,11 +1,12 @@
-"""Channels and strengths of single antennas as sums over paths, for trial values of a few parameters at a time.
+"""Channels, strengths and spectra as sums over paths, for trial values of a few parameters at a time.
 
 A channel is the sum of g exp(-j k L) over paths. A shift s and tilts t of a plane change the length L of a path that
 travels along u and meets the plane at p by 2 u . n (s - t . a (p - c)), with the normal n, the axes a and the centre c:
-by Fermat's principle the displacement of the plane at the point counts. A strength is the sum of abs(g)^2, which has no
-phase; planes are no parameters then. Materials change g, which is traced once for each alternative of a surface, along
-the paths that meet it. So a trial costs one exponential for each of these paths, and no other path is evaluated. The
-gain of a receiver is a factor of its sums.
+by Fermat's principle the displacement of the plane at the point counts. A spectrum is that of such sums at an array's
+elements, whose lengths are taken to change alike. A strength is the sum of abs(g)^2, which has no phase; planes are no
+parameters then. Materials change g, which is traced once for each alternative of a surface, along the paths that meet
+it. So a trial costs one exponential for each of these paths, and no other path is evaluated. The gain of a receiver is
+a factor of its sums.
 """
 
 from __future__ import annotations
@@ -19,17 +20,19 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..graph.combine import LEAST_POWER, SILENCE, PowerReceiver
+from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..tasks import task_of
 from ..tracing.image_method import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.walls import moved_planes, plane_centres
+from .sums import Channels, Complex, Reports, Spectra, Strengths
 
 if TYPE_CHECKING:
     from .misfit import Misfit
 
-Complex = NDArray[np.complex128]
+MOST_WAVES = 1 << 24
+"""Most element signals of paths, of 16 bytes each, that are kept for spectra."""
 STEP = 1e-4
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
 centimetres resonate within a few per cent of their thickness."""
@@ -39,7 +42,7 @@ class PathSum:
     """Residuals of a misfit near one vector.
 
     Args:
-        misfit: residuals of single antennas (`serves`).
+        misfit: residuals that are such sums (`serves`).
         vector: vector [p] about which lengths are linear.
     """
 
@@ -49,15 +52,24 @@ class PathSum:
         self._side = np.repeat(np.arange(len(misfit.sides)), [len(entries) for entries in self._entries])
         self._first = np.searchsorted(self._side, np.arange(len(misfit.sides) + 1))
         self._slabs, self._row = _met(misfit, self._entries)
-        self._strengths = task_of(misfit.record).in_decibel
-        self._plane_places, self._planes = misfit.plane_entries, np.zeros((len(self._row), 0), np.int64)
-        if not self._strengths:
-            hz = misfit.record.frequencies_hz
-            assert hz is not None
-            self._k = 2 * np.pi * np.asarray(hz, float) / speed_of_light
+        task, self._plane_places = task_of(misfit.record), misfit.plane_entries
+        self._planes = np.zeros((len(self._row), 0), np.int64)
+        if len(self._plane_places):
             sides = [_geometry(misfit, number, entries, vector) for number, entries in enumerate(self._entries)]
-            joined = (np.concatenate(each) for each in zip(*sides, strict=True))
-            self._length, self.slope, self._planes = joined
+            length, self.slope, self._planes = (np.concatenate(each) for each in zip(*sides, strict=True))
+        self._unit: Complex | None = None
+        self._reports: Reports
+        if task.in_decibel:
+            self._reports = Strengths(misfit)
+        elif task.image:
+            hz = np.array([side.frequency_hz for side in misfit.sides])
+            self._reports, self._k = Spectra(misfit), (2 * np.pi * hz / speed_of_light)[self._side, None]
+            self._unit = np.concatenate(misfit.unit_signals(self.at, self._entries))
+        else:
+            assert misfit.record.frequencies_hz is not None
+            hz = np.asarray(misfit.record.frequencies_hz, float)
+            self._reports, self._k = Channels(), 2 * np.pi * hz[None] / speed_of_light
+            self._unit = np.exp(-1j * length[:, None] * self._k)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
         self._touched: dict[tuple[bytes, bytes], IntArray] = {}
         self._phase: tuple[tuple[bytes, ...], Complex] = (), np.zeros((0, 0), complex)
@@ -72,30 +84,36 @@ class PathSum:
         ]
         self._gain = self.misfit.gains(self.at, self._entries)
         every = np.arange(len(self._row))
-        self._waves = self._waves_of(self._gain, self._phases(every, np.zeros(len(self._plane_places)), ()))
+        self._waves = self._waves_of(every, self._gain, np.zeros(len(self._plane_places)), ())
         self._total = self._sums(self._waves, every)
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
-        """Whether a misfit is of channels by materials, planes and gains, or of strengths by materials and gains."""
-        record, gains = misfit.record, {side.gain_name for side in misfit.sides}
-        known = {SHIFT, TILT} if task_of(record).is_complex else set()
+        """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths by materials and
+        gains.
+        """
+        record, task, gains = misfit.record, task_of(misfit.record), {side.gain_name for side in misfit.sides}
+        known = set() if task.in_decibel else {SHIFT, TILT}
         others = {name for name in misfit.parts if not name.startswith((PREFIX, "receiver."))} - known
         devices = {name for name in misfit.parts if name.startswith("receiver.") and not name.endswith(".gain")}
         if others or devices or len(gains) * misfit.carriers < len(misfit.sides):
             return False
-        if task_of(record).in_decibel:
+        if task.in_decibel:
             powers = (isinstance(model, PowerReceiver) and not model.interference for model in misfit.models)
             return all(powers)
-        channels = task_of(record).is_complex and record.observation.ndim == 3
+        if task.image:
+            pairs = zip(misfit.models, misfit.entries(), strict=True)
+            waves = [len(m.elements_m) * len(found) for m, found in pairs if isinstance(m, ArrayReceiver)]
+            sizes = {len(m.elements_m) for m in misfit.models if isinstance(m, ArrayReceiver)}
+            return len(waves) == len(misfit.models) and len(sizes) == 1 and sum(waves) <= MOST_WAVES
+        channels = task.is_complex and record.observation.ndim == 3
         return channels and SHIFT in misfit.parts and misfit.carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
         touched, waves = self._changed(vector)
         total, factor = self._total + self._sums(waves - self._waves[touched], touched), self._factor(vector)
-        report = self._in_decibel(total * np.abs(factor) ** 2) if self._strengths else _pairs(total * factor)
-        return report / self.misfit.unit[:, None] - self.misfit.observed
+        return self._reports.report(total, factor) / self.misfit.unit[:, None] - self.misfit.observed
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
@@ -112,12 +130,14 @@ class PathSum:
             change = np.zeros_like(total)
             if column in receiver:
                 imaginary, places = receiver[column]
-                if not (imaginary and self._strengths):
-                    change[places] = total[places] * (2 if self._strengths else 1j if imaginary else 1)
+                if self._unit is not None:
+                    change[places] = total[places] * (1j if imaginary else 1)
+                elif not imaginary:
+                    change[places] = 2 * total[places]
             elif column in self._plane_places:
                 slope = self.slope[:, np.flatnonzero(self._plane_places == column)[0]]
                 moved = np.flatnonzero(slope)
-                change = self._sums(present[moved] * (-1j * slope[moved, None] * self._k), moved)
+                change = self._sums(present[moved] * (-1j * slope[moved, None] * self._wavenumber(moved)), moved)
             else:
                 there = vector.copy()
                 there[column] += STEP
@@ -125,7 +145,7 @@ class PathSum:
                 # Parameters are rounded to single precision, gains are not.
                 step = float(np.float32(there[column])) - float(np.float32(vector[column]))
                 change = self._sums((waves - present[moved]) / step, moved)
-            slopes[..., number] = self._slope(total, change, factor)
+            slopes[..., number] = self._reports.slope(total, change, factor)
             on_column(number)
         slopes /= self.misfit.unit[:, None, None]
         slopes[~np.isfinite(self.misfit.observed).all(axis=1)] = 0
@@ -148,26 +168,8 @@ class PathSum:
             found[places] = np.exp(amplitude + 1j * phase)
         return found
 
-    def _slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
-        """Derivative of a report by that of its sum."""
-        if not self._strengths:
-            return _pairs(change * factor)
-        scale = np.abs(factor) ** 2
-        power, slope = total.real * scale + LEAST_POWER, change.real * scale
-        return np.where(power > SILENCE, 10 / np.log(10) * slope / (power + LEAST_POWER), 0)
-
-    def _in_decibel(self, total: Complex) -> FloatArray:
-        """Powers as `wrf_mi.graph.combine.PowerReceiver` reports them."""
-        power = total.real + LEAST_POWER
-        found = np.empty_like(power)
-        for model, places in zip(self.misfit.models, self.misfit.places, strict=True):
-            assert isinstance(model, PowerReceiver)
-            here = power[places]
-            found[places] = 10 * np.log10(np.where(here > SILENCE, here + LEAST_POWER, model.floor))
-        return found
-
     def _sums(self, waves: Complex, which: IntArray) -> Complex:
-        """Sums [rows, frequencies] of waves of some paths; of strengths [rows, 1]."""
+        """Sums [rows, frequencies or elements] of waves of some paths; of powers [rows, 1]."""
         total = np.zeros((len(self.misfit.observed), waves.shape[1]), complex)
         if len(which):
             row = self._row[which]
@@ -185,22 +187,26 @@ class PathSum:
             met = np.isin(self._planes, planes).any(axis=1) | np.isin(self._slabs, slabs).any(axis=1)
             self._touched[key] = np.flatnonzero(met)
         touched = self._touched[key]
-        phases = self._phases(touched, (vector - self._start)[self._plane_places], key)
-        return touched, self._waves_of(self._gain_at(vector, touched), phases)
+        shifts = (vector - self._start)[self._plane_places]
+        return touched, self._waves_of(touched, self._gain_at(vector, touched), shifts, key)
 
-    def _phases(self, which: IntArray, shifts: FloatArray, key: tuple[bytes, ...]) -> Complex:
-        """Factors exp(-j k L) of some paths, which ``key`` identifies; kept for the next call."""
-        if self._strengths:
-            return np.ones((1, 1), complex)
+    def _wavenumber(self, which: IntArray) -> FloatArray:
+        """Wavenumbers of some paths, [paths or 1, frequencies or 1]."""
+        return self._k if len(self._k) == 1 else self._k[which]
+
+    def _waves_of(self, which: IntArray, gain: Complex, shifts: FloatArray, key: tuple[bytes, ...]) -> Complex:
+        """What is summed of some paths, which ``key`` identifies: waves [paths, frequencies or elements], or powers
+        [paths, 1].
+        """
+        if self._unit is None:
+            return (np.abs(gain[:, None]) ** 2).astype(complex)
         name = (*key, shifts.tobytes())
-        if self._phase[0] != name:
-            length = self._length[which] + self.slope[which] @ shifts
-            self._phase = name, np.exp(-1j * length[:, None] * self._k)
-        return self._phase[1]
-
-    def _waves_of(self, gain: Complex, phases: Complex) -> Complex:
-        """What is summed: waves [paths, frequencies], or powers [paths, 1]."""
-        return (np.abs(gain[:, None]) ** 2).astype(complex) if self._strengths else gain[:, None] * phases
+        if self._phase[0] != name:  # kept for the next call
+            unit = self._unit[which]
+            if shifts.any():
+                unit = unit * np.exp(-1j * (self.slope[which] @ shifts)[:, None] * self._wavenumber(which))
+            self._phase = name, unit
+        return gain[:, None] * self._phase[1]
 
     def _gain_at(self, vector: FloatArray, touched: IntArray) -> Complex:
         materials = self._material.ravel()
@@ -224,11 +230,6 @@ class PathSum:
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
     """What gives residuals and derivatives near a vector fastest: a sum over paths where one serves."""
     return PathSum(misfit, vector) if PathSum.serves(misfit) else misfit
-
-
-def _pairs(channel: Complex) -> FloatArray:
-    """Real and imaginary parts in turn."""
-    return np.ascontiguousarray(channel).view(float)
 
 
 def _met(misfit: Misfit, entries: Sequence[IntArray]) -> tuple[IntArray, IntArray]:

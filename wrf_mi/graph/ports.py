@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import columns_on_device, on_device
@@ -87,30 +87,33 @@ class ComplexMatrix:
 
     Args:
         values: complex matrix [m, n].
+
+    Attributes:
+        values: the matrix.
     """
 
     def __init__(self, values: ArrayLike) -> None:
-        self._values = np.asarray(values, complex)
+        self.values: NDArray[np.complex128] = np.asarray(values, complex)
         self._device: dict[Any, tuple[Any, Any]] = {}
 
     def arrays(self, float_type: Any) -> tuple[Any, Any]:
         """Real and imaginary part on the device, [m, n]."""
         if float_type not in self._device:
-            columns = self._values.shape[1]
-            re, im = (matrix(on_device(part, float_type), columns) for part in (self._values.real, self._values.imag))
+            columns = self.values.shape[1]
+            re, im = (matrix(on_device(part, float_type), columns) for part in (self.values.real, self.values.imag))
             self._device[float_type] = re, im
         return self._device[float_type]
 
     def forward(self, x: Complex) -> Complex:
         """Products x M of rows, flat [batch * m], to flat [batch * n]."""
         c, s = self.arrays(type(x[0]))
-        re, im = (matrix(part, len(self._values)) for part in x)
+        re, im = (matrix(part, len(self.values)) for part in x)
         return (re @ c - im @ s).array, (re @ s + im @ c).array
 
     def adjoint(self, x: Complex) -> Complex:
         """Products x M^H of rows, flat [batch * n], to flat [batch * m]."""
         c, s = (dr.moveaxis(part, 0, 1) for part in self.arrays(type(x[0])))
-        re, im = (matrix(part, self._values.shape[1]) for part in x)
+        re, im = (matrix(part, self.values.shape[1]) for part in x)
         return (re @ c + im @ s).array, (im @ c - re @ s).array
 
 
