@@ -119,7 +119,13 @@ _OWN: Mapping[str, Check] = {
     "new-carriers": _here(
         "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
     ),
-    "new-receivers": _here("receivers without measurements, and with few", "unmeasured:receivers", FLAT, resumes=True),
+    "new-receivers": _here(
+        "receivers without measurements, and with few",
+        "unmeasured:receivers",
+        FLAT,
+        resumes=True,
+        table="unmeasured:table",
+    ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),

@@ -209,24 +209,30 @@ def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: median (mean) score of each method, and the hybrid's mean gain with its 95 % interval."""
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [
-        f"| held out | {HYBRID} | inside | {' | '.join(methods[1:])} |",
-        f"| {' | '.join(['---'] * (len(methods) + 2))} |",
-    ]
-    for at in dict.fromkeys(row["at"] for row in rows):
-        cells = [at]
-        for row in (row for row in rows if row["at"] == at):
-            digits = row["digits"]
-            score = f"{row['median']:.{digits}f} ({row['mean']:.{digits}f})"
-            if row["gain"] is None:
-                cells += [f"**{score}**", f"{row['inside']:.0%}"]
-            else:
-                value, low, high = (f"{part:.{digits}f}" for part in row["gain"])
-                cells.append(f"{score} [{value}: {low} to {high}]")
-        lines.append(f"| {' | '.join(cells)} |")
+    """Markdown table: median (mean) score of each method, and the hybrid's mean gain with its 95 % interval.
+
+    Methods have a column each, or share one where they are not the same throughout.
+    """
+    places = dict.fromkeys(row["at"] for row in rows)
+    by_place = [[row for row in rows if row["at"] == at] for at in places]
+    methods = [row["method"] for row in by_place[0]][1:]
+    shared = any([row["method"] for row in found][1:] != methods for found in by_place)
+    columns = ["held out", HYBRID, "inside", *(["others"] if shared else methods)]
+    lines = [f"| {' | '.join(columns)} |", f"| {' | '.join(['---'] * len(columns))} |"]
+    for at, (hybrid, *others) in zip(places, by_place, strict=True):
+        cells = [f"{row['method']} {_with_gain(row)}" if shared else _with_gain(row) for row in others]
+        first = [at, f"**{_score(hybrid)}**", f"{hybrid['inside']:.0%}"]
+        lines.append(f"| {' | '.join([*first, *(['; '.join(cells)] if shared else cells)])} |")
     return "\n".join(lines)
+
+
+def _score(row: Mapping[str, Any]) -> str:
+    return f"{row['median']:.{row['digits']}f} ({row['mean']:.{row['digits']}f})"
+
+
+def _with_gain(row: Mapping[str, Any]) -> str:
+    value, low, high = (f"{part:.{row['digits']}f}" for part in row["gain"])
+    return f"{_score(row)} [{value}: {low} to {high}]"
 
 
 def carriers() -> dict[str, Any]:

@@ -54,6 +54,7 @@ ON_PAGE = {
     "elsewhere": "numerics.md",
     "rooms": "correction.md",
     "new-carriers": "hybrid.md",
+    "new-receivers": "hybrid.md",
     "locate": "locate.md",
     "phase-error": "physics.md",
     "sentinels": "results.md",
