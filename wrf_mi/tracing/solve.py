@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,13 +21,15 @@ from .devices import before_walls, check_devices
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
-from .material_parameters import MaterialGrouping
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
 from .sampled import sampled_paths
-from .scene_tables import SceneTables
 from .search import ReflectionChains, shoot
 from .surfaces import Surfaces, scene_surfaces
+
+if TYPE_CHECKING:
+    from .material_parameters import MaterialGrouping
+    from .scene_tables import SceneTables
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +89,8 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
+        from .scene_tables import SceneTables
+
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self._scene, self.surfaces, grouping)
         return self._tables[grouping]
