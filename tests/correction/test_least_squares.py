@@ -59,6 +59,15 @@ def test_correlated_values_count_once() -> None:
     assert found[1] == pytest.approx(found[0], rel=0.2)
 
 
+@pytest.mark.parametrize("rows", [40, 400])
+def test_values_are_counted_whatever_the_number_and_size_of_rows(rows: int) -> None:
+    """Of white noise all count, where rows are few and a tenth of them has most of the power."""
+    rng = np.random.default_rng(6)
+    size = np.where(rng.random((rows, 1)) < 0.1, 10.0, 1.0)
+    assert Noise.of(size * rng.normal(size=(rows, 16))).values == pytest.approx(16, rel=0.1)
+    assert Noise.of(rng.normal(size=(1, 16))).values == 1
+
+
 def test_rows_that_nothing_explains_hardly_count() -> None:
     noisy = MATRIX @ TRUE + np.random.default_rng(4).normal(0, 0.1, (ROWS, VALUES))
     noisy[:60] += 5.0

@@ -18,8 +18,8 @@ def add_parser(commands: Any) -> None:
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
-    parts = "what is changed, from materials,planes,frame,gain,pose,patterns"
-    add("--fit", metavar="LIST", help=f"{parts} (default: the first three; for signal strengths materials and gain)")
+    parts = "what is changed, from materials,planes,frame,hidden,gain,pose,patterns"
+    add("--fit", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials and gain)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
     add("--rows", type=int, metavar="N", help="most training rows that are compared (default: 600)")

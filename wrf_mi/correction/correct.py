@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..scene.folder import read_scene_folder
+from ..scene.hidden import with_hidden_faces
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.surfaces import KINDS, Kind
 from ..tasks import task_of
@@ -32,7 +34,7 @@ from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit
 from .misfit import Misfit, search_options
-from .options import DEFAULTS, GAIN, STRENGTHS, CorrectionOptions, OnStage
+from .options import DEFAULTS, GAIN, HIDDEN, STRENGTHS, CorrectionOptions, OnStage
 
 NONE = np.zeros((0, 2), np.int64)
 """No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
@@ -116,7 +118,11 @@ def correct_scene(
     if task.in_decibel and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
     split = _at_most(split, options.rows)
-    opened = open_scene(scene, scene_carrier(record, split.all_train), material=material)
+    carrier_hz = scene_carrier(record, split.all_train)
+    with with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext(scene) as supposed:
+        opened = open_scene(supposed, carrier_hz, material=material)
+        if supposed == scene:
+            options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
     check_materials(opened)
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)

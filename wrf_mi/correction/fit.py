@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..scene.hidden import PREFIX as HIDDEN
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .frame import rigid_motions
-from .least_squares import Prior, Solution, solve
+from .least_squares import Noise, Prior, Solution, solve
 from .misfit import Misfit
 from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
-from .search import Choice, choose, joint_choices, material_choices, shift_choices
+from .search import (
+    ABSENT,
+    ABSENT_VALUES,
+    GAIN,
+    Choice,
+    choose,
+    joint_choices,
+    material_choices,
+    material_places,
+    shift_choices,
+)
 
 LEAST_PATHS = 10
 """Fewest paths of a surface or plane that is changed."""
@@ -25,8 +38,37 @@ ROUNDS = 3
 """Largest number of rounds: planes that are off hide the right material, and conversely."""
 ROUND_STEPS = 3
 """Largest number of least-squares steps between choices."""
+RECONSIDERED = 4
+"""Largest number of times that doubtful surfaces are chosen anew."""
 REFINING_STEPS = 3
 """Largest number of least-squares steps of one plane while shifts are compared."""
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Choices of a stage.
+
+    Attributes:
+        stage: the stage.
+        mean: means of the parameters' prior [p].
+        materials: material of each surface that was chosen, by its name.
+    """
+
+    stage: str
+    mean: FloatArray
+    materials: Mapping[str, str]
+
+
+class _Found(NamedTuple):
+    """Least squares and the choices before."""
+
+    solution: Solution
+    known: _Known
+
+    @property
+    def vector(self) -> FloatArray:
+        """Parameters [p]."""
+        return self.solution.vector
 
 
 class Fit:
@@ -45,6 +87,9 @@ class Fit:
         self.prior_deviation = np.ones(len(self.stated))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)
+        supposed = [slab for slab, name in enumerate(misfit.sides[0].slabs.names) if name.startswith(HIDDEN)]
+        for slab in supposed if MATERIALS in options.parts else ():
+            self.stated[material_places(misfit, slab)] = ABSENT_VALUES
         self._match_gains()
 
     def _match_gains(self) -> None:
@@ -97,9 +142,24 @@ class Fit:
         return {stage: self._alternate(stage) for stage in stages}
 
     def _alternate(self, stage: str) -> Solution:
-        """Rounds of choices and least squares, until a round changes no choice."""
-        vector, mean, parts = self.stated, self.stated.copy(), stage.split("+")
-        options, misfit = self.options, self.misfit
+        """Rounds of choices and least squares, until a round changes no choice; then doubtful surfaces once more."""
+        choices, title = self._choices(stage), f"{stage.replace('+', ', ')}: choices"
+        supposed = {name: ABSENT for name in self.misfit.sides[0].slabs.names if name.startswith(HIDDEN)}
+        vector, known, _ = self._chosen(_Known(stage, self.stated, supposed), self.stated, choices, f"{title}, round 1")
+        found = self._solved(vector, known)
+        for round_ in range(2, ROUNDS + 1):
+            vector, known, changed = self._chosen(found.known, found.vector, choices, f"{title}, round {round_}")
+            if not changed:
+                break
+            found = self._solved(vector, known)
+        found = self._after_doubts(found, choices, title)
+        self.means[stage] = found.known.mean
+        self.taken |= {(stage, surface): material for surface, material in found.known.materials.items()}
+        return found.solution
+
+    def _choices(self, stage: str) -> list[Choice]:
+        """Choices of a stage."""
+        parts, options, misfit = stage.split("+"), self.options, self.misfit
         shifts, materials = list[Choice](), list[Choice]()
         if PLANES in parts or FRAME in parts:
             alone, common = PLANES in parts, FRAME in parts
@@ -108,24 +168,95 @@ class Fit:
             shifts = shift_choices(misfit, self.planes, sd_m, sd_rad, self.frequency_hz)
         if MATERIALS in parts:
             materials = material_choices(misfit, self.slabs, self.frequency_hz)
-        choices = joint_choices(materials, shifts, misfit.plane_of_slab)
-        for round_ in range(ROUNDS):
-            what = f"{stage.replace('+', ', ')}: choices, round {round_ + 1}"
-            vector, taken = choose(misfit, vector, choices, self._expected, self._refined, self._progress(what))
-            if round_ and not taken:
-                break
-            for choice in choices:
-                # Least squares stay near the materials that were chosen, and near the planes as stated.
+        return joint_choices(materials, shifts, misfit.plane_of_slab)
+
+    def _chosen(
+        self, known: _Known, start: FloatArray, choices: Sequence[Choice], what: str
+    ) -> tuple[FloatArray, _Known, bool]:
+        """Vector and materials that choices find from ``start``, and whether one has changed."""
+        vector, taken = choose(self, start, choices, self._progress(what))
+        mean, materials = known.mean.copy(), dict(known.materials)
+        for choice in choices:
+            # Least squares stay near the materials that were chosen, and near the planes as stated.
+            if choice.what in taken and choice.material:
                 chosen = choice.places[np.isinf(choice.deviation)]
-                if choice.what in taken and len(chosen):
-                    mean[chosen] = vector[chosen]
-                    self.taken[stage, choice.what] = taken[choice.what].partition(",")[0]
-            found = self.solve(stage, vector, mean, ROUND_STEPS)
-            vector = found.vector
-        self.means[stage] = mean
+                mean[chosen] = vector[chosen]
+                materials[choice.what] = taken[choice.what]
+        return vector, _Known(known.stage, mean, materials), bool(taken)
+
+    def _solved(self, vector: FloatArray, known: _Known) -> _Found:
+        return _Found(self.solve(known.stage, vector, known.mean, ROUND_STEPS), known)
+
+    def _after_doubts(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
+        """The best that is found where doubtful surfaces are chosen anew, until each reason for doubt has failed."""
+        doubts = [(self._implausible, [choice for choice in choices if choice.joint])]
+        doubts.append((self._unsupported, [choice for choice in choices if choice.material]))
+        doubts = [(doubt, those) for doubt, those in doubts if len(those) > 1]
+        failed, number = 0, 0
+        while failed < len(doubts) and number < RECONSIDERED:
+            doubt, those = doubts[number % len(doubts)]
+            number += 1
+            other = self._reconsidered(found, those, doubt, f"{title} in doubt, {number} of {RECONSIDERED}")
+            noise = found.solution.noise
+            better = self._cost(other, noise) < self._cost(found, noise) - GAIN
+            found, failed = (other, 0) if better else (found, failed + 1)
         return found
 
-    def _expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
+    def _cost(self, found: _Found, noise: Noise) -> float:
+        free = self.free(found.known.stage)
+        prior = self.prior(found.known.mean, free)
+        return noise.cost(self.misfit.residual(found.vector)) + prior.cost(found.vector[free])
+
+    def _reconsidered(
+        self,
+        found: _Found,
+        choices: Sequence[Choice],
+        doubt: Callable[[Sequence[Choice], FloatArray], FloatArray],
+        what: str,
+    ) -> _Found:
+        """The half of the surfaces that is doubted most, chosen anew beside the others.
+
+        They were chosen while others were still wrong, and wrong ones hold each other where they are.
+        """
+        most = np.sort(np.argsort(-doubt(choices, found.vector), kind="stable")[: (len(choices) + 1) // 2])
+        doubted, start = [choices[number] for number in most], found.vector.copy()
+        for choice in doubted:
+            start[choice.places] = self._absent(choice, start)
+        vector, known, _ = self._chosen(found.known, start, doubted, what)
+        return self._solved(vector, known)
+
+    def _implausible(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
+        """Squared distances of planes from where the others let expect them, in standard deviations."""
+        places = [choice.places[np.isfinite(choice.deviation)] for choice in choices]
+        away = [(vector[place] - self.expected(vector, place)) / self.prior_deviation[place] for place in places]
+        return np.square(away).sum(axis=1)
+
+    def _unsupported(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
+        """Log-likelihoods without each surface, the higher the less observations tell of it."""
+        trials, found = near(self.misfit, vector), np.zeros(len(choices))
+        noise = Noise.of(trials.residual(vector))
+        for number, choice in enumerate(choices):
+            there = vector.copy()
+            there[choice.places] = self._absent(choice, vector)
+            found[number] = -noise.cost(trials.residual(there))
+        return found
+
+    def _absent(self, choice: Choice, vector: FloatArray) -> FloatArray:
+        """Values of a choice whose surface is left out; its plane is where the others let expect it."""
+        values = next(values for name, values in choice.values.items() if name.startswith(ABSENT))
+        return np.where(np.isinf(choice.deviation), values, self.expected(vector, choice.places))
+
+    def planes_cost(self, vector: FloatArray) -> float:
+        """Cost of planes by their prior, in which they share the motions of the frame."""
+        free, prior = self._planes_prior
+        return prior.cost(vector[free])
+
+    @cached_property
+    def _planes_prior(self) -> tuple[IntArray, Prior]:
+        free = np.intersect1d(self.misfit.plane_entries, self.free(PLANES))
+        return free, self.prior(self.stated, free)
+
+    def expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
         expected = vector[places].copy()
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
@@ -140,7 +271,7 @@ class Fit:
             expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
         return expected
 
-    def _refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
+    def refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         places = places[np.isin(places, self.free("+".join(self.options.parts)))]
         misfit, vector, mean = self.misfit, start.copy(), start.copy()
@@ -188,4 +319,8 @@ class Fit:
             done = step
 
         found = solve(lambda part: misfit.residual(whole(part)), jacobian, start[free], prior, steps, on_step)
-        return replace(found, vector=whole(found.vector))
+        vector = whole(found.vector)
+        others = np.setdiff1d(misfit.plane_entries, free)
+        if FRAME in stage.split("+"):  # too few paths meet them
+            vector[others] = self.expected(vector, others)
+        return replace(found, vector=vector)

@@ -34,8 +34,8 @@ TRIALS = 8
 HARDER = 8.0
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
 """Damping of the first step and the smallest, relative to the diagonal."""
-CONVERGED = 1e-3
-"""Relative decrease of the cost below which no further step is taken."""
+CONVERGED = 0.1
+"""Decrease of the cost below which no further step is taken: a parameter's error of a standard deviation costs 0.5."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,7 @@ class Noise:
     def of(cls, residual: FloatArray) -> Noise:
         """Noise of residuals [rows, values]; a row without observation is NaN."""
         seen = residual[np.isfinite(residual).all(axis=1)]
-        # The smaller of the two products of the matrix with its transpose: their squares have equal traces.
-        product = seen.T @ seen if seen.shape[1] <= len(seen) else seen @ seen.T
-        square = float(np.square(product).sum())
-        count = float(np.trace(product)) ** 2 / square if square > 0 else 1.0
+        count = _independent(seen)
         variance = float(np.median(np.square(seen).mean(axis=1))) / MEDIAN_OF_MEAN if len(seen) else 1.0
         return cls(max(variance, LEAST_VARIANCE), min(max(count, 1.0), float(residual.shape[1])))
 
@@ -77,6 +74,22 @@ class Noise:
     def _excess(self, residual: FloatArray) -> FloatArray:
         mean = np.where(np.isfinite(residual).all(axis=1), np.square(residual).mean(axis=1), 0)
         return np.asarray(self.values * mean / (FREEDOM * self.variance))
+
+
+def _independent(residual: FloatArray) -> float:
+    """Participation ratio of the eigenvalues of the covariance of rows [n, values] of equal length.
+
+    The trace of the squared covariance is estimated from pairs of different rows; with the rows themselves it is too
+    large by a share of values / n, and a few rows of large residuals outweigh all others.
+    """
+    size = np.linalg.norm(residual, axis=1, keepdims=True)
+    unit = (residual / np.where(size > 0, size, 1))[size[:, 0] > 0]
+    # The smaller of the two products of the matrix with its transpose: their squares have equal traces.
+    product = unit.T @ unit if unit.shape[1] <= len(unit) else unit @ unit.T
+    pairs = float(np.square(product).sum()) - len(unit)
+    if len(unit) < 2:
+        return 1.0
+    return len(unit) * (len(unit) - 1) / pairs if pairs > 0 else float(residual.shape[1])
 
 
 @dataclass(frozen=True)
@@ -142,7 +155,7 @@ def solve(
         vector, found, damping = there, tried, max(damping / HARDER, LEAST_DAMPING)
         on_step(step, after)
         noise, derivative = Noise.of(found), jacobian(vector)
-        if before - after < CONVERGED * abs(before):
+        if before - after < CONVERGED:
             break
     information, _ = _normal(derivative, found, noise)
     return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)

@@ -15,9 +15,9 @@ from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
 from ..tracing.plane_parameters import SHIFT, TILT
 
-FRAME = "frame"
+FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
-PARTS = (MATERIALS, PLANES, FRAME, GAIN, "pose", PATTERNS)
+PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS)
 """What a correction may change."""
 EXPONENT_SD = 0.3
 """Standard deviation of the exponent of a conductivity with the frequency; ITU-R P.2040 has 0.16 to 1.34 for building
@@ -53,7 +53,7 @@ class CorrectionOptions(CheckedSettings):
         pattern_sd: standard deviation of a pattern's coefficient.
     """
 
-    parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME)
+    parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
     depth: Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")] = 3
     reflections: Annotated[int, NOT_NEGATIVE] = 3
     rows: Annotated[int, Field(ge=1, description="1 or more")] = 600
@@ -79,6 +79,8 @@ class CorrectionOptions(CheckedSettings):
         super().__post_init__()
         if unknown := [part for part in self.parts if part not in PARTS]:
             raise InputError(f"correct: {unknown[0]!r} is not a part; choose of {', '.join(PARTS)}")
+        if HIDDEN in self.parts and MATERIALS not in self.parts:
+            raise InputError(f"correct: {HIDDEN} needs {MATERIALS}, by which a face is there or not")
         if not self.parts:
             raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
 

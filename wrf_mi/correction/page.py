@@ -25,6 +25,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_figure
+from ..scene.hidden import PREFIX as HIDDEN
 from ..tasks import task_of
 from ..tracing.corrected_scene import (
     material_constants,
@@ -159,13 +160,14 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
         places = [part.start + index for part in parts if part is not None]
         free = bool(places) and places[0] in correction.free
         sd = correction.deviation[places] if free else None
-        taken = correction.materials.get(name)
+        taken, supposed = correction.materials.get(name), name.startswith(HIDDEN)
+        left_out = taken == ABSENT and free and bool(after[index, 0] < 1.1)
         found.append(
             {
                 "surface": name.partition("/")[0],
                 "paths": int(paths[index]),
                 "first_choice": taken,
-                "absent": taken == ABSENT and free and bool(after[index, 0] < 1.1),
+                "absent": taken in (None, ABSENT) if supposed else left_out,
                 "permittivity": [float(before[index, 0]), float(after[index, 0])],
                 "conductivity": [float(before[index, 1]), float(after[index, 1])],
                 "thickness_m": [float(before[index, 2]), float(after[index, 2])],
@@ -260,7 +262,7 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         f'- "Measured" are quantities whose standard deviation fell below {SUPPORTED:.0%} of the one before; '
         "`x/ 1.2` is a factor of one standard deviation.",
         "- Standard deviations are those of the Fisher information and the prior, with the paths as found in the "
-        "stated scene. Surfaces that the scan missed are not in them.",
+        "stated scene. Of surfaces that the scan missed, only faces of boxes are tried (`hidden`).",
         "",
     ]
     return "\n".join(lines)

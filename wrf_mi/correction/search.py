@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import Protocol
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from ..scene.hidden import PREFIX as HIDDEN
 from ..tracing.material_parameters import (
     EXPONENT,
     LEAST_CONDUCTIVITY,
@@ -36,7 +38,8 @@ QUANTITIES = (*CONSTANTS, EXPONENT)
 """Parameters of a surface's material, in the order of a choice's values."""
 ABSENT = "absent"
 """Choice of a surface that waves do not notice."""
-ABSENT_THICKNESS_M = 0.001
+ABSENT_VALUES = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, 0.001]), 0.0)
+"""Its entries of the vector, in the order of `QUANTITIES`; 1 mm of almost nothing."""
 GAIN = 0.5
 """Least increase of the log-likelihood for which a choice changes."""
 SWEEPS = 3
@@ -67,13 +70,14 @@ class Choice:
     deviation: FloatArray
 
     @property
+    def material(self) -> bool:
+        """Whether a material is chosen."""
+        return bool(np.isinf(self.deviation).any())
+
+    @property
     def joint(self) -> bool:
         """Whether material and shift are chosen together."""
-        return bool(np.isinf(self.deviation).any() and np.isfinite(self.deviation).any())
-
-    def cost(self, vector: FloatArray) -> float:
-        """Negative logarithm of the prior of a vector's values, without its constant."""
-        return float(np.square(vector[self.places] / self.deviation).sum() / 2)
+        return self.material and bool(np.isfinite(self.deviation).any())
 
 
 def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list[Choice]:
@@ -86,10 +90,14 @@ def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list
         )
         for name, (permittivity, conductivity, thickness) in known.items()
     }
-    values[ABSENT] = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, ABSENT_THICKNESS_M]), 0.0)
-    first = [misfit.parts[name_of(SURFACE, quantity)].start for quantity in QUANTITIES]
-    names = misfit.sides[0].slabs.names
-    return [Choice(names[slab], np.add(first, slab), values, np.full(len(first), np.inf)) for slab in hit]
+    values[ABSENT] = ABSENT_VALUES
+    names, free = misfit.sides[0].slabs.names, np.full(len(QUANTITIES), np.inf)
+    return [Choice(names[slab], material_places(misfit, slab), values, free) for slab in hit]
+
+
+def material_places(misfit: Misfit, slab: int) -> IntArray:
+    """Entries of the vector that the material of a slab has, in the order of `QUANTITIES`."""
+    return np.array([misfit.parts[name_of(SURFACE, quantity)].start + slab for quantity in QUANTITIES])
 
 
 def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, frequency_hz: float) -> list[Choice]:
@@ -105,13 +113,14 @@ def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, fre
 
 
 def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int]) -> list[Choice]:
-    """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes, and
-    all other choices by themselves.
+    """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
+    for supposed faces, and all other choices by themselves.
 
     At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
     """
     with_material = {f"plane {plane_of[one.what]}": one for one in reversed(materials)}
-    pairs = [(with_material[one.what], one) for one in shifts if one.what in with_material][:JOINT]
+    every = [(with_material[one.what], one) for one in shifts if one.what in with_material]
+    pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what.startswith(HIDDEN)]
     joined = [
         Choice(
             material.what,
@@ -129,54 +138,73 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_o
     return [*joined, *(one for one in (*shifts, *materials) if one.what not in done)]
 
 
+class Rules(Protocol):
+    """What is known of a vector apart from observations."""
+
+    misfit: Misfit
+
+    def planes_cost(self, vector: FloatArray) -> float:
+        """Negative logarithm of the planes' prior, without its constant."""
+
+    def expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
+        """Entries ``places`` by all others, in place of alternatives' NaN."""
+
+    def refined(self, trials: Misfit | PathSum, vector: FloatArray, places: IntArray) -> FloatArray:
+        """The vector after some least-squares steps of the entries ``places`` on the residuals of ``trials``."""
+
+
 def choose(
-    misfit: Misfit,
+    rules: Rules,
     vector: FloatArray,
     choices: Sequence[Choice],
-    expect: Callable[[FloatArray, IntArray], FloatArray],
-    refine: Callable[[Misfit | PathSum, FloatArray, IntArray], FloatArray],
     on_choice: Callable[[int, int], None],
 ) -> tuple[FloatArray, dict[str, str]]:
     """Coordinate descent over choices, in sweeps until none changes.
 
     Args:
-        misfit: residuals of a vector.
+        rules: residuals and prior of a vector.
         vector: start [p].
         choices: choices in the order in which they are tried.
-        expect: ``expect(vector, places)``: entries ``places`` by all others, in place of alternatives' NaN.
-        refine: ``refine(trials, vector, places)``: the vector after some least-squares steps of the entries ``places``
-            on the residuals of ``trials``.
         on_choice: called with the number of choices tried and their number.
 
     Returns:
-        The vector, and the alternative taken by each choice that changed.
+        The vector, and the material or shift taken by each choice that changed.
     """
-    vector, taken, first = np.array(vector, float), dict[str, str](), itemgetter(0)
+    vector, taken = np.array(vector, float), dict[str, str]()
     for sweep in range(SWEEPS):
-        trials = near(misfit, vector)
-        residual, changed = trials.residual(vector), False
-        noise = Noise.of(residual)
+        trials = near(rules.misfit, vector)
+        noise, changed = Noise.of(trials.residual(vector)), False
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
-            tried, expected = [], expect(vector, choice.places)
-            for name, values in choice.values.items():
-                there = vector.copy()
-                there[choice.places] = np.where(np.isnan(values), expected, values)
-                tried.append((noise.cost(trials.residual(there)) + choice.cost(there), name, there))
-            if choice.joint:
-                # A plane that is tilted, too, fits at the right shift only once its tilts do.
-                by_shift = {
-                    name.rpartition(",")[2]: (cost, name, there) for cost, name, there in sorted(tried, key=first)[::-1]
-                }
-                places = choice.places if trials is misfit else choice.places[np.isfinite(choice.deviation)]
-                for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
-                    better = refine(trials, there, places)
-                    tried.append((noise.cost(trials.residual(better)) + choice.cost(better), name, better))
-            least, name, there = min(tried, key=first)
-            if least < noise.cost(residual) + choice.cost(vector) - GAIN:
-                taken[choice.what], vector, residual, changed = name, there, trials.residual(there), True
+            least, name, there = _best(rules, trials, noise, choice, vector)
+            if least < _cost(rules, trials, noise, vector) - GAIN:
+                taken[choice.what], vector, changed = name.partition(",")[0], there, True
                 if isinstance(trials, PathSum):
                     trials.accept(there)
         if not changed:
             break
     return vector, taken
+
+
+def _cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
+    return noise.cost(trials.residual(vector)) + rules.planes_cost(vector)
+
+
+def _best(
+    rules: Rules, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray
+) -> tuple[float, str, FloatArray]:
+    """Alternative of a choice with the least cost: cost, name and vector."""
+    tried, expected = list[tuple[float, str, FloatArray]](), rules.expected(vector, choice.places)
+    for name, values in choice.values.items():
+        there = vector.copy()
+        there[choice.places] = np.where(np.isnan(values), expected, values)
+        tried.append((_cost(rules, trials, noise, there), name, there))
+    first = itemgetter(0)
+    if choice.joint:
+        # A plane that is tilted, too, fits at the right shift only once its tilts do.
+        by_shift = {one[1].rpartition(",")[2]: one for one in sorted(tried, key=first)[::-1]}
+        places = choice.places if trials is rules.misfit else choice.places[np.isfinite(choice.deviation)]
+        for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
+            better = rules.refined(trials, there, places)
+            tried.append((_cost(rules, trials, noise, better), name, better))
+    return min(tried, key=first)

@@ -14,6 +14,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..scene.folder import write_scene
 from ..scene.materials import CARRIER, THICKNESS_M, Materials
 from ..scene.materials import EXPONENT as LAW
@@ -32,9 +33,9 @@ from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
 
-FLAT = 0.1
-"""Share of the largest singular value below which planes at a corner count as parallel: those within 11 degrees do not
-determine the corner's position along them."""
+FLAT = 0.2
+"""Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
+may lie far from it."""
 UNCHANGED = 1e-4
 """Relative change of a constant below which a material keeps its name: less than any measurement supports."""
 QUANTITIES = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
@@ -45,9 +46,9 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     """Corners [f, 3, 3] of a scene's faces, in metres, after its planes have moved.
 
     A corner takes the shortest way to all moved planes that meet there: on a single wall along its normal, at an edge
-    or a corner of a room to the new intersection: closed surfaces stay closed. Planes without a common point are met in
-    the least-squares sense; a mesh that only touches another one (a partition on the middle of a floor) does not
-    follow it.
+    or a corner of a room to the new intersection: closed surfaces stay closed. Planes without a common point are met by
+    area, the largest first, so that a wall stays flat at the corners of a small face that is almost parallel to it; a
+    mesh that only touches another one (a partition on the middle of a floor) does not follow it.
 
     Args:
         surfaces: surfaces of the scene.
@@ -69,13 +70,27 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     same = same.reshape(-1)
     pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
     bounds = np.searchsorted(pairs[:, 0], np.arange(len(first) + 1))
+    edges = surfaces.triangles[:, 1:] - surfaces.triangles[:, :1]
+    sizes = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    area = np.bincount(surfaces.plane, sizes, count).astype(float)
     way = np.zeros((len(first), 3))
     for corner, (low, high) in enumerate(pairwise(bounds)):
-        plane = pairs[low:high, 1]
+        plane = _determining(pairs[low:high, 1], area, normal)
         # Relative to the corner: the distance of faces from their planes within the tolerance stays.
         off = offset[plane] - surfaces.offset[plane] - (normal - surfaces.normal)[plane] @ corners[first[corner]]
-        way[corner] = np.linalg.lstsq(normal[plane], off, rcond=FLAT)[0]
+        way[corner] = np.linalg.lstsq(normal[plane], off)[0]
     return (corners + way[same]).reshape(-1, 3, 3)
+
+
+def _determining(planes: IntArray, area: FloatArray, normal: FloatArray) -> IntArray:
+    """Of planes at a corner, the largest first, those that are not parallel to what the larger ones span."""
+    kept, basis = list[int](), np.zeros((0, 3))
+    for plane in planes[np.argsort(-area[planes], kind="stable")]:
+        across = normal[plane] - basis.T @ (basis @ normal[plane])
+        if (size := float(np.linalg.norm(across))) > FLAT:
+            kept.append(plane)
+            basis = np.vstack([basis, across / size])
+    return np.array(kept)
 
 
 def check_materials(scene: Any) -> None:

@@ -1,0 +1,217 @@
+"""Faces of furniture that a scan could not see, supposed from those that it saw.
+
+Most furniture is made of boxes with upright sides. Two sides that meet in a corner, or a top and a side at its edge,
+state where the other sides and the top of a box are. Whether they are there, and of what, measurements have to tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations, count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import shapely
+
+from ..core.angles import FloatArray
+from .edit import read_surfaces
+from .folder import write_scene
+from .materials import FILE
+from .surfaces import Surface, bodies
+
+PREFIX = "hidden_"
+"""Names of supposed faces begin with it."""
+FLAT_M = 0.03
+"""Largest distance of a face's corners from its plane."""
+UPRIGHT = np.sin(np.radians(10))
+"""Sine of the largest lean of a side, and of the largest deviation from a right angle."""
+TOUCH_M = 0.15
+"""Largest gap where two faces of a box meet: an edge is seen to the point spacing of the scan."""
+SAME_M = 0.1
+"""Distance within which parallel faces are one: a cabinet's back at a wall is the wall."""
+COVERED = 0.3
+"""Share of a face, seen along its normal, from which on another one in its place stands for it."""
+LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0
+"""Sides of boxes."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A flat face.
+
+    Attributes:
+        centre: its centre [3], metres.
+        sides: its half sides [2, 3], metres, at right angles.
+    """
+
+    centre: FloatArray
+    sides: FloatArray
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal [3]."""
+        across = np.cross(*self.sides)
+        return np.asarray(across / np.linalg.norm(across))
+
+    @property
+    def corners(self) -> FloatArray:
+        """Corners [4, 3] in the order of the outline."""
+        return np.asarray(self.centre + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ self.sides)
+
+    def covered_by(self, other: Rectangle) -> bool:
+        """Whether another face lies in its place."""
+        if abs(self.normal @ other.normal) < np.sqrt(1 - UPRIGHT**2):
+            return False
+        if abs((other.centre - self.centre) @ self.normal) > SAME_M:
+            return False
+        length = np.linalg.norm(self.sides, axis=1)
+        flat = [
+            shapely.Polygon((face.corners - self.centre) @ (self.sides / length[:, None]).T) for face in (self, other)
+        ]
+        return bool(shapely.intersection(*flat).area > COVERED * flat[0].area)
+
+    def surface(self, name: str) -> Surface:
+        """The face as a surface."""
+        return Surface(name, "other", self.corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@dataclass(frozen=True)
+class Box:
+    """An upright box: corners of its base [4, 2] in the order of the outline, and lowest and highest z, metres."""
+
+    base: FloatArray
+    low: float
+    high: float
+
+    def faces(self) -> Iterator[Rectangle]:
+        """Its sides and its top."""
+        middle = np.append(self.base.mean(axis=0), (self.low + self.high) / 2)
+        along, across = (np.append((self.base[k + 1] - self.base[k]) / 2, 0.0) for k in (0, 1))
+        up = np.array([0.0, 0.0, (self.high - self.low) / 2])
+        for side, other in ((along, across), (across, along)):
+            yield Rectangle(middle - other, np.stack([side, up]))
+            yield Rectangle(middle + other, np.stack([side, up]))
+        yield Rectangle(middle + up, np.stack([along, across]))
+
+
+@contextmanager
+def with_hidden_faces(scene: str | Path) -> Iterator[str | Path]:
+    """A scene folder with its `hidden_faces` for as long as the context lasts; the scene itself where it has none.
+
+    They are of the material that its rules give furniture.
+
+    Args:
+        scene: see `wrf_mi.tracing.open_scene`.
+    """
+    if not (Path(scene) / FILE).is_file():
+        yield scene
+        return
+    surfaces, materials = read_surfaces(scene)
+    if not (faces := hidden_faces(surfaces)):
+        yield scene
+        return
+    stated = replace(materials, surfaces={**materials.surfaces, **{face.name: face.kind for face in faces}})
+    with TemporaryDirectory() as place:
+        folder = Path(place) / "scene"
+        yield write_scene(folder, [*surfaces, *faces], frame=f"that of {scene}", source=str(scene), materials=stated)
+
+
+def hidden_faces(surfaces: Sequence[Surface]) -> list[Surface]:
+    """Faces that complete boxes of furniture, none where other surfaces lie.
+
+    They are named ``hidden_01`` and so on, less the names that surfaces have.
+
+    Args:
+        surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
+    """
+    faces = {kind: list(_faces([one for one in surfaces if (one.kind == "other") == kind])) for kind in (True, False)}
+    known, found = [*faces[True], *faces[False]], list[Rectangle]()
+    for box in _boxes(faces[True]):
+        sizes = np.linalg.norm(box.base[1:3] - box.base[:2], axis=1)
+        if min(*sizes, box.high - box.low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
+            continue
+        found += [face for face in box.faces() if not any(map(face.covered_by, [*known, *found]))]
+    taken = {surface.name for surface in surfaces}
+    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in taken)
+    return [face.surface(name) for face, name in zip(found, names, strict=False)]
+
+
+def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
+    """Upright and level faces of surfaces."""
+    for surface in surfaces:
+        triangles = surface.vertices_m[surface.faces]
+        for members, _, _ in bodies(triangles):
+            corners = triangles[members].reshape(-1, 3)
+            centre = corners.mean(axis=0)
+            normal = np.linalg.svd(corners - centre, full_matrices=False)[2][2]
+            if np.abs((corners - centre) @ normal).max() > FLAT_M:
+                continue
+            if abs(normal[2]) < UPRIGHT:
+                along = np.array([-normal[1], normal[0], 0.0]) / np.hypot(*normal[:2])
+                axes = np.stack([along, [0.0, 0.0, 1.0]])
+            elif np.hypot(*normal[:2]) < UPRIGHT:
+                outline = shapely.get_coordinates(shapely.MultiPoint(corners[:, :2]).minimum_rotated_rectangle)
+                if len(outline) < 4:
+                    continue
+                side = np.append(outline[1] - outline[0], 0.0)
+                side /= np.linalg.norm(side)
+                axes = np.stack([side, np.array([-side[1], side[0], 0.0])])
+            else:
+                continue
+            flat = (corners - centre) @ axes.T
+            low, high = flat.min(axis=0), flat.max(axis=0)
+            if (high - low > FLAT_M).all():
+                yield Rectangle(centre + (low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes)
+
+
+def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
+    """Boxes of which two faces are known."""
+    sides = [face for face in faces if abs(face.normal[2]) < 0.5]
+    tops = [face for face in faces if abs(face.normal[2]) > 0.5]
+    for top in tops:
+        for side in sides:
+            if (low := _below(top, side)) is not None:
+                yield Box(top.corners[:, :2], low, float(top.centre[2]))
+    for one, other in combinations(sides, 2):
+        base = _corner(one, other)
+        if base is not None:
+            heights = np.array([face.centre[2] + s * face.sides[1, 2] for face in (one, other) for s in (-1, 1)])
+            yield Box(base, float(heights.min()), float(heights.max()))
+
+
+def _below(top: Rectangle, side: Rectangle) -> float | None:
+    """Lowest z of a side that stands below an edge of a top; None: it does not."""
+    for edge, half in ((top.sides[0], top.sides[1]), (top.sides[1], top.sides[0])):
+        for sign in (-1, 1):
+            middle, length = top.centre + sign * half, np.linalg.norm(edge)
+            away = side.centre + side.sides[1] - middle
+            along = edge / length
+            parallel = abs(side.normal @ along) < UPRIGHT
+            near = abs(away @ half) / np.linalg.norm(half) < TOUCH_M and abs(away[2]) < TOUCH_M
+            if parallel and near and abs(away @ along) < length:
+                return float(side.centre[2] - side.sides[1, 2])
+    return None
+
+
+def _corner(one: Rectangle, other: Rectangle) -> FloatArray | None:
+    """Base [4, 2] of the box of two sides that meet; None: they do not, or not at right angles."""
+    if abs(one.normal @ other.normal) > UPRIGHT:
+        return None
+    overlap = min(one.centre[2] + one.sides[1, 2], other.centre[2] + other.sides[1, 2]) - max(
+        one.centre[2] - one.sides[1, 2], other.centre[2] - other.sides[1, 2]
+    )
+    if overlap < LEAST_SIDE_M:
+        return None
+    a, b = one.sides[0, :2], other.sides[0, :2]
+    for s in (-1, 1):
+        for t in (-1, 1):
+            end, begin = one.centre[:2] + s * a, other.centre[:2] + t * b
+            if np.linalg.norm(end - begin) < TOUCH_M:
+                corner = (end + begin) / 2
+                across = -2 * t * (b - (b @ a) / (a @ a) * a)
+                along = -2 * s * a
+                return np.stack([corner, corner + along, corner + along + across, corner + across])
+    return None
