@@ -164,8 +164,7 @@ class Fit:
         if PLANES in parts or FRAME in parts:
             alone, common = PLANES in parts, FRAME in parts
             sd_m = float(np.hypot(options.shift_sd_m * alone, options.frame_sd_m * common))
-            sd_rad = float(np.hypot(options.tilt_sd_rad * alone, options.frame_sd_rad * common))
-            shifts = shift_choices(misfit, self.planes, sd_m, sd_rad, self.frequency_hz)
+            shifts = shift_choices(misfit, self.planes, sd_m, self.frequency_hz)
         if MATERIALS in parts:
             materials = material_choices(misfit, self.slabs, self.frequency_hz)
         return joint_choices(materials, shifts, misfit.plane_of_slab)
@@ -178,10 +177,8 @@ class Fit:
         mean, materials = known.mean.copy(), dict(known.materials)
         for choice in choices:
             # Least squares stay near the materials that were chosen, and near the planes as stated.
-            if choice.what in taken and choice.material:
-                chosen = choice.places[np.isinf(choice.deviation)]
-                mean[chosen] = vector[chosen]
-                materials[choice.what] = taken[choice.what]
+            if choice.what in taken and choice.material.size:
+                mean[choice.material], materials[choice.what] = vector[choice.material], taken[choice.what]
         return vector, _Known(known.stage, mean, materials), bool(taken)
 
     def _solved(self, vector: FloatArray, known: _Known) -> _Found:
@@ -190,7 +187,7 @@ class Fit:
     def _after_doubts(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
         """The best that is found where doubtful surfaces are chosen anew, until each reason for doubt has failed."""
         doubts = [(self._implausible, [choice for choice in choices if choice.joint])]
-        doubts.append((self._unsupported, [choice for choice in choices if choice.material]))
+        doubts.append((self._unsupported, [choice for choice in choices if choice.material.size]))
         doubts = [(doubt, those) for doubt, those in doubts if len(those) > 1]
         failed, number = 0, 0
         while failed < len(doubts) and number < RECONSIDERED:
@@ -220,14 +217,16 @@ class Fit:
         """
         most = np.sort(np.argsort(-doubt(choices, found.vector), kind="stable")[: (len(choices) + 1) // 2])
         doubted, start = [choices[number] for number in most], found.vector.copy()
+        mean, materials = found.known.mean.copy(), dict(found.known.materials)
         for choice in doubted:
             start[choice.places] = self._absent(choice, start)
-        vector, known, _ = self._chosen(found.known, start, doubted, what)
+            mean[choice.material], materials[choice.what] = start[choice.material], ABSENT
+        vector, known, _ = self._chosen(_Known(found.known.stage, mean, materials), start, doubted, what)
         return self._solved(vector, known)
 
     def _implausible(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
         """Squared distances of planes from where the others let expect them, in standard deviations."""
-        places = [choice.places[np.isfinite(choice.deviation)] for choice in choices]
+        places = [choice.plane for choice in choices]
         away = [(vector[place] - self.expected(vector, place)) / self.prior_deviation[place] for place in places]
         return np.square(away).sum(axis=1)
 
@@ -244,7 +243,7 @@ class Fit:
     def _absent(self, choice: Choice, vector: FloatArray) -> FloatArray:
         """Values of a choice whose surface is left out; its plane is where the others let expect it."""
         values = next(values for name, values in choice.values.items() if name.startswith(ABSENT))
-        return np.where(np.isinf(choice.deviation), values, self.expected(vector, choice.places))
+        return np.where(choice.of_plane, self.expected(vector, choice.places), values)
 
     def planes_cost(self, vector: FloatArray) -> float:
         """Cost of planes by their prior, in which they share the motions of the frame."""

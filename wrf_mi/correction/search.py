@@ -13,6 +13,7 @@ from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
@@ -61,23 +62,28 @@ class Choice:
         what: name for reports.
         places: entries of the vector that it has.
         values: alternatives by name, values of these entries; NaN: as the other planes let expect.
-        deviation: standard deviation of each entry's prior about zero; infinite: alternatives are equally likely.
+        of_plane: whether each entry is of a plane, not of a material.
     """
 
     what: str
     places: IntArray
     values: Mapping[str, FloatArray]
-    deviation: FloatArray
+    of_plane: NDArray[np.bool_]
 
     @property
-    def material(self) -> bool:
-        """Whether a material is chosen."""
-        return bool(np.isinf(self.deviation).any())
+    def material(self) -> IntArray:
+        """Entries of a material."""
+        return self.places[~self.of_plane]
+
+    @property
+    def plane(self) -> IntArray:
+        """Entries of a plane."""
+        return self.places[self.of_plane]
 
     @property
     def joint(self) -> bool:
         """Whether material and shift are chosen together."""
-        return self.material and bool(np.isfinite(self.deviation).any())
+        return bool(self.material.size and self.plane.size)
 
 
 def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list[Choice]:
@@ -91,8 +97,8 @@ def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list
         for name, (permittivity, conductivity, thickness) in known.items()
     }
     values[ABSENT] = ABSENT_VALUES
-    names, free = misfit.sides[0].slabs.names, np.full(len(QUANTITIES), np.inf)
-    return [Choice(names[slab], material_places(misfit, slab), values, free) for slab in hit]
+    names, of_plane = misfit.sides[0].slabs.names, np.zeros(len(QUANTITIES), bool)
+    return [Choice(names[slab], material_places(misfit, slab), values, of_plane) for slab in hit]
 
 
 def material_places(misfit: Misfit, slab: int) -> IntArray:
@@ -100,16 +106,16 @@ def material_places(misfit: Misfit, slab: int) -> IntArray:
     return np.array([misfit.parts[name_of(SURFACE, quantity)].start + slab for quantity in QUANTITIES])
 
 
-def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, sd_rad: float, frequency_hz: float) -> list[Choice]:
+def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, frequency_hz: float) -> list[Choice]:
     """Choices of shifts of planes, with the tilts of the frame, within `FARTHEST` standard deviations of the prior."""
     step_m = STEP * speed_of_light / frequency_hz
     most = int(FARTHEST * sd_m / step_m)
     shifts = step_m * np.arange(-most, most + 1)
     values = {f"{1e3 * shift:+.0f} mm": np.array([shift, np.nan, np.nan]) for shift in shifts}
     shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
-    deviation = np.array([sd_m, sd_rad, sd_rad])
     places = {plane: np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in hit}
-    return [Choice(f"plane {plane}", place, values, deviation) for plane, place in places.items()] if most else []
+    of_plane = np.ones(3, bool)
+    return [Choice(f"plane {plane}", place, values, of_plane) for plane, place in places.items()] if most else []
 
 
 def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int]) -> list[Choice]:
@@ -130,7 +136,7 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_o
                 for there, moved in shift.values.items()
                 for kind, values in material.values.items()
             },
-            np.concatenate([material.deviation, shift.deviation]),
+            np.concatenate([material.of_plane, shift.of_plane]),
         )
         for material, shift in pairs
     ]
@@ -203,7 +209,7 @@ def _best(
     if choice.joint:
         # A plane that is tilted, too, fits at the right shift only once its tilts do.
         by_shift = {one[1].rpartition(",")[2]: one for one in sorted(tried, key=first)[::-1]}
-        places = choice.places if trials is rules.misfit else choice.places[np.isfinite(choice.deviation)]
+        places = choice.places if trials is rules.misfit else choice.plane
         for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
             better = rules.refined(trials, there, places)
             tried.append((_cost(rules, trials, noise, better), name, better))

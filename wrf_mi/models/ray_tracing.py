@@ -12,6 +12,7 @@ Gaussians.
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -49,8 +50,12 @@ from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field
 from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 
+logger = logging.getLogger(__name__)
+
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
+WITHOUT_PATH = 0.05
+"""Share of measured values without a path from which on walls that nothing passes are suspected."""
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
 alone, a part of any size costs as much as a few hundred positions."""
@@ -232,11 +237,25 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     arrays = {name: np.asarray(value) for name, value in facts.items()}
     if task_of(record).in_decibel:
         known = split.all_train
-        offsets = fit_offsets(tracer.observe(traced)[:, known], record.observation[:, known])
+        reported = tracer.observe(traced)[:, known]
+        if not settings.transmission:
+            _warn_of_walls(reported, record.observation[:, known])
+        offsets = fit_offsets(reported, record.observation[:, known])
         arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
     fitted = FittedTracing(problem, arrays, path)
     fitted.train_seconds = 0.0
     return fitted
+
+
+def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None:
+    """Say that waves pass walls where many measured values have no path without."""
+    measured = np.isfinite(measured_dbm)
+    without = measured & ~np.isfinite(traced_dbm)
+    if without.sum() > WITHOUT_PATH * measured.sum():
+        share = without.sum() / measured.sum()
+        remedy = "waves pass walls with --set transmission=true (wrf-mi trace: --paths with transmission)"
+        text = f"no path arrives where %.0f %% of the training values were measured; {remedy}"
+        logger.warning(text, 100 * share)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
