@@ -186,11 +186,10 @@ class Fit:
 
     def _after_doubts(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
         """The best that is found where doubtful surfaces are chosen anew, until each reason for doubt has failed."""
-        doubts = [(self._implausible, [choice for choice in choices if choice.joint])]
-        doubts.append((self._unsupported, [choice for choice in choices if choice.material.size]))
-        doubts = [(doubt, those) for doubt, those in doubts if len(those) > 1]
+        moved = [choice for choice in choices if choice.joint]
+        doubts = [(self._implausible, moved), (self._unsupported, [one for one in choices if one.material.size])]
         failed, number = 0, 0
-        while failed < len(doubts) and number < RECONSIDERED:
+        while len(moved) > 1 and failed < len(doubts) and number < RECONSIDERED:
             doubt, those = doubts[number % len(doubts)]
             number += 1
             other = self._reconsidered(found, those, doubt, f"{title} in doubt, {number} of {RECONSIDERED}")
