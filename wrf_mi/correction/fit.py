@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -25,6 +26,7 @@ from .search import (
     ABSENT_VALUES,
     GAIN,
     Choice,
+    alternatives,
     choose,
     joint_choices,
     material_choices,
@@ -40,6 +42,10 @@ ROUND_STEPS = 3
 """Largest number of least-squares steps between choices."""
 RECONSIDERED = 4
 """Largest number of times that doubtful surfaces are chosen anew."""
+ELSEWHERE, MINIMA = 3, 2
+"""Number of the least plausible planes that are tried elsewhere, and of other minima of each."""
+APART = 1 / 8
+"""Least distance of minima, wavelengths: paths change by up to a quarter."""
 REFINING_STEPS = 3
 """Largest number of least-squares steps of one plane while shifts are compared."""
 
@@ -80,6 +86,7 @@ class Fit:
         self.taken: dict[tuple[str, str], str] = {}
         self.means: dict[str, FloatArray] = {}
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
+        self.apart_m = APART * speed_of_light / self.frequency_hz
         planes, slabs = misfit.counts()
         self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
         self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
@@ -196,6 +203,27 @@ class Fit:
             noise = found.solution.noise
             better = self._cost(other, noise) < self._cost(found, noise) - GAIN
             found, failed = (other, 0) if better else (found, failed + 1)
+        return self._with_planes_elsewhere(found, moved, title) if len(moved) > 1 else found
+
+    def _with_planes_elsewhere(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
+        """The best that is found with one of the least plausible planes in another minimum, all others adapted to it.
+
+        What the others have adapted to the wrong minimum makes the right one look worse until they may change.
+        """
+        doubtful = np.argsort(-self._implausible(choices, found.vector), kind="stable")[:ELSEWHERE]
+        for number, choice in enumerate([choices[place] for place in doubtful], 1):
+            self.on_stage(f"{title} in other minima, {number} of {len(doubtful)}", 0.0)
+            noise, trials = found.solution.noise, near(self.misfit, found.vector)
+            tried, shift = [found.vector[choice.plane[0]]], choice.plane[0]
+            for _, name, there in alternatives(self, trials, noise, choice, found.vector):
+                if len(tried) > MINIMA or np.abs(np.subtract(tried, there[shift])).min() < self.apart_m:
+                    continue
+                tried.append(there[shift])
+                mean, materials = found.known.mean.copy(), dict(found.known.materials)
+                mean[choice.material], materials[choice.what] = there[choice.material], name.partition(",")[0]
+                other = self._solved(there, _Known(found.known.stage, mean, materials))
+                if self._cost(other, noise) < self._cost(found, noise) - GAIN:
+                    found, noise = other, other.solution.noise
         return found
 
     def _cost(self, found: _Found, noise: Noise) -> float:

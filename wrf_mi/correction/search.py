@@ -182,7 +182,7 @@ def choose(
         noise, changed = Noise.of(trials.residual(vector)), False
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
-            least, name, there = _best(rules, trials, noise, choice, vector)
+            least, name, there = alternatives(rules, trials, noise, choice, vector)[0]
             if least < _cost(rules, trials, noise, vector) - GAIN:
                 taken[choice.what], vector, changed = name.partition(",")[0], there, True
                 if isinstance(trials, PathSum):
@@ -196,10 +196,10 @@ def _cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArr
     return noise.cost(trials.residual(vector)) + rules.planes_cost(vector)
 
 
-def _best(
+def alternatives(
     rules: Rules, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray
-) -> tuple[float, str, FloatArray]:
-    """Alternative of a choice with the least cost: cost, name and vector."""
+) -> list[tuple[float, str, FloatArray]]:
+    """Alternatives of a choice, those with the least cost first: cost, name and vector."""
     tried, expected = list[tuple[float, str, FloatArray]](), rules.expected(vector, choice.places)
     for name, values in choice.values.items():
         there = vector.copy()
@@ -213,4 +213,4 @@ def _best(
         for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
             better = rules.refined(trials, there, places)
             tried.append((_cost(rules, trials, noise, better), name, better))
-    return min(tried, key=first)
+    return sorted(tried, key=first)
