@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene, true_scene
 from wrf_mi_scenes import scenes
+from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
@@ -21,7 +22,9 @@ from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, defa
 from wrf_mi.correction.misfit import Misfit, search_options
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
+from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
+from wrf_mi.scene.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
@@ -29,6 +32,7 @@ from wrf_mi.tracing.corrected_scene import material_constants
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
 from wrf_mi.tracing.tracer import RayTracer
 
+ROOM = correction_rooms.surfaces
 PLANE_M, PLANE_RAD = 1e-3, 1e-3
 STEP = 2e-4
 """Of derivatives: in it, extremes of spectra do not change places."""
@@ -74,6 +78,43 @@ def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Pa
     felt = [not name.startswith("board") for name in slabs.names]
     ratio = material_constants(slabs, found.parameters)[felt, 0] / expected.permittivity[felt]
     assert np.mean(np.abs(ratio - 1) < PERMITTIVITY) >= 0.8
+
+
+def with_box(hidden: bool) -> list[Surface]:
+    """A low metal box on the floor of the room, whole or with the two sides of it that lie far from the receiver."""
+    low, high = np.array([2.0, 2.0, 0.03]), np.array([3.8, 3.4, 0.36])
+    sides = {"other_01": (0, high[0]), "other_02": (1, high[1])}
+    sides |= {"other_03": (0, low[0]), "other_04": (1, low[1]), "other_05": (2, high[2])} if hidden else {}
+    meshes = {
+        name: sheet(axis, at, *np.delete(np.stack([low, high], 1), axis, 0)) for name, (axis, at) in sides.items()
+    }
+    own = [Surface(name, "other", np.asarray(mesh.vertices), np.asarray(mesh.faces)) for name, mesh in meshes.items()]
+    return [*ROOM(), *own]
+
+
+def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its top, of metal, is found; faces that are found once belong to the stated scene of the next correction."""
+    true, seen = (TRUE_MATERIALS | {f"other_{k:02d}": "itu_metal" for k in range(1, 1 + n)} for n in (5, 2))
+    monkeypatch.setattr(correction_rooms, "surfaces", lambda: with_box(True))
+    record = channels(stated_scene(tmp_path / "true", true), 100)
+    monkeypatch.setattr(correction_rooms, "surfaces", lambda: with_box(False))
+    scene, split = stated_scene(tmp_path / "stated", seen), make_splits(record, "official")[0]
+    options = CorrectionOptions(parts=("materials", "hidden"), depth=2, rays=1 << 14, steps=3)
+    found = correct_scene(scene, record, split, options)
+    facts = write_page(found, tmp_path / "corrected")
+    present = {one["surface"]: one["conductivity"][1] for one in facts["materials"] if not one["absent"]}
+    tops = [surface for surface in read_surfaces(tmp_path / "corrected")[0] if surface.name.startswith("hidden")]
+    level = [surface.name for surface in tops if np.ptp(surface.vertices_m[:, 2]) < 1e-3]
+    assert len(level) == 1
+    assert present[level[0]] > 1e5
+    mean = {stage: np.nanmean(score) for stage, score in found.scores.items()}
+    assert mean[found.kept] > mean[""] + 3
+
+    again = correct_scene(tmp_path / "corrected", record, split, replace(options, steps=0))
+    assert not again.supposed & {surface.name for surface in tops}
+    kept = {one["surface"] for one in write_page(again, tmp_path / "again")["materials"] if not one["absent"]}
+    assert level[0] in kept
+    assert np.nanmean(again.scores[""]) > mean[""] + 3
 
 
 def test_walls_in_wrong_minima_hold_each_other_until_they_are_doubted(
@@ -167,7 +208,7 @@ def test_receivers_that_a_split_holds_out_are_not_used(tmp_path: Path) -> None:
 def test_new_receivers_decide_where_receivers_are_held_out(tmp_path: Path) -> None:
     """Half of the trained receivers judge, with the mean gain of the others."""
     true = stated_scene(tmp_path / "true", TRUE_MATERIALS)
-    one = strengths(channels(true, 80, seed=2))
+    one = strengths(channels(true, 80))
     places = [[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0], [2.0, 3.9, 1.5]]
     places.append([4.5, 0.6, 2.3])
     receivers = tuple(replace(one.receivers[0], name=f"rx{k}", position_m=np.array(p)) for k, p in enumerate(places))

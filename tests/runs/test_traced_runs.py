@@ -360,15 +360,16 @@ def test_tracer_predicts_free_space_loss(flat_folder: Path, room: Path) -> None:
 
 
 def test_walls_that_nothing_passes_are_suspected(
-    flat_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    flat_folder: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A wall through the room hides half of it; the log names the setting, unless it is given or nothing is hidden."""
     walls = "x,y\n0,0\n2.5,0\n2.5,4\n2.5,0\n5,0\n5,4\n0,4\n0,0\n"
     (tmp_path / "walls.csv").write_text(walls)
     divided = make_scene(tmp_path / "walls.csv", tmp_path / "divided", height_m=2.7).folder
-    for name, options in (("off", DIRECT), ("on", replace(DIRECT, transmission=True, max_depth=1))):
+    passed = replace(DIRECT, transmission=True, max_depth=1)
+    for name, scene, options in (("off", divided, DIRECT), ("on", divided, passed), ("open", room, DIRECT)):
         caplog.clear()
-        train(flat_folder, tmp_path / name, "ray-tracing", scene=divided, settings=options)
+        train(flat_folder, tmp_path / name, "ray-tracing", scene=scene, settings=options)
         assert ("transmission=true" in caplog.text) == (name == "off")
 
 

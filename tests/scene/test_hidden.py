@@ -94,14 +94,16 @@ def test_a_scene_folder_has_them_for_as_long_as_asked(tmp_path: Path) -> None:
     ]
     plain = write_scene(tmp_path / "plain", parts[:1], frame="f", source="s")
     folder = write_scene(tmp_path / "scene", parts, frame="f", source="s")
-    with with_hidden_faces(folder) as scene:
+    with with_hidden_faces(folder) as (scene, names):
+        assert names == {"hidden_01", "hidden_02", "hidden_03"}
         surfaces, materials = read_surfaces(scene)
-        assert [one.name for one in surfaces][3:] == ["hidden_01", "hidden_02", "hidden_03"]
+        assert [one.name for one in surfaces][3:] == sorted(names)
         assert materials.of("hidden_01", "other") == materials.of("other_0", "other")
     assert not Path(scene).exists()
     for other in (plain, "box", tmp_path / "scene" / "meshes" / "floor.ply"):
-        with with_hidden_faces(other) as scene:
+        with with_hidden_faces(other) as (scene, names):
             assert scene == other
+            assert not names
 
 
 @pytest.mark.parametrize("corners", [np.zeros((4, 3)), np.array([[0, 0, 0], [1, 0, 0], [1, 1, 1], [0, 1, 0.0]])])

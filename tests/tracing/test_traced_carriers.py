@@ -52,10 +52,6 @@ def response(field: TracedField, parameters: dict[str, Any]) -> np.ndarray:
     return (gain * phase).reshape(len(field), -1).sum(axis=1)
 
 
-ARRANGING = 20
-"""Number of operations up to which kernels only arrange data; Dr.Jit takes their inputs in one order or another."""
-
-
 def test_a_trace_at_another_carrier_compiles_nothing_anew(xml: Path) -> None:
     """Carrier and constants of materials are no literals of the kernels."""
 
@@ -65,8 +61,7 @@ def test_a_trace_at_another_carrier_compiles_nothing_anew(xml: Path) -> None:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             trace_paths(scene, transmitters(5), receiver(), OPTIONS)
-            found = dr.kernel_history([dr.KernelType.JIT])
-        return {one["hash"] for one in found if one["operation_count"] > ARRANGING}
+            return {one["hash"] for one in dr.kernel_history([dr.KernelType.JIT])}
 
     assert kernels(LOW_HZ) == kernels(MIDDLE_HZ) == kernels(HIGH_HZ)
 

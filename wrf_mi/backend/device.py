@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 PACKET = 64
 """Readable numbers after the end of an array that Dr.Jit wraps: no packet of LLVM is longer."""
+ALIGNED_BYTES = 64
+"""Packets begin at multiples of their size: Dr.Jit copies unaligned columns by other kernels."""
 HOST: dict[Any, type[np.generic]] = {
     dr.VarType.Float32: np.float32,
     dr.VarType.Float64: np.float64,
@@ -46,9 +48,11 @@ def columns_on_device(columns: Iterable[ArrayLike], kind: Any) -> list[Any]:
 
 
 def with_room(values: ArrayLike, kind: type[np.generic]) -> NDArray[Any]:
-    """A flat copy of all values, with room for the rest of a packet after its end."""
-    given = np.asarray(values)
-    room: NDArray[Any] = np.zeros(given.size + PACKET, kind)[: given.size]
+    """A flat copy of all values, with room for the rest of a packet after its end, at the start of a cache line."""
+    given, size = np.asarray(values), np.dtype(kind).itemsize
+    memory = np.zeros((given.size + PACKET) * size + ALIGNED_BYTES, np.uint8)
+    first = -memory.ctypes.data % ALIGNED_BYTES
+    room: NDArray[Any] = memory[first : first + given.size * size].view(kind)
     np.copyto(room.reshape(given.shape), given, casting="unsafe")
     return room
 

@@ -57,6 +57,7 @@ class Correction:
         materials: material that each changed surface took first, by its name.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
+        supposed: names of objects that the stated scene lacks (`wrf_mi.scene.hidden`).
         options: options.
         seconds: duration.
         facts: sizes for the page.
@@ -72,6 +73,7 @@ class Correction:
     materials: Mapping[str, str]
     scores: Mapping[str, FloatArray]
     kinds: Mapping[str, Kind]
+    supposed: frozenset[str]
     options: CorrectionOptions
     seconds: float = 0.0
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -119,10 +121,11 @@ def correct_scene(
         options = replace(options, parts=(*options.parts, GAIN))
     split = _at_most(split, options.rows)
     carrier_hz = scene_carrier(record, split.all_train)
-    with with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext(scene) as supposed:
-        opened = open_scene(supposed, carrier_hz, material=material)
-        if supposed == scene:
-            options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
+    completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, frozenset[str]()))
+    with completed as (place, supposed):
+        opened = open_scene(place, carrier_hz, material=material)
+    if not supposed:
+        options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
     check_materials(opened)
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
@@ -136,7 +139,7 @@ def correct_scene(
     if not any(side.exists.any() for side in first.sides):
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
     others = misfit(parts.held, parts.held_rows)
-    trial = Fit(first, options, on_stage)
+    trial = Fit(first, options, on_stage, supposed)
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
     chosen = trial.all_parts()
@@ -145,7 +148,7 @@ def correct_scene(
     judged = {key: parts.units(score) for key, score in scores.items()}
     kept = _kept(judged, task.higher_is_better, bool(parts.out))
     whole = misfit(record, split.all_train)
-    final = Fit(whole, options, on_stage)
+    final = Fit(whole, options, on_stage, supposed)
     vector, deviation = final.stated, np.zeros(len(final.stated))
     if kept:
         solution = final.solve(kept, chosen[kept].vector, trial.means[kept])
@@ -163,6 +166,7 @@ def correct_scene(
         {what: material for (stage, what), material in trial.taken.items() if stage == kept},
         scores,
         kinds,
+        supposed,
         options,
         time.perf_counter() - begun,
         {

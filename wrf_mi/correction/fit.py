@@ -13,7 +13,6 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..scene.hidden import PREFIX as HIDDEN
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .frame import rigid_motions
@@ -80,8 +79,16 @@ class _Found(NamedTuple):
 class Fit:
     """Choice and least squares over the rows of one misfit."""
 
-    def __init__(self, misfit: Misfit, options: CorrectionOptions, on_stage: OnStage) -> None:
+    def __init__(
+        self,
+        misfit: Misfit,
+        options: CorrectionOptions,
+        on_stage: OnStage,
+        supposed: frozenset[str] = frozenset(),
+    ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
+        names = misfit.sides[0].slabs.names
+        self.supposed = {name: slab for slab, name in enumerate(names) if name.partition("/")[0] in supposed}
         self.stated = misfit.start.copy()
         self.taken: dict[tuple[str, str], str] = {}
         self.means: dict[str, FloatArray] = {}
@@ -94,8 +101,7 @@ class Fit:
         self.prior_deviation = np.ones(len(self.stated))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)
-        supposed = [slab for slab, name in enumerate(misfit.sides[0].slabs.names) if name.startswith(HIDDEN)]
-        for slab in supposed if MATERIALS in options.parts else ():
+        for slab in self.supposed.values():
             self.stated[material_places(misfit, slab)] = ABSENT_VALUES
         self._match_gains()
 
@@ -151,8 +157,9 @@ class Fit:
     def _alternate(self, stage: str) -> Solution:
         """Rounds of choices and least squares, until a round changes no choice; then doubtful surfaces once more."""
         choices, title = self._choices(stage), f"{stage.replace('+', ', ')}: choices"
-        supposed = {name: ABSENT for name in self.misfit.sides[0].slabs.names if name.startswith(HIDDEN)}
-        vector, known, _ = self._chosen(_Known(stage, self.stated, supposed), self.stated, choices, f"{title}, round 1")
+        vector, known, _ = self._chosen(
+            _Known(stage, self.stated, dict.fromkeys(self.supposed, ABSENT)), self.stated, choices, f"{title}, round 1"
+        )
         found = self._solved(vector, known)
         for round_ in range(2, ROUNDS + 1):
             vector, known, changed = self._chosen(found.known, found.vector, choices, f"{title}, round {round_}")
@@ -174,7 +181,7 @@ class Fit:
             shifts = shift_choices(misfit, self.planes, sd_m, self.frequency_hz)
         if MATERIALS in parts:
             materials = material_choices(misfit, self.slabs, self.frequency_hz)
-        return joint_choices(materials, shifts, misfit.plane_of_slab)
+        return joint_choices(materials, shifts, misfit.plane_of_slab, self.supposed)
 
     def _chosen(
         self, known: _Known, start: FloatArray, choices: Sequence[Choice], what: str
@@ -223,7 +230,8 @@ class Fit:
                 mean[choice.material], materials[choice.what] = there[choice.material], name.partition(",")[0]
                 other = self._solved(there, _Known(found.known.stage, mean, materials))
                 if self._cost(other, noise) < self._cost(found, noise) - GAIN:
-                    found, noise = other, other.solution.noise
+                    found = other
+                    break  # the other alternatives are beside what was found before
         return found
 
     def _cost(self, found: _Found, noise: Noise) -> float:

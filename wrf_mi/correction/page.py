@@ -25,7 +25,6 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_figure
-from ..scene.hidden import PREFIX as HIDDEN
 from ..tasks import task_of
 from ..tracing.corrected_scene import (
     material_constants,
@@ -160,7 +159,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
         places = [part.start + index for part in parts if part is not None]
         free = bool(places) and places[0] in correction.free
         sd = correction.deviation[places] if free else None
-        taken, supposed = correction.materials.get(name), name.startswith(HIDDEN)
+        taken, supposed = correction.materials.get(name), name.partition("/")[0] in correction.supposed
         left_out = taken == ABSENT and free and bool(after[index, 0] < 1.1)
         found.append(
             {

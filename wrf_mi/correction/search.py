@@ -7,7 +7,7 @@ is kept where it raises the likelihood by more than `GAIN`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Protocol
@@ -18,7 +18,6 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..scene.hidden import PREFIX as HIDDEN
 from ..tracing.material_parameters import (
     EXPONENT,
     LEAST_CONDUCTIVITY,
@@ -118,7 +117,9 @@ def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, frequency_hz: floa
     return [Choice(f"plane {plane}", place, values, of_plane) for plane, place in places.items()] if most else []
 
 
-def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int]) -> list[Choice]:
+def joint_choices(
+    materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int], supposed: Collection[str]
+) -> list[Choice]:
     """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
     for supposed faces, and all other choices by themselves.
 
@@ -126,7 +127,7 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], plane_o
     """
     with_material = {f"plane {plane_of[one.what]}": one for one in reversed(materials)}
     every = [(with_material[one.what], one) for one in shifts if one.what in with_material]
-    pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what.startswith(HIDDEN)]
+    pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what in supposed]
     joined = [
         Choice(
             material.what,

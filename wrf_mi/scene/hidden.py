@@ -98,25 +98,26 @@ class Box:
 
 
 @contextmanager
-def with_hidden_faces(scene: str | Path) -> Iterator[str | Path]:
-    """A scene folder with its `hidden_faces` for as long as the context lasts; the scene itself where it has none.
+def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, frozenset[str]]]:
+    """A scene folder with its `hidden_faces` for as long as the context lasts, and their names.
 
-    They are of the material that its rules give furniture.
+    They are of the material that its rules give furniture. The scene itself where it has none.
 
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
     """
     if not (Path(scene) / FILE).is_file():
-        yield scene
+        yield scene, frozenset()
         return
     surfaces, materials = read_surfaces(scene)
     if not (faces := hidden_faces(surfaces)):
-        yield scene
+        yield scene, frozenset()
         return
     stated = replace(materials, surfaces={**materials.surfaces, **{face.name: face.kind for face in faces}})
     with TemporaryDirectory() as place:
         folder = Path(place) / "scene"
-        yield write_scene(folder, [*surfaces, *faces], frame=f"that of {scene}", source=str(scene), materials=stated)
+        write_scene(folder, [*surfaces, *faces], frame=f"that of {scene}", source=str(scene), materials=stated)
+        yield folder, frozenset(face.name for face in faces)
 
 
 def hidden_faces(surfaces: Sequence[Surface]) -> list[Surface]:
@@ -127,9 +128,10 @@ def hidden_faces(surfaces: Sequence[Surface]) -> list[Surface]:
     Args:
         surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
     """
-    faces = {kind: list(_faces([one for one in surfaces if (one.kind == "other") == kind])) for kind in (True, False)}
-    known, found = [*faces[True], *faces[False]], list[Rectangle]()
-    for box in _boxes(faces[True]):
+    furniture = list(_faces([one for one in surfaces if one.kind == "other"]))
+    known = [*furniture, *_faces([one for one in surfaces if one.kind != "other"])]
+    found = list[Rectangle]()
+    for box in _boxes(furniture):
         sizes = np.linalg.norm(box.base[1:3] - box.base[:2], axis=1)
         if min(*sizes, box.high - box.low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
             continue

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
 
@@ -70,9 +71,7 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     same = same.reshape(-1)
     pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
     bounds = np.searchsorted(pairs[:, 0], np.arange(len(first) + 1))
-    edges = surfaces.triangles[:, 1:] - surfaces.triangles[:, :1]
-    sizes = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    area = np.bincount(surfaces.plane, sizes, count).astype(float)
+    area = np.bincount(surfaces.plane, trimesh.triangles.area(surfaces.triangles), count).astype(float)
     way = np.zeros((len(first), 3))
     for corner, (low, high) in enumerate(pairwise(bounds)):
         plane = _determining(pairs[low:high, 1], area, normal)
