@@ -1,7 +1,8 @@
 """Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-Paths are found once with the stated scene; choice (`wrf_mi.correction.search`) and least squares
-(`wrf_mi.correction.least_squares`) are done in rounds on training rows, and what is kept is decided on others of them.
+Paths are found with the stated scene; choice (`wrf_mi.correction.search`) and least squares
+(`wrf_mi.correction.least_squares`) are done in rounds on training rows, once more with the paths of the scene that they
+found where planes have moved. What is kept is decided on other training rows.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
 from ..tracing.corrected_scene import check_materials
 from ..tracing.instrument_parameters import gain_name
+from ..tracing.moved_scene import moved_search
 from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
-from .fit import LEAST_PATHS, Fit
+from .fit import LEAST_PATHS, Fit, Found
 from .misfit import Misfit, search_options
-from .options import DEFAULTS, GAIN, HIDDEN, STRENGTHS, CorrectionOptions, OnStage
+from .options import DEFAULTS, FRAME, GAIN, HIDDEN, PLANES, STRENGTHS, CorrectionOptions, OnStage
 
 NONE = np.zeros((0, 2), np.int64)
 """No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
@@ -55,6 +57,7 @@ class Correction:
         prior: standard deviations before the correction [p].
         free: indices of the changed entries.
         materials: material that each changed surface took first, by its name.
+        absent: slabs of surfaces that are left out.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
         supposed: names of objects that the stated scene lacks (`wrf_mi.scene.hidden`).
@@ -71,6 +74,7 @@ class Correction:
     prior: FloatArray
     free: IntArray
     materials: Mapping[str, str]
+    absent: frozenset[int]
     scores: Mapping[str, FloatArray]
     kinds: Mapping[str, Kind]
     supposed: frozenset[str]
@@ -123,7 +127,7 @@ def correct_scene(
     carrier_hz = scene_carrier(record, split.all_train)
     completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, frozenset[str]()))
     with completed as (place, supposed):
-        opened = open_scene(place, carrier_hz, material=material)
+        opened, copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
     if not supposed:
         options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
     check_materials(opened)
@@ -131,39 +135,52 @@ def correct_scene(
     prepared.check(record.tx_pos_m, record.receivers)
     parts = _parts(record, split)
 
-    def misfit(record: Record, rows: IntArray) -> Misfit:
+    def fit_of(record: Record, rows: IntArray, found: Found | None = None) -> Fit:
+        """Fit to paths of the stated scene, or to those of a scene whose planes have moved."""
         on_stage("tracing", 0.0)
-        return Misfit(record, rows, opened, search_options(options), options.changes, prepared)
+        searched = None
+        if found and _moves(found.known.stage):
+            absent = trial.absent(found.known, found.vector)
+            searched = moved_search(copy, prepared.surfaces, trial.misfit.named(found.vector), absent)
+        how = search_options(options), options.changes, prepared, searched
+        return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed)
 
-    first = misfit(parts.known, parts.known_rows)
-    if not any(side.exists.any() for side in first.sides):
+    trial = fit_of(parts.known, parts.known_rows)
+    if not any(side.exists.any() for side in trial.misfit.sides):
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
-    others = misfit(parts.held, parts.held_rows)
-    trial = Fit(first, options, on_stage, supposed)
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
     chosen = trial.all_parts()
-    stages = {"": trial.stated, **{key: found.vector for key, found in chosen.items()}}
-    scores = {key: others.scores(parts.with_mean_gain(vector, first)) for key, vector in stages.items()}
+    stated = fit_of(parts.held, parts.held_rows).misfit
+    scores = {"": stated.scores(parts.with_mean_gain(trial.stated, trial.misfit))}
+    for stage, found in chosen.items():
+        others = stated
+        if _moves(stage):
+            chosen[stage] = found = fit_of(parts.known, parts.known_rows, found).continued(found)
+            others = fit_of(parts.held, parts.held_rows, found).misfit
+        scores[stage] = others.scores(parts.with_mean_gain(found.vector, trial.misfit))
     judged = {key: parts.units(score) for key, score in scores.items()}
     kept = _kept(judged, task.higher_is_better, bool(parts.out))
-    whole = misfit(record, split.all_train)
-    final = Fit(whole, options, on_stage, supposed)
-    vector, deviation = final.stated, np.zeros(len(final.stated))
-    if kept:
-        solution = final.solve(kept, chosen[kept].vector, trial.means[kept])
-        vector = solution.vector
-        deviation[final.free(kept)] = np.sqrt(np.diag(solution.covariance))
+    best = chosen[kept] if kept else None
+    final = fit_of(record, split.all_train, best)
+    vector, deviation, free = final.stated, np.zeros(len(final.stated)), np.zeros(0, np.int64)
+    materials, absent = dict[str, str](), frozenset(final.supposed.values())
+    if best:
+        solution = final.solve(kept, best.vector, best.known.mean)
+        vector, free = solution.vector, final.free(kept)
+        deviation[free] = np.sqrt(np.diag(solution.covariance))
+        materials, absent = dict(best.known.materials), final.absent(best.known, vector)
     kinds = _kinds(scene)
     return Correction(
         opened,
-        whole,
+        final.misfit,
         kept,
         vector,
         deviation,
         final.prior_deviation,
-        final.free(kept) if kept else np.zeros(0, np.int64),
-        {what: material for (stage, what), material in trial.taken.items() if stage == kept},
+        free,
+        materials,
+        absent,
         scores,
         kinds,
         supposed,
@@ -173,9 +190,14 @@ def correct_scene(
             "rows": len(split.all_train),
             "held_out": len(parts.held_rows),
             "held_out_receivers": list(parts.out),
-            "paths": sum(int(s.exists.sum()) for s in whole.sides),
+            "paths": sum(int(s.exists.sum()) for s in final.misfit.sides),
         },
     )
+
+
+def _moves(stage: str) -> bool:
+    """Whether a stage moves planes, so that other paths may exist."""
+    return not {PLANES, FRAME}.isdisjoint(stage.split("+"))
 
 
 class _Parts(NamedTuple):

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
+from .doubts import Doubts
 from .frame import rigid_motions
 from .least_squares import Noise, Prior, Solution, solve
 from .misfit import Misfit
@@ -23,9 +23,7 @@ from .path_sum import PathSum, near
 from .search import (
     ABSENT,
     ABSENT_VALUES,
-    GAIN,
     Choice,
-    alternatives,
     choose,
     joint_choices,
     material_choices,
@@ -39,18 +37,14 @@ ROUNDS = 3
 """Largest number of rounds: planes that are off hide the right material, and conversely."""
 ROUND_STEPS = 3
 """Largest number of least-squares steps between choices."""
-RECONSIDERED = 4
-"""Largest number of times that doubtful surfaces are chosen anew."""
-ELSEWHERE, MINIMA = 3, 2
-"""Number of the least plausible planes that are tried elsewhere, and of other minima of each."""
-APART = 1 / 8
-"""Least distance of minima, wavelengths: paths change by up to a quarter."""
+STILL_ABSENT = 0.1
+"""Susceptibility up to which a surface that was chosen to be absent is, after least squares."""
 REFINING_STEPS = 3
 """Largest number of least-squares steps of one plane while shifts are compared."""
 
 
 @dataclass(frozen=True)
-class _Known:
+class Known:
     """Choices of a stage.
 
     Attributes:
@@ -63,17 +57,27 @@ class _Known:
     mean: FloatArray
     materials: Mapping[str, str]
 
+    def with_material(self, choice: Choice, material: str, vector: FloatArray) -> Known:
+        """With the material of a choice, whose constants a vector [p] has; least squares stay near them."""
+        mean = self.mean.copy()
+        mean[choice.material] = vector[choice.material]
+        return Known(self.stage, mean, {**self.materials, choice.what: material})
 
-class _Found(NamedTuple):
+
+class Found(NamedTuple):
     """Least squares and the choices before."""
 
     solution: Solution
-    known: _Known
+    known: Known
 
     @property
     def vector(self) -> FloatArray:
         """Parameters [p]."""
         return self.solution.vector
+
+
+def _title(stage: str) -> str:
+    return f"{stage.replace('+', ', ')}: choices"
 
 
 class Fit:
@@ -90,10 +94,7 @@ class Fit:
         names = misfit.sides[0].slabs.names
         self.supposed = {name: slab for slab, name in enumerate(names) if name.partition("/")[0] in supposed}
         self.stated = misfit.start.copy()
-        self.taken: dict[tuple[str, str], str] = {}
-        self.means: dict[str, FloatArray] = {}
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
-        self.apart_m = APART * speed_of_light / self.frequency_hz
         planes, slabs = misfit.counts()
         self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
         self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
@@ -146,30 +147,45 @@ class Fit:
             covariance[np.ix_(places, places)] += (motions * deviation**2) @ motions.T
         return Prior(mean[free], np.linalg.inv(covariance[np.ix_(free, free)]))
 
-    def all_parts(self) -> dict[str, Solution]:
-        """Solutions by the names of their parts: with materials alone, and with planes."""
+    def absent(self, known: Known, vector: FloatArray) -> frozenset[int]:
+        """Slabs of surfaces that are left out of the scene of a vector [p]."""
+        names = self.misfit.sides[0].slabs.names
+        taken = [slab for slab, name in enumerate(names) if known.materials.get(name) == ABSENT]
+        thin = {slab for slab in taken if vector[material_places(self.misfit, slab)[0]] < np.log(STILL_ABSENT)}
+        return frozenset(thin.union(set(self.supposed.values()).intersection(taken)))
+
+    def all_parts(self) -> dict[str, Found]:
+        """Results by the names of their parts: with materials alone, and with planes."""
         parts, frame = self.options.parts, [part for part in (PLANES, FRAME) if part in self.options.parts]
         stages = ["+".join(parts)]
         if MATERIALS in parts and frame:
             stages.insert(0, "+".join(part for part in parts if part not in frame))
         return {stage: self._alternate(stage) for stage in stages}
 
-    def _alternate(self, stage: str) -> Solution:
+    def _alternate(self, stage: str) -> Found:
         """Rounds of choices and least squares, until a round changes no choice; then doubtful surfaces once more."""
-        choices, title = self._choices(stage), f"{stage.replace('+', ', ')}: choices"
-        vector, known, _ = self._chosen(
-            _Known(stage, self.stated, dict.fromkeys(self.supposed, ABSENT)), self.stated, choices, f"{title}, round 1"
-        )
-        found = self._solved(vector, known)
-        for round_ in range(2, ROUNDS + 1):
-            vector, known, changed = self._chosen(found.known, found.vector, choices, f"{title}, round {round_}")
+        choices, title = self._choices(stage), _title(stage)
+        known = Known(stage, self.stated, dict.fromkeys(self.supposed, ABSENT))
+        vector, known, _ = self.chosen(known, self.stated, choices, f"{title}, round 1")
+        found = self._rounds(self.solved(vector, known), choices, range(2, ROUNDS + 1))
+        return Doubts(self, choices, title).settled(found)
+
+    def _rounds(self, found: Found, choices: Sequence[Choice], numbers: Iterable[int]) -> Found:
+        """Rounds of choices and least squares, until a round changes no choice."""
+        for number in numbers:
+            what = f"{_title(found.known.stage)}, round {number}"
+            vector, known, changed = self.chosen(found.known, found.vector, choices, what)
             if not changed:
                 break
-            found = self._solved(vector, known)
-        found = self._after_doubts(found, choices, title)
-        self.means[stage] = found.known.mean
-        self.taken |= {(stage, surface): material for surface, material in found.known.materials.items()}
-        return found.solution
+            found = self.solved(vector, known)
+        return found
+
+    def continued(self, found: Found) -> Found:
+        """Rounds of choices and least squares from what a fit to other paths has found."""
+        choices, stage = self._choices(found.known.stage), found.known.stage
+        found = Found(self.solve(stage, found.vector, found.known.mean), found.known)
+        found = self._rounds(found, choices, range(1, ROUNDS + 1))
+        return Doubts(self, choices, _title(stage)).with_other_materials(found)
 
     def _choices(self, stage: str) -> list[Choice]:
         """Choices of a stage."""
@@ -183,102 +199,25 @@ class Fit:
             materials = material_choices(misfit, self.slabs, self.frequency_hz)
         return joint_choices(materials, shifts, misfit.plane_of_slab, self.supposed)
 
-    def _chosen(
-        self, known: _Known, start: FloatArray, choices: Sequence[Choice], what: str
-    ) -> tuple[FloatArray, _Known, bool]:
+    def chosen(
+        self, known: Known, start: FloatArray, choices: Sequence[Choice], what: str
+    ) -> tuple[FloatArray, Known, bool]:
         """Vector and materials that choices find from ``start``, and whether one has changed."""
         vector, taken = choose(self, start, choices, self._progress(what))
-        mean, materials = known.mean.copy(), dict(known.materials)
         for choice in choices:
-            # Least squares stay near the materials that were chosen, and near the planes as stated.
             if choice.what in taken and choice.material.size:
-                mean[choice.material], materials[choice.what] = vector[choice.material], taken[choice.what]
-        return vector, _Known(known.stage, mean, materials), bool(taken)
+                known = known.with_material(choice, taken[choice.what], vector)
+        return vector, known, bool(taken)
 
-    def _solved(self, vector: FloatArray, known: _Known) -> _Found:
-        return _Found(self.solve(known.stage, vector, known.mean, ROUND_STEPS), known)
+    def solved(self, vector: FloatArray, known: Known) -> Found:
+        """A few least-squares steps from a vector [p]."""
+        return Found(self.solve(known.stage, vector, known.mean, ROUND_STEPS), known)
 
-    def _after_doubts(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
-        """The best that is found where doubtful surfaces are chosen anew, until each reason for doubt has failed."""
-        moved = [choice for choice in choices if choice.joint]
-        doubts = [(self._implausible, moved), (self._unsupported, [one for one in choices if one.material.size])]
-        failed, number = 0, 0
-        while len(moved) > 1 and failed < len(doubts) and number < RECONSIDERED:
-            doubt, those = doubts[number % len(doubts)]
-            number += 1
-            other = self._reconsidered(found, those, doubt, f"{title} in doubt, {number} of {RECONSIDERED}")
-            noise = found.solution.noise
-            better = self._cost(other, noise) < self._cost(found, noise) - GAIN
-            found, failed = (other, 0) if better else (found, failed + 1)
-        return self._with_planes_elsewhere(found, moved, title) if len(moved) > 1 else found
-
-    def _with_planes_elsewhere(self, found: _Found, choices: Sequence[Choice], title: str) -> _Found:
-        """The best that is found with one of the least plausible planes in another minimum, all others adapted to it.
-
-        What the others have adapted to the wrong minimum makes the right one look worse until they may change.
-        """
-        doubtful = np.argsort(-self._implausible(choices, found.vector), kind="stable")[:ELSEWHERE]
-        for number, choice in enumerate([choices[place] for place in doubtful], 1):
-            self.on_stage(f"{title} in other minima, {number} of {len(doubtful)}", 0.0)
-            noise, trials = found.solution.noise, near(self.misfit, found.vector)
-            tried, shift = [found.vector[choice.plane[0]]], choice.plane[0]
-            for _, name, there in alternatives(self, trials, noise, choice, found.vector):
-                if len(tried) > MINIMA or np.abs(np.subtract(tried, there[shift])).min() < self.apart_m:
-                    continue
-                tried.append(there[shift])
-                mean, materials = found.known.mean.copy(), dict(found.known.materials)
-                mean[choice.material], materials[choice.what] = there[choice.material], name.partition(",")[0]
-                other = self._solved(there, _Known(found.known.stage, mean, materials))
-                if self._cost(other, noise) < self._cost(found, noise) - GAIN:
-                    found = other
-                    break  # the other alternatives are beside what was found before
-        return found
-
-    def _cost(self, found: _Found, noise: Noise) -> float:
+    def cost(self, found: Found, noise: Noise) -> float:
+        """Negative logarithm of likelihood and prior, without its constant."""
         free = self.free(found.known.stage)
         prior = self.prior(found.known.mean, free)
         return noise.cost(self.misfit.residual(found.vector)) + prior.cost(found.vector[free])
-
-    def _reconsidered(
-        self,
-        found: _Found,
-        choices: Sequence[Choice],
-        doubt: Callable[[Sequence[Choice], FloatArray], FloatArray],
-        what: str,
-    ) -> _Found:
-        """The half of the surfaces that is doubted most, chosen anew beside the others.
-
-        They were chosen while others were still wrong, and wrong ones hold each other where they are.
-        """
-        most = np.sort(np.argsort(-doubt(choices, found.vector), kind="stable")[: (len(choices) + 1) // 2])
-        doubted, start = [choices[number] for number in most], found.vector.copy()
-        mean, materials = found.known.mean.copy(), dict(found.known.materials)
-        for choice in doubted:
-            start[choice.places] = self._absent(choice, start)
-            mean[choice.material], materials[choice.what] = start[choice.material], ABSENT
-        vector, known, _ = self._chosen(_Known(found.known.stage, mean, materials), start, doubted, what)
-        return self._solved(vector, known)
-
-    def _implausible(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
-        """Squared distances of planes from where the others let expect them, in standard deviations."""
-        places = [choice.plane for choice in choices]
-        away = [(vector[place] - self.expected(vector, place)) / self.prior_deviation[place] for place in places]
-        return np.square(away).sum(axis=1)
-
-    def _unsupported(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
-        """Log-likelihoods without each surface, the higher the less observations tell of it."""
-        trials, found = near(self.misfit, vector), np.zeros(len(choices))
-        noise = Noise.of(trials.residual(vector))
-        for number, choice in enumerate(choices):
-            there = vector.copy()
-            there[choice.places] = self._absent(choice, vector)
-            found[number] = -noise.cost(trials.residual(there))
-        return found
-
-    def _absent(self, choice: Choice, vector: FloatArray) -> FloatArray:
-        """Values of a choice whose surface is left out; its plane is where the others let expect it."""
-        values = next(values for name, values in choice.values.items() if name.startswith(ABSENT))
-        return np.where(choice.of_plane, self.expected(vector, choice.places), values)
 
     def planes_cost(self, vector: FloatArray) -> float:
         """Cost of planes by their prior, in which they share the motions of the frame."""

@@ -29,6 +29,7 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
 from ..tracing.instrument_parameters import instrument_parameters
+from ..tracing.moved_scene import MovedSearch
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
@@ -52,6 +53,7 @@ class Misfit:
         options: options of the traced side.
         wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
         prepared: shared state of the scene.
+        searched: where paths are searched; None: in the scene as stated.
 
     Attributes:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
@@ -73,6 +75,7 @@ class Misfit:
         options: TracedOptions,
         wanted: Callable[[str], bool],
         prepared: Prepared | None = None,
+        searched: MovedSearch | None = None,
     ) -> None:
         self.record, self.rows, task = record, rows, task_of(record)
         placed = placed_receivers(record, by_uplink=False)
@@ -94,7 +97,8 @@ class Misfit:
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in zip(seen, self.receivers, strict=True):
-            self.sides += traced_fields(scene, record.tx_pos_m[rows], receiver, options, shared, heading, carriers)
+            given = record.tx_pos_m[rows], receiver, options, shared, heading, carriers
+            self.sides += traced_fields(scene, *given, searched=searched)
             for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))

@@ -38,7 +38,7 @@ from .correct import Correction
 from .fit import LEAST_PATHS
 from .frame import rigid_motion
 from .options import FRAME, MATERIALS
-from .search import ABSENT, CONSTANTS, QUANTITIES
+from .search import CONSTANTS, QUANTITIES
 
 PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
 SUPPORTED = 0.5
@@ -70,7 +70,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
             correction.parameters if correction.kept else {},
             grouping="surface",
             kinds=correction.kinds,
-            absent=[index for index, one in enumerate(facts["materials"]) if one["absent"]],
+            absent=correction.absent,
             replace=True,
         )
         write_atomically(part / FIGURES, json.dumps(facts, indent=1, default=_plain) + "\n")
@@ -159,14 +159,12 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
         places = [part.start + index for part in parts if part is not None]
         free = bool(places) and places[0] in correction.free
         sd = correction.deviation[places] if free else None
-        taken, supposed = correction.materials.get(name), name.partition("/")[0] in correction.supposed
-        left_out = taken == ABSENT and free and bool(after[index, 0] < 1.1)
         found.append(
             {
                 "surface": name.partition("/")[0],
                 "paths": int(paths[index]),
-                "first_choice": taken,
-                "absent": taken in (None, ABSENT) if supposed else left_out,
+                "first_choice": correction.materials.get(name),
+                "absent": index in correction.absent,
                 "permittivity": [float(before[index, 0]), float(after[index, 0])],
                 "conductivity": [float(before[index, 1]), float(after[index, 1])],
                 "thickness_m": [float(before[index, 2]), float(after[index, 2])],

@@ -7,6 +7,7 @@ is kept where it raises the likelihood by more than `GAIN`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -47,6 +48,8 @@ JOINT = 10
 """Number of planes whose material and shift are chosen together."""
 REFINED = 8
 """Number of shifts, the best with their best materials, that are compared after least-squares steps."""
+SHIFTS_EACH = 3
+"""Number of shifts of each material that are compared so, where materials are in doubt."""
 STEP = 1 / 16
 """Step of the shifts, wavelengths: paths change by up to an eighth."""
 FARTHEST = 2.0
@@ -198,20 +201,35 @@ def _cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArr
 
 
 def alternatives(
-    rules: Rules, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray
+    rules: Rules,
+    trials: Misfit | PathSum,
+    noise: Noise,
+    choice: Choice,
+    vector: FloatArray,
+    of_materials: bool = False,
 ) -> list[tuple[float, str, FloatArray]]:
-    """Alternatives of a choice, those with the least cost first: cost, name and vector."""
+    """Alternatives of a choice, those with the least cost first: cost, name and vector.
+
+    Of a material and a shift together, the best of some shifts, or of each of the materials, are compared after least
+    squares, too.
+    """
     tried, expected = list[tuple[float, str, FloatArray]](), rules.expected(vector, choice.places)
     for name, values in choice.values.items():
         there = vector.copy()
         there[choice.places] = np.where(np.isnan(values), expected, values)
         tried.append((_cost(rules, trials, noise, there), name, there))
-    first = itemgetter(0)
+    tried.sort(key=itemgetter(0))
     if choice.joint:
         # A plane that is tilted, too, fits at the right shift only once its tilts do.
-        by_shift = {one[1].rpartition(",")[2]: one for one in sorted(tried, key=first)[::-1]}
+        kind, each, most = (0, SHIFTS_EACH, len(tried)) if of_materials else (2, 1, REFINED)
+        count, few = Counter[str](), list[tuple[str, FloatArray]]()
+        for _, name, there in tried:
+            key = name.partition(",")[kind]
+            if count[key] < each and len(few) < most:
+                count[key] += 1
+                few.append((name, there))
         places = choice.places if trials is rules.misfit else choice.plane
-        for _, name, there in sorted(by_shift.values(), key=first)[:REFINED]:
+        for name, there in few:
             better = rules.refined(trials, there, places)
             tried.append((_cost(rules, trials, noise, better), name, better))
-    return sorted(tried, key=first)
+    return sorted(tried, key=itemgetter(0))

@@ -58,20 +58,14 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     Raises:
         ValueError: parameters of a scene with another number of planes.
     """
-    count = len(surfaces.normal)
-    shift, tilt = (np.asarray(parameters.get(name, np.zeros(0)), float) for name in (SHIFT, TILT))
-    shift, tilt = shift if shift.size else np.zeros(count), tilt if tilt.size else np.zeros((count, 2))
-    if shift.shape != (count,) or tilt.shape != (count, 2):
-        raise ValueError(f"moved_triangles: shifts {shift.shape} and tilts {tilt.shape} of a scene of {count} planes")
-    change = np.column_stack([shift, tilt])
-    normal, offset = moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
+    normal, offset = planes_at(surfaces, parameters)
 
     corners = surfaces.triangles.reshape(-1, 3)
     _, first, same = np.unique(np.round(corners / SAME_CORNER_M), axis=0, return_index=True, return_inverse=True)
     same = same.reshape(-1)
     pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
     bounds = np.searchsorted(pairs[:, 0], np.arange(len(first) + 1))
-    area = np.bincount(surfaces.plane, trimesh.triangles.area(surfaces.triangles), count).astype(float)
+    area = np.bincount(surfaces.plane, trimesh.triangles.area(surfaces.triangles), len(normal)).astype(float)
     way = np.zeros((len(first), 3))
     for corner, (low, high) in enumerate(pairwise(bounds)):
         plane = _determining(pairs[low:high, 1], area, normal)
@@ -79,6 +73,21 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
         off = offset[plane] - surfaces.offset[plane] - (normal - surfaces.normal)[plane] @ corners[first[corner]]
         way[corner] = np.linalg.lstsq(normal[plane], off)[0]
     return (corners + way[same]).reshape(-1, 3, 3)
+
+
+def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, FloatArray]:
+    """Normals [q, 3] and offsets [q] in metres of a scene's planes with the parameters of `moved_triangles`.
+
+    Raises:
+        ValueError: parameters of a scene with another number of planes.
+    """
+    count = len(surfaces.normal)
+    shift, tilt = (np.asarray(parameters.get(name, np.zeros(0)), float) for name in (SHIFT, TILT))
+    shift, tilt = shift if shift.size else np.zeros(count), tilt if tilt.size else np.zeros((count, 2))
+    if shift.shape != (count,) or tilt.shape != (count, 2):
+        raise ValueError(f"planes_at: shifts {shift.shape} and tilts {tilt.shape} of a scene of {count} planes")
+    change = np.column_stack([shift, tilt])
+    return moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
 
 
 def _determining(planes: IntArray, area: FloatArray, normal: FloatArray) -> IntArray:

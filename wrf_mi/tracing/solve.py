@@ -48,11 +48,12 @@ class Prepared:
 
     Args:
         scene: a ``sionna.rt.Scene`` of constant geometry and, for traced fields, materials.
+        surfaces: its surfaces; None: they are found.
     """
 
-    def __init__(self, scene: Any) -> None:
-        self.surfaces: Surfaces = scene_surfaces(scene)
-        self._scene, self._test = scene, SpecularTest(scene, self.surfaces)
+    def __init__(self, scene: Any, surfaces: Surfaces | None = None) -> None:
+        self.scene, self.surfaces = scene, surfaces or scene_surfaces(scene)
+        self._test = SpecularTest(scene, self.surfaces)
         self._chains: dict[tuple[bytes, TraceOptions, int], ReflectionChains] = {}
         self._rays: dict[TraceOptions, int] = {}
         self._tables: dict[MaterialGrouping, SceneTables] = {}
@@ -92,7 +93,7 @@ class Prepared:
         from .scene_tables import SceneTables
 
         if grouping not in self._tables:
-            self._tables[grouping] = SceneTables.of(self._scene, self.surfaces, grouping)
+            self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
         return self._tables[grouping]
 
     def rays(self, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
@@ -113,14 +114,14 @@ class Prepared:
     def new_chains(self, source_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
         """Chains from a point [3] by rays of any seed, not kept here."""
         met, surfaces = options.max_depth if options.transmission else options.reflections, self.surfaces
-        plane = shoot(self._scene, surfaces, source_m, rays, met, options.reflections, seed)
+        plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed)
         return ReflectionChains(plane, image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:])
 
     def specular_paths(
         self, chains: ReflectionChains, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions
     ) -> Legs:
         """Paths from a point [3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
-        return specular_paths(self._scene, self.surfaces, self._test, chains, source_m, targets_m, options)
+        return specular_paths(self.scene, self.surfaces, self._test, chains, source_m, targets_m, options)
 
 
 def trace_paths(

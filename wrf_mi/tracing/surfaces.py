@@ -88,7 +88,6 @@ class Surfaces:
 
 def scene_surfaces(scene: Any) -> Surfaces:
     """Read the triangles of a ``sionna.rt.Scene`` and find its planes."""
-    import drjit as dr
     import mitsuba as mi
 
     names = tuple(scene.objects)
@@ -98,13 +97,21 @@ def scene_surfaces(scene: Any) -> Surfaces:
         parameters = mi.traverse(mesh)
         corners = np.asarray(parameters["vertex_positions"], float).reshape(-1, 3)
         triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
-        pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mesh))
-        ids.append(int(pointer[0]))
+        ids.append(shape_id(mesh))
         found = MESH_FILE.search(str(mesh))
         files.append(found[1] if found else "")
     first = np.cumsum([len(part) for part in triangles])
     surfaces = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
     return replace(surfaces, files=tuple(files))
+
+
+def shape_id(mesh: Any) -> int:
+    """Index of a mesh in Mitsuba's registry."""
+    import drjit as dr
+    import mitsuba as mi
+
+    pointer: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(mesh))
+    return int(pointer[0])
 
 
 def find_planes(
@@ -127,7 +134,7 @@ def find_planes(
     plane = plane.reshape(-1)
     total = np.bincount(plane, area)
     seeds = np.argsort(-total, kind="stable")[:MERGED_COUNT]
-    biggest = _largest_face(plane, area)
+    biggest = largest_face(plane, area)
     free = np.ones(len(plane), bool)
     for seed in seeds[total[seeds] >= MERGED_M2]:
         face = biggest[seed]
@@ -143,7 +150,7 @@ def find_planes(
     plane = plane.reshape(-1)
     # The plane is that of the face which took in the others: theirs may be tilted within the tolerance.
     kept = plane[biggest[labels]] == np.arange(len(labels))
-    face = np.where(kept, biggest[labels], _largest_face(plane, area))
+    face = np.where(kept, biggest[labels], largest_face(plane, area))
     normal, offset = normal[face], offset[face]
     edge = triangles[face][:, 1] - triangles[face][:, 0]
     edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
@@ -152,7 +159,7 @@ def find_planes(
     return Surfaces(names, shape_ids, first_face, triangles, plane, normal, offset, face, axes, low, high)
 
 
-def _largest_face(plane: IntArray, area: FloatArray) -> IntArray:
+def largest_face(plane: IntArray, area: FloatArray) -> IntArray:
     """Largest face of each plane; the first of equals."""
     order = np.lexsort((-area, plane))
     return order[np.searchsorted(plane[order], np.arange(plane.max(initial=-1) + 1))]

@@ -13,6 +13,7 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from . import TraceResult, trace_paths
+from .moved_scene import MovedSearch
 from .pose import moved_m
 from .solve import Prepared
 from .traced_field import TracedField, TracedOptions, needs_search
@@ -27,6 +28,7 @@ def traced_fields(
     tx_heading_rad: ArrayLike | None = None,
     carriers_hz: FloatArray | None = None,
     parameters: Mapping[str, Any] | None = None,
+    searched: MovedSearch | None = None,
 ) -> list[TracedField]:
     """Traced fields of the transmitters of each carrier at a receiver.
 
@@ -43,6 +45,7 @@ def traced_fields(
         carriers_hz: carrier of each transmitter [n], Hz; None: that of the scene.
         parameters: Dr.Jit tensors by the names of `TracedField.parameters`: where they move the receiver further than
             `TracedField.refresh` allows at a carrier, paths are searched from there. None: the stated pose.
+        searched: where paths are searched; None: in the scene as stated.
 
     Returns:
         A field for each carrier, ascending, of its transmitters in the given order.
@@ -62,10 +65,12 @@ def traced_fields(
         from_m = here_m if moved else stated_m
         if moved not in found:
             there = replace(receiver, position_m=from_m)
-            how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna}
+            where = searched.prepared if searched else prepared
+            how: dict[str, Any] = {"prepared": where, "tx_antenna": options.tx_antenna}
             how |= {"check": False, "gains": False}
-            found[moved] = trace_paths(scene, distinct, there, options.trace, **how)
+            found[moved] = trace_paths(where.scene, distinct, there, options.trace, **how)
         given = positions[rows], receiver, options, None if heading is None else heading[rows]
         traced = found[moved].of_transmitters(number[rows])
-        fields.append(TracedField(scene, *given, traced, prepared, carrier_hz, from_m))
+        present = searched.parameters if searched else None
+        fields.append(TracedField(scene, *given, traced, prepared, carrier_hz, from_m, present))
     return fields

@@ -63,8 +63,8 @@ class TracedOptions:
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
-        faint: the weakest paths of a transmitter are dropped while their amplitudes, with the scene's materials, add up
-            to less than this share of the amplitudes of all; 0: none.
+        faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
+            add up to less than this share of the amplitudes of all; 0: none.
         thickness: whether thicknesses of materials are parameters, too.
         exponent: whether exponents of conductivities with the frequency are parameters, too.
     """
@@ -124,6 +124,7 @@ class TracedField:
             caller checks the antennas (`wrf_mi.tracing.solve.Prepared.check`).
         frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
+        present: Dr.Jit tensors by the names of `parameters` by which faint paths are told; None: as stated.
 
     Attributes:
         frequency_hz: carrier of the paths.
@@ -149,6 +150,7 @@ class TracedField:
         prepared: Prepared | None = None,
         frequency_hz: float | None = None,
         searched_at_m: FloatArray | None = None,
+        present: Mapping[str, Any] | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
         if self.tx_pos_m.ndim != 2 or self.tx_pos_m.shape[1] != 3 or not np.isfinite(self.tx_pos_m).all():
@@ -157,7 +159,7 @@ class TracedField:
         if heading.shape != (len(self.tx_pos_m),) or not np.isfinite(heading).all():
             raise ValueError(f"TracedField: tx_heading_rad has shape {heading.shape}; give finite [n]")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
-        self._prepared = prepared
+        self._prepared, self._present = prepared, present or {}
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
         self._stated_hz = float(scene.frequency[0])
@@ -367,17 +369,18 @@ class TracedField:
         return position, tuple(columns_on_device((np.cos(heading), np.sin(heading)), Float64))
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
-        """Amplitudes of paths as stated.
+        """Amplitudes of paths, with the present parameters.
 
         Raises:
             InputError: one that is not a number.
         """
         if not dr.width(chains.exists):
             return np.zeros(0)
-        pose = _spread(receiver_pose(self.receiver, {}, Float64), dr.width(chains.exists))
-        tables = self.slabs.tables({}, self._constants, self.frequency_hz / self._stated_hz)
+        pose = _spread(receiver_pose(self.receiver, self._present, Float64), dr.width(chains.exists))
+        tables = self.slabs.tables(self._present, self._constants, self.frequency_hz / self._stated_hz)
         antennas = self.receiver.antenna, self.options.tx_antenna
         with dr.suspend_grad():
+            chains = replace(chains, levels=self._planes.move(chains.levels, self._present))
             real, imaginary = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas).gain
             power = real * real + imaginary * imaginary
         amplitude: FloatArray = np.sqrt(power.numpy())
