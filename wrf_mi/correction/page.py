@@ -258,8 +258,8 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         f"{'' if MATERIALS in facts['kept'] else ', or no change of materials was kept'}.",
         f'- "Measured" are quantities whose standard deviation fell below {SUPPORTED:.0%} of the one before; '
         "`x/ 1.2` is a factor of one standard deviation.",
-        "- Standard deviations are those of the Fisher information and the prior, with the paths as found in the "
-        "stated scene. Of surfaces that the scan missed, only faces of boxes are tried (`hidden`).",
+        "- Standard deviations are those of the Fisher information and the prior, with the paths of the scene that "
+        "was found. Of surfaces that the scan missed, only faces of boxes are tried (`hidden`).",
         "",
     ]
     return "\n".join(lines)
