@@ -89,6 +89,17 @@ def test_paths_are_those_of_the_scene_that_was_found(corrected: Any) -> None:
     assert np.mean(found.scores[found.kept]) > 50
 
 
+def test_planes_alone_are_corrected(tmp_path: Path) -> None:
+    """Channels that were held out are predicted better where all materials stay as stated."""
+    true, *_ = true_scene(tmp_path)
+    record = channels(true, 160)
+    options = CorrectionOptions(parts=("planes", "frame"), rays=1 << 14)
+    found = correct_scene(tmp_path / "base", record, make_splits(record, "official")[0], options)
+    assert found.kept == "planes+frame"
+    mean = {stage: np.mean(score) for stage, score in found.scores.items()}
+    assert mean[found.kept] > mean[""] + 10
+
+
 def test_a_wall_is_of_another_material_that_reflects_alike_at_one_carrier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

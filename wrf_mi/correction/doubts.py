@@ -99,6 +99,8 @@ class Doubts:
         def same(choice: Choice, one: Alternative, other: Alternative) -> bool:
             return one.material == other.material
 
+        if not self.material:
+            return found
         places = np.array([choice.material for choice in self.material])
         away = (found.vector - found.known.mean) / self.fit.prior_deviation
         doubt = np.square(away[places]).sum(axis=-1)

@@ -76,7 +76,8 @@ class PathSum:
         count = len(misfit.sides[0].surfaces.normal)
         self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])[: len(self._plane_places)]
         material = [part for name, part in misfit.parts.items() if name.startswith(PREFIX)]
-        self._material = np.array([np.arange(part.start, part.stop) for part in material]).reshape(len(material), -1)
+        places = np.array([np.arange(part.start, part.stop) for part in material], np.int64)
+        self._material = places.reshape(len(material), len(misfit.sides[0].slabs.names))
         self._factors = [
             (misfit.parts[side.gain_name], places)
             for side, places in zip(misfit.sides, misfit.places, strict=True)
