@@ -115,6 +115,9 @@ _OWN: Mapping[str, Check] = {
         resumes=True,
         table="ingredients:table",
     ),
+    "intervals": _here(
+        "intervals of four models", "coverage:main", RFID, FLAT, CONFERENCE, resumes=True, table="coverage:table"
+    ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "new-carriers": _here(
         "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"

@@ -1,4 +1,4 @@
-"""The hybrid beside each of its ingredients, and intervals of both, over data sets, splits and numbers of rows.
+"""The hybrid beside each of its ingredients, over data sets, splits and numbers of rows.
 
 Each cell is a run of the hybrid and one of each ingredient on the same rows. Scores are compared row by row; an
 ingredient is *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is
@@ -50,9 +50,7 @@ WORSE_SHARE = 0.02
 """Largest share of comparisons in which the hybrid may be clearly worse."""
 INSIDE = (0.85, 0.95)
 """Limits of the share of test values inside the 90 % intervals."""
-
-WITH_INTERVALS = ("kriging", "physics")
-"""Ingredients that are also fitted to folds for intervals of their own."""
+HYBRID = "hybrid"
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
     """Scores, intervals and mean differences of the hybrid and its ingredients."""
     block = TASKS[hybrid.task].block
     found = []
-    for name, run in {"hybrid": hybrid, **others}.items():
+    for name, run in {HYBRID: hybrid, **others}.items():
         one = {
             "model": name,
             "score": run.metrics[block],
@@ -105,31 +103,31 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
             "train_seconds": run.metrics["train_seconds"],
         }
         one |= {key: run.metrics.get(key) for key in ("inside_90", "crps", "ms_per_sample")}
-        if name != "hybrid":
+        if name != HYBRID:
             gain = bootstrap(differences(hybrid, run), np.mean)
             one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
         found.append(one)
     return found
 
 
+def run_of_cell(cell: Cell, folder: Path, name: str, model: str, **more: Any) -> Results:
+    """Run of a model in ``folder / name`` on the rows of a cell, seed 0; one that is finished is read."""
+    place = folder / name
+    if not (place / METRICS).exists():
+        shutil.rmtree(place, ignore_errors=True)
+        train(cell.dataset, place, model, split=cell.split, n_train=cell.n_train, seed=0, **more)
+    return read_run(place)
+
+
 def measure(cell: Cell, folder: Path) -> list[dict[str, Any]]:
     """Runs of a cell in ``folder``, those that are finished excepted, compared."""
     scene = scene_of_cell(cell, folder.parent)
-    given: dict[str, Any] = {"split": cell.split, "n_train": cell.n_train, "seed": 0}
-
-    def run(name: str, model: str, **more: Any) -> Results:
-        place = folder / name
-        if not (place / METRICS).exists():
-            shutil.rmtree(place, ignore_errors=True)
-            train(cell.dataset, place, model, **given, **more)
-        return read_run(place)
-
-    hybrid = run("hybrid", "hybrid", scene=scene)
+    hybrid = run_of_cell(cell, folder, HYBRID, HYBRID, scene=scene)
     others = {}
-    for name in [name for name in hybrid.metrics["held_out"] if name != "hybrid"]:
+    for name in [name for name in hybrid.metrics["held_out"] if name != HYBRID]:
         known = INGREDIENTS[name]
         more = {"scene": scene if known.scene else None, "settings": known.settings}
-        others[name] = run(name, known.model, intervals=name in WITH_INTERVALS, **more)
+        others[name] = run_of_cell(cell, folder, name, known.model, **more)
     return compared(hybrid, others)
 
 

@@ -1,0 +1,89 @@
+"""Shares of test values inside the 90 % intervals of four models, over data sets and both kinds of split.
+
+Standard deviations are those of errors on training rows that are held out in space: the hybrid has its own, other
+models are fitted to the folds as ``wrf-mi train --intervals`` does. Each run is stored when it is measured
+(`wrf_mi_bench.comparison.stored_part`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from wrf_mi.models.hybrid.ingredients import INGREDIENTS
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.synthetic.furnished_room import NAME as ROOM
+from wrf_mi.tasks import TASKS
+
+from .bench import CONFERENCE, FLAT, RFID
+from .comparison import data_folder, measured_on, stored_part
+from .ingredients import HYBRID, INSIDE, LAB, RUNS, Cell, run_of_cell, scene_of_cell
+
+CELLS = tuple(
+    Cell(dataset, split, n_train)
+    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CONFERENCE: None}.items()
+    for split in ("official", "blocked")
+)
+MODELS = ("kriging", "physics", "joint", HYBRID)
+"""Ingredients of the hybrid, and the hybrid."""
+
+
+def models_of(cell: Cell, scene: str | None) -> list[str]:
+    """Models that serve a cell: without a scene physics has no mesh, and there is no joint field."""
+    return [name for name in MODELS if scene is not None or name != "joint"]
+
+
+def measured(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
+    """Score, share inside the 90 % intervals, CRPS and time of training of a model, as they are stored."""
+    scene = scene_of_cell(cell, folder.parent)
+    if name == HYBRID:
+        run = run_of_cell(cell, folder, HYBRID, HYBRID, scene=scene)
+    else:
+        known = INGREDIENTS[name]
+        more = {"scene": scene if known.scene else None, "settings": known.settings}
+        run = run_of_cell(cell, folder, f"{name}-intervals", known.model, intervals=True, **more)
+    block = TASKS[run.task].block
+    return {"block": block, "score": run.metrics[block]} | {
+        key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")
+    }
+
+
+def main() -> dict[str, Any]:
+    """Measure all runs that are not stored; `InputError` where data are not on this machine.
+
+    Returns:
+        ``rows``; ``inside``: number of runs whose intervals cover 85 to 95 %, of ``runs``; and ``failed``, where some
+        do not.
+    """
+    for cell in CELLS:
+        data_folder(cell.dataset)
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    for cell in CELLS:
+        for name in models_of(cell, scene_of_cell(cell, place)):
+            print(f"intervals: {cell.title}: {name}", file=sys.stderr, flush=True)
+            part = stored_part("intervals", f"{cell.name}-{name}", partial(measured, cell, name, place / cell.name))
+            parts.append(part)
+            value = f"{part['inside_90']:.1%} inside, CRPS {part['crps']:.3g}"
+            known = {key: part[key] for key in ("inside_90", "crps", "score")}
+            row = {"what": f"{cell.title}: {name}", "value": value, "asked": "85 to 95 % inside"}
+            rows.append({**row, **known, "cell": cell.title, "model": name})
+            print(f"intervals: {row['what']}: {value}", file=sys.stderr, flush=True)
+    inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
+    found = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
+    if inside < len(rows):
+        found["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
+    return found
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table, a line for each data set and split: share inside and CRPS of each model."""
+    lines = [f"| data | {' | '.join(MODELS)} |", "| --- |" + " --- |" * len(MODELS)]
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        known = {row["model"]: f"{row['inside_90']:.0%}, {row['crps']:.3g}" for row in rows if row["cell"] == cell}
+        lines.append(f"| {cell} | {' | '.join(known.get(name, '') for name in MODELS)} |")
+    return "\n".join(lines)
