@@ -86,7 +86,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     import mitsuba as mi
     from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
-    from ..backend.device import on_device, to_tensor, to_uint, to_vectors
+    from ..backend.device import columns_on_device, on_device, to_vectors
 
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
@@ -97,18 +97,16 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     shape[used] = surfaces.shape_ids[thing[used]]
     primitive[used] = (face - surfaces.first_face[thing])[used]
     buffer._valid = dr.opaque(mi.Bool, valid, count)
-    buffer._src_indices = to_uint(legs.source)
-    buffer._tgt_indices = to_uint(legs.target)
+    buffer._src_indices, buffer._tgt_indices = columns_on_device((legs.source, legs.target), mi.UInt32)
     integers: Any = mi.TensorXu
-    numbers = (legs.interactions, shape, primitive)
-    found = (integers(to_uint(values), values.shape) for values in numbers)
-    buffer._interaction_types, buffer._shapes, buffer._primitives = found
-    buffer._probs = to_tensor(legs.probability)
+    numbers = columns_on_device((legs.interactions, shape, primitive), mi.UInt32)
+    buffer._interaction_types, buffer._shapes, buffer._primitives = (integers(values, face.shape) for values in numbers)
     vertices = np.nan_to_num(legs.vertices_m, nan=0.0).astype(np.float32)
     for level in range(1, depth):  # beyond the last interaction Sionna RT reads the last point, and adds its distance
         vertices[:, level] = np.where(used[:, level, None], vertices[:, level], vertices[:, level - 1])
-    for axis, name in enumerate(("_vertices_x", "_vertices_y", "_vertices_z")):
-        setattr(buffer, name, to_tensor(vertices[..., axis]))
+    values = columns_on_device((legs.probability, *np.moveaxis(vertices, -1, 0)), mi.Float)
+    for name, column in zip(("_probs", "_vertices_x", "_vertices_y", "_vertices_z"), values, strict=True):
+        setattr(buffer, name, mi.TensorXf(column, face.shape))
     if legs.wedge:
         for name in WEDGE:
             kind: Any = type(getattr(buffer._diffracting_wedges, name))

@@ -200,17 +200,10 @@ def possible(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_float, to_vectors
+    from ..backend.device import to_vectors
 
     length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
     reflections, planes, images = chains.on_device
-    tables: tuple[Any, ...] = (
-        to_vectors(surfaces.normal, mi.Vector3f),
-        to_float(surfaces.offset),
-        *(to_vectors(surfaces.axes[:, side], mi.Vector3f) for side in range(2)),
-        to_vectors(surfaces.low - MARGIN_M, mi.Point2f),
-        to_vectors(surfaces.high + MARGIN_M, mi.Point2f),
-    )
     step = max(1, PAIRS_PER_CHUNK // len(targets_m))
     # As data, not as code: the same kernel serves all numbers of targets.
     count = dr.opaque(mi.UInt32, len(targets_m))
@@ -226,11 +219,13 @@ def possible(
             active = level < reflects
             plane = dr.gather(mi.UInt32, planes[level], row, active)
             image = dr.gather(mi.Point3f, images[level], row, active)
+            tables = surfaces.planes_on_device
             n, d, u, v, low, high = (dr.gather(type(table), table, plane, active) for table in tables)
             here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
             met: Any = point + (image - point) * (here / (here - there))
             along = mi.Point2f(dr.dot(u, met), dr.dot(v, met))
-            valid &= ~active | ((here * there < 0) & dr.all(along >= low) & dr.all(along <= high))
+            within: Any = dr.all(along >= low - MARGIN_M) & dr.all(along <= high + MARGIN_M)
+            valid &= ~active | ((here * there < 0) & within)
             point = dr.select(active, met, point)
         found = np.asarray(dr.compress(valid), np.int64)
         chain, target = found // len(targets_m) + start, found % len(targets_m)

@@ -70,6 +70,18 @@ class Surfaces:
         return content_digest(self.triangles, self.first_face)
 
     @cached_property
+    def planes_on_device(self) -> tuple[Any, ...]:
+        """``normal``, ``offset``, both ``axes``, ``low`` and ``high`` of the planes: Dr.Jit vectors [q]."""
+        import mitsuba as mi
+
+        from ..backend.device import columns_on_device
+
+        columns = (self.normal, self.offset[:, None], self.axes[:, 0], self.axes[:, 1], self.low, self.high)
+        x = columns_on_device(np.hstack(columns).T, mi.Float)
+        axes = mi.Vector3f(*x[4:7]), mi.Vector3f(*x[7:10])
+        return mi.Vector3f(*x[:3]), x[3], *axes, mi.Point2f(*x[10:12]), mi.Point2f(*x[12:])
+
+    @cached_property
     def solids(self) -> list[IntArray]:
         """Faces of each closed, consistently oriented body that is an object rather than a room."""
         area = trimesh.triangles.area(self.triangles)

@@ -339,8 +339,8 @@ class TracedField:
         if self._gaussians is not None:
             self.attach(self._gaussians)
         # Place holders have a transmitter, too: lengths of zero have no direction.
-        sources = self._sources(np.repeat(np.arange(len(self)), each))
-        self.chains = Chains(*sources, dr.zeros(Float64, len(place)), [])
+        sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
+        self.chains = Chains(sources[:3], tuple(sources[3:]), dr.zeros(Float64, len(place)), [])
         if len(kept):
             index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)
             self.chains.exists = dr.gather(Float64, found.exists, index, mask)
@@ -349,24 +349,29 @@ class TracedField:
 
     def _chains_of(self, tx: IntArray, types: NDArray[np.uint8], face: IntArray) -> Chains:
         """Chains of paths from transmitters [p] with interactions [p, depth] at faces [p, depth]."""
-        surfaces, used = self.surfaces, types != 0
-        plane, material = np.append(surfaces.plane, 0)[face], self._slab(face).astype(np.uint32)
+        surfaces, depth = self.surfaces, types.shape[1] if types.any() else 0
+        types, face = types[:, :depth], face[:, :depth]
+        plane, used, material = np.append(surfaces.plane, 0)[face], types != 0, self._slab(face).astype(np.uint32)
+        # All columns of a type by one copy: each copy is a kernel of its own.
+        normal, offset = surfaces.normal[plane] * used[..., None], surfaces.offset[plane] * used
+        columns = [column for k in range(depth) for column in (*normal[:, k].T, offset[:, k])]
+        numbers = columns_on_device([*columns, *self._source_columns(tx), np.ones(len(tx))], Float64)
+        kinds = [types[:, k] == kind for k in range(depth) for kind in (SPECULAR, TRANSMISSION)]
+        masks = columns_on_device(kinds, mi.Bool)
+        indices = columns_on_device([table[:, k] for k in range(depth) for table in (material, plane)], mi.UInt32)
         levels = [
             Level(
-                columns_on_device((surfaces.normal[plane[:, k]] * used[:, k, None]).T, Float64),
-                on_device(surfaces.offset[plane[:, k]] * used[:, k], Float64),
-                *columns_on_device((types[:, k] == SPECULAR, types[:, k] == TRANSMISSION), mi.Bool),
-                *columns_on_device((material[:, k], plane[:, k]), mi.UInt32),
+                numbers[4 * k : 4 * k + 3], numbers[4 * k + 3], *masks[2 * k : 2 * k + 2], *indices[2 * k : 2 * k + 2]
             )
-            for k in range(types.shape[1] if used.any() else 0)
+            for k in range(depth)
         ]
-        return Chains(*self._sources(tx), on_device(np.ones(len(tx)), Float64), levels)
+        *sources, exists = numbers[4 * depth :]
+        return Chains(sources[:3], tuple(sources[3:]), exists, levels)
 
-    def _sources(self, tx: IntArray) -> tuple[Vector, Complex]:
-        """Positions of transmitters, and cosine and sine of their headings."""
+    def _source_columns(self, tx: IntArray) -> list[FloatArray]:
+        """Coordinates of transmitters, and cosines and sines of their headings."""
         heading = self.heading_rad[tx]
-        position = columns_on_device(self.tx_pos_m[tx].T, Float64)
-        return position, tuple(columns_on_device((np.cos(heading), np.sin(heading)), Float64))
+        return [*self.tx_pos_m[tx].T, np.cos(heading), np.sin(heading)]
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
         """Amplitudes of paths, with the present parameters.
