@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from spectrum_records import make_record
+from test_compare import captured
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.array_files import CHECKSUM
@@ -17,6 +18,7 @@ from wrf_mi.models import MODELS
 from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out_folds
 from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
+from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.offsets import fit_offsets
@@ -238,3 +240,14 @@ def test_all_receivers_held_out_are_refused(law: Record, tmp_path: Path) -> None
     for held in ((0, 1, 2, 3), (4,)):
         with pytest.raises(InputError, match=r"split mine holds out receivers .* of 4; leave some to train on"):
             train(law, tmp_path / "run", "mri", split=Split("mine", 0, *rows, held))
+
+
+def test_pictures_of_a_comparison_show_the_receivers_that_were_held_out(
+    law: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = captured(monkeypatch, "position_table")
+    run = train(law, tmp_path / "run", "mri", split="receiver:3")
+    compare([run.folder], tmp_path / "compare")
+    shown = [[name for name, _ in rows] for rows, *_ in maps]
+    assert ["anchor3"] in shown
+    assert not any("anchor0" in names for names in shown)

@@ -128,13 +128,17 @@ def _columns(runs: Sequence[Results]) -> list[str]:
 
 
 def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:
-    """Heading and picture of each receiver's power over the first run's test positions, or rows without positions."""
+    """Heading and picture of each receiver's power over the first run's test positions, or rows without positions.
+
+    Receivers without a test value, as trained ones are where others are held out, are left out.
+    """
     first = runs[0]
     aligned = [_aligned(run, indices) for run, indices in zip(runs, indices(runs), strict=True)]
     maps, task = [first.truth, *aligned, first.reference], TASKS[first.task]
     rows = [
         (name, [None if values is None else task.level(Prediction(values[r])).mean for values in maps])
         for r, name in enumerate(first.receivers)
+        if np.isfinite(first.truth[r]).any()
     ]
     quantity = task.quantity
     if not np.isfinite(first.tx_pos_m).all():
