@@ -19,9 +19,9 @@ import numpy as np
 
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.models.hybrid.ingredients import INGREDIENTS
-from wrf_mi.runs.api import train
+from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.fit_key import fit_key, source_files
-from wrf_mi.runs.folder import METRICS
+from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.timing import bootstrap
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
@@ -111,11 +111,13 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
 
 
 def run_of_cell(cell: Cell, folder: Path, name: str, model: str, **more: Any) -> Results:
-    """Run of a model in ``folder / name`` on the rows of a cell, seed 0; one that is finished is read."""
+    """Run of a model in ``folder / name`` on the rows of a cell, seed 0: finished, continued or new."""
     place = folder / name
-    if not (place / METRICS).exists():
-        shutil.rmtree(place, ignore_errors=True)
+    if not (place / CONFIG).exists():
+        shutil.rmtree(place, ignore_errors=True)  # stopped before its configuration was written
         train(cell.dataset, place, model, split=cell.split, n_train=cell.n_train, seed=0, **more)
+    elif not is_finished(place):
+        resume(place)
     return read_run(place)
 
 
