@@ -12,7 +12,7 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tasks import task_of
-from .held_out import HeldOut, distance_to_rows, held_out_predictions, hold_out_folds
+from .held_out import HeldOut, RowDistance, held_out_predictions, hold_out_folds
 from .intervals import GAPS, Intervals, expected_size, fit_intervals
 from .model import (
     Arrays,
@@ -44,11 +44,12 @@ class FittedWithIntervals(Fitted):
 
     def __init__(self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals) -> None:
         self.fitted, self._record, self._rows, self._intervals = fitted, record, rows, intervals
+        self._distance = RowDistance(record, rows)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
     def _stated(self, found: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
-        distance = distance_to_rows(self._record, self._rows, tx_pos_m, receiver)
-        return self._intervals(found.mean, expected_size(task_of(self._record), found), distance)
+        distance_m = self._distance(tx_pos_m, receiver)
+        return self._intervals(found.mean, expected_size(task_of(self._record), found), distance_m)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction of the model with calibrated standard deviations, [m, ...]."""

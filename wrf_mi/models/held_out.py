@@ -126,12 +126,26 @@ def _hold_out_carriers(record: Record, split: Split) -> list[Split]:
     return folds
 
 
-def distance_to_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
-    """Distance [m] of positions [m, 3] to the nearest of some rows that a receiver received; infinite without any."""
-    seen = np.isfinite(record.observation[receiver][rows]).reshape(len(rows), -1).all(axis=1)
-    if not seen.any():
-        return np.full(len(tx_pos_m), np.inf)
-    return np.asarray(cKDTree(record.tx_pos_m[rows[seen]]).query(tx_pos_m)[0])
+class RowDistance:
+    """Distance of positions to the nearest of some rows that a receiver received.
+
+    Args:
+        record: data.
+        rows: the rows [n].
+    """
+
+    def __init__(self, record: Record, rows: IntArray) -> None:
+        self._record, self._rows = record, rows
+        self._trees: dict[int, cKDTree | None] = {}
+
+    def __call__(self, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
+        """Distances [m] in metres of positions [m, 3]; infinite without any row."""
+        if receiver not in self._trees:
+            values = self._record.observation[receiver][self._rows]
+            seen = self._rows[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
+            self._trees[receiver] = cKDTree(self._record.tx_pos_m[seen]) if len(seen) else None
+        tree = self._trees[receiver]
+        return np.full(len(tx_pos_m), np.inf) if tree is None else np.asarray(tree.query(tx_pos_m)[0])
 
 
 @dataclass(frozen=True)
@@ -155,11 +169,11 @@ class HeldOut:
         """Held-out rows of folds, or as many of them, drawn with a seed, as `MOST_HELD_OUT` allows."""
         parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
         for number, fold in enumerate(folds):
-            known = record.seen(fold)
+            distance = RowDistance(record.seen(fold), fold.all_train)
             for receiver in fold.held_receivers or range(len(record.receivers)):
                 rows = np.setdiff1d(fold.test, fold.left[fold.left[:, 0] == receiver, 1])
                 rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
-                away = distance_to_rows(known, fold.all_train, record.tx_pos_m[rows], receiver)
+                away = distance(record.tx_pos_m[rows], receiver)
                 parts.append((np.full(len(rows), number), np.full(len(rows), receiver), rows, away))
         every = cls(*(np.concatenate(values) for values in zip(*parts, strict=True)))
         most = int(np.clip(MOST_VALUES // int(np.prod(record.observation.shape[2:])), *MOST_HELD_OUT))

@@ -28,7 +28,7 @@ from ...tasks import task_of
 from .. import MODELS
 from ..held_out import (
     HeldOut,
-    distance_to_rows,
+    RowDistance,
     fit_model,
     held_out_predictions,
     hold_out_folds,
@@ -95,6 +95,7 @@ class FittedHybrid(Fitted):
         facts: dict[str, Any],
     ) -> None:
         self._problem, self._known, self._facts = problem, known, facts
+        self._distance = RowDistance(problem.record, known)
         self.ingredients, self.mixture, self.intervals = dict(fitted), mixture, intervals
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -145,8 +146,8 @@ class FittedHybrid(Fitted):
     ) -> Decomposition:
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
-        distance = distance_to_rows(self._problem.record, self._known, tx_pos_m, receiver)
-        weights = self.mixture(distance)
+        distance_m = self._distance(tx_pos_m, receiver)
+        weights = self.mixture(distance_m)
         weights = np.where(weights < NEGLIGIBLE, 0, weights)
         weights /= weights.sum(axis=1, keepdims=True)
         observed = self._problem.record.observation
@@ -169,7 +170,7 @@ class FittedHybrid(Fitted):
         mean = sums.sum(axis=0) if both else sums[0]
         whole = Prediction(mean)
         if self.intervals is not None:
-            whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance)
+            whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance_m)
         if not both:
             return Decomposition(whole, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
