@@ -97,7 +97,7 @@ def _transmissions(
     start, end = (np.concatenate(points) for points in zip(*legs[::-1], strict=True))
     through = np.zeros((len(chain), levels + 1), np.int64)
     after = np.repeat(np.arange(levels + 1), [len(row) for row in met])
-    through[np.concatenate(met), after] = crossings(scene, start, end, depth)
+    through[np.concatenate(met), after] = crossings(scene, surfaces, start, end, depth)
     return through
 
 

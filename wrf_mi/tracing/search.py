@@ -145,12 +145,10 @@ def _shoot(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import on_device, to_uint, to_vectors
+    from ..backend.device import to_vectors
 
     ray = mi.Ray3f(to_vectors(source_m[None], mi.Point3f), to_vectors(directions.T, mi.Vector3f))
-    lookup = np.zeros(int(surfaces.shape_ids.max()) + 1, np.uint32)
-    lookup[surfaces.shape_ids] = surfaces.first_face[:-1]
-    first, plane = to_uint(lookup), on_device(surfaces.plane, mi.Int32)
+    first, plane = surfaces.faces_on_device
     # As data, not as code: the same kernel serves every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
@@ -160,7 +158,7 @@ def _shoot(
         active &= hit.is_valid()
         shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
         face = dr.gather(mi.UInt32, first, shape, active) + hit.prim_index
-        planes.append(dr.select(active, dr.gather(mi.Int32, plane, face, active), -1))
+        planes.append(dr.select(active, mi.Int32(dr.gather(mi.UInt32, plane, face, active)), -1))
         mirrored = ray.d - 2 * dr.dot(ray.d, hit.n) * hit.n
         ray = hit.spawn_ray(dr.select((pattern >> level) & 1 == 1, mirrored, ray.d))
     dr.eval(planes)
@@ -233,11 +231,15 @@ def possible(
         yield chain[order], target[order]
 
 
-def crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
+def crossings(scene: Any, surfaces: Surfaces, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
     """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
+
+    Mitsuba's surface interaction takes a call of each shape, which to trace and compile takes longer than the rays:
+    points and normals are computed from distances and faces here.
 
     Args:
         scene: ``sionna.rt.Scene``.
+        surfaces: its surfaces.
         start_m: first points [n, 3], metres.
         end_m: second points [n, 3], metres.
         most: largest number that is counted.
@@ -253,14 +255,20 @@ def crossings(scene: Any, start_m: FloatArray, end_m: FloatArray, most: int) -> 
     length = dr.norm(end - start)
     direction = (end - start) / length
     limit = dr.opaque(mi.UInt32, most)
+    (first_face, plane), normal = surfaces.faces_on_device, surfaces.planes_on_device[0]
 
     def body(active: Any, count: Any, origin: Any) -> tuple[Any, Any, Any]:
-        ray = mi.Ray3f(origin, direction)
-        hit = scene.mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
+        hit = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
+        met = origin + direction * hit.t
         # From the start: the ray's origin is moved off the last surface by up to a millimetre.
-        inside = active & hit.is_valid() & (dr.dot(hit.p - start, direction) < length - END_M)
+        inside = active & hit.is_valid() & (dr.dot(met - start, direction) < length - END_M)
         count += dr.select(inside, mi.UInt32(1), mi.UInt32(0))
-        return inside & (count <= limit), count, hit.spawn_ray(direction).o
+        shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
+        face = dr.gather(mi.UInt32, first_face, shape, inside) + hit.prim_index
+        n = dr.gather(mi.Vector3f, normal, dr.gather(mi.UInt32, plane, face, inside), inside)
+        # As Mitsuba spawns rays: along the normal, by an error of rounding that grows with the coordinates.
+        offset = dr.mulsign((1 + dr.max(dr.abs(met))) * mi.math.RayEpsilon, dr.dot(n, direction))
+        return inside & (count <= limit), count, mi.Point3f(met + n * offset)
 
     none = dr.zeros(mi.UInt32, len(start_m))
     first = length > 2 * END_M, none, start + direction * END_M

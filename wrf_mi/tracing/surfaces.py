@@ -70,6 +70,15 @@ class Surfaces:
         return content_digest(self.triangles, self.first_face)
 
     @cached_property
+    def faces_on_device(self) -> tuple[Any, Any]:
+        """First face by index in Mitsuba's registry, and plane of each face: Dr.Jit arrays, ``mi.UInt32``."""
+        from ..backend.device import to_uint
+
+        first = np.zeros(int(self.shape_ids.max(initial=0)) + 1, np.uint32)
+        first[self.shape_ids] = self.first_face[:-1]
+        return to_uint(first), to_uint(self.plane)
+
+    @cached_property
     def planes_on_device(self) -> tuple[Any, ...]:
         """``normal``, ``offset``, both ``axes``, ``low`` and ``high`` of the planes: Dr.Jit vectors [q]."""
         import mitsuba as mi
