@@ -13,14 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 
 from .bench import CONFERENCE, FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part
-from .ingredients import HYBRID, INSIDE, LAB, RUNS, Cell, run_of_cell, scene_of_cell
+from .ingredients import HYBRID, INSIDE, LAB, RUNS, Cell, run_of_cell, run_of_ingredient, scene_of_cell
 
 CELLS = tuple(
     Cell(dataset, split, n_train)
@@ -42,9 +41,7 @@ def measured(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
     if name == HYBRID:
         run = run_of_cell(cell, folder, HYBRID, HYBRID, scene=scene)
     else:
-        known = INGREDIENTS[name]
-        more = {"scene": scene if known.scene else None, "settings": known.settings}
-        run = run_of_cell(cell, folder, f"{name}-intervals", known.model, intervals=True, **more)
+        run = run_of_ingredient(cell, folder, name, scene, intervals=True)
     block = TASKS[run.task].block
     return {"block": block, "score": run.metrics[block]} | {
         key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")

@@ -121,16 +121,21 @@ def run_of_cell(cell: Cell, folder: Path, name: str, model: str, **more: Any) ->
     return read_run(place)
 
 
+def run_of_ingredient(cell: Cell, folder: Path, name: str, scene: str | None, intervals: bool = False) -> Results:
+    """Run of an ingredient by itself, as `run_of_cell`, with intervals of its own or without."""
+    known = INGREDIENTS[name]
+    more: dict[str, Any] = {"scene": scene if known.scene else None, "settings": known.settings}
+    return run_of_cell(
+        cell, folder, f"{name}-intervals" if intervals else name, known.model, intervals=intervals, **more
+    )
+
+
 def measure(cell: Cell, folder: Path) -> list[dict[str, Any]]:
     """Runs of a cell in ``folder``, those that are finished excepted, compared."""
     scene = scene_of_cell(cell, folder.parent)
     hybrid = run_of_cell(cell, folder, HYBRID, HYBRID, scene=scene)
-    others = {}
-    for name in [name for name in hybrid.metrics["held_out"] if name != HYBRID]:
-        known = INGREDIENTS[name]
-        more = {"scene": scene if known.scene else None, "settings": known.settings}
-        others[name] = run_of_cell(cell, folder, name, known.model, **more)
-    return compared(hybrid, others)
+    names = [name for name in hybrid.metrics["held_out"] if name != HYBRID]
+    return compared(hybrid, {name: run_of_ingredient(cell, folder, name, scene) for name in names})
 
 
 def measured(cell: Cell, folder: Path) -> dict[str, Any]:

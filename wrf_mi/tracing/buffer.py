@@ -125,11 +125,9 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
     kept = np.flatnonzero(buffer.valid.numpy())
     types = buffer.interaction_types.numpy()[kept].astype(np.uint8)
     used = types != 0
-    first = np.zeros(int(surfaces.shape_ids.max(initial=0)) + 1, np.int64)
-    first[surfaces.shape_ids] = surfaces.first_face[:-1]
     shape, primitive = (tensor.numpy()[kept].astype(np.int64) for tensor in (buffer.shapes, buffer.primitives))
     face = np.full(shape.shape, -1, np.int64)
-    face[used] = first[shape[used]] + primitive[used]
+    face[used] = surfaces.first_by_shape[shape[used]] + primitive[used]
     vertices = np.stack([getattr(buffer, f"vertices_{axis}").numpy()[kept] for axis in "xyz"], axis=-1).astype(float)
     vertices[~used] = np.nan
     wedges = buffer.diffracting_wedges

@@ -63,3 +63,15 @@ def component(tensor: Any, i: int) -> Any:
     """Entry ``i`` of a flattened tensor as an array of width 1. Differentiable."""
     flat = tensor.array
     return dr.gather(type(flat), flat, dr.uint32_array_t(type(flat))(i))
+
+
+def spread_pose(pose: Pose, count: int) -> Pose:
+    """A pose as arrays of ``count`` values.
+
+    The derivative of a gather is a sum in the same kernel; broadcast numbers would take a kernel for each of the
+    twelve.
+    """
+    table = dr.concat([*pose.position, *(c for row in pose.to_world for c in row)])
+    kind: Any = type(table)
+    wide = [dr.gather(kind, table, dr.full(dr.uint32_array_t(kind), i, count)) for i in range(12)]
+    return Pose(wide[:3], [wide[3:6], wide[6:9], wide[9:12]])

@@ -201,7 +201,7 @@ def possible(
     from ..backend.device import to_vectors
 
     length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
-    reflections, planes, images = chains.on_device
+    (reflections, planes, images), tables = chains.on_device, surfaces.planes_on_device
     step = max(1, PAIRS_PER_CHUNK // len(targets_m))
     # As data, not as code: the same kernel serves all numbers of targets.
     count = dr.opaque(mi.UInt32, len(targets_m))
@@ -217,7 +217,6 @@ def possible(
             active = level < reflects
             plane = dr.gather(mi.UInt32, planes[level], row, active)
             image = dr.gather(mi.Point3f, images[level], row, active)
-            tables = surfaces.planes_on_device
             n, d, u, v, low, high = (dr.gather(type(table), table, plane, active) for table in tables)
             here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
             met: Any = point + (image - point) * (here / (here - there))

@@ -70,13 +70,18 @@ class Surfaces:
         return content_digest(self.triangles, self.first_face)
 
     @cached_property
+    def first_by_shape(self) -> IntArray:
+        """First face of each object, by the index of its mesh in Mitsuba's registry."""
+        first = np.zeros(int(self.shape_ids.max(initial=0)) + 1, np.int64)
+        first[self.shape_ids] = self.first_face[:-1]
+        return first
+
+    @cached_property
     def faces_on_device(self) -> tuple[Any, Any]:
-        """First face by index in Mitsuba's registry, and plane of each face: Dr.Jit arrays, ``mi.UInt32``."""
+        """`first_by_shape`, and plane of each face: Dr.Jit arrays, ``mi.UInt32``."""
         from ..backend.device import to_uint
 
-        first = np.zeros(int(self.shape_ids.max(initial=0)) + 1, np.uint32)
-        first[self.shape_ids] = self.first_face[:-1]
-        return to_uint(first), to_uint(self.plane)
+        return to_uint(self.first_by_shape), to_uint(self.plane)
 
     @cached_property
     def planes_on_device(self) -> tuple[Any, ...]:

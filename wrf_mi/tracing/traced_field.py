@@ -40,7 +40,7 @@ from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters,
 from .material_parameters import MaterialGrouping
 from .options import FACTOR
 from .pattern_parameters import pattern_factor
-from .pose import component, moved_m, receiver_pose
+from .pose import component, moved_m, receiver_pose, spread_pose
 from .result import without_faint
 from .scene_tables import SceneTables
 from .solve import Prepared
@@ -257,7 +257,7 @@ class TracedField:
             chains = chains.select(chosen)
         chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
         tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
-        pose = _spread(receiver_pose(self.receiver, parameters, Float64), batch * each)
+        pose = spread_pose(receiver_pose(self.receiver, parameters, Float64), batch * each)
         antennas = self.receiver.antenna, self.options.tx_antenna
         paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
@@ -381,7 +381,7 @@ class TracedField:
         """
         if not dr.width(chains.exists):
             return np.zeros(0)
-        pose = _spread(receiver_pose(self.receiver, self._present, Float64), dr.width(chains.exists))
+        pose = spread_pose(receiver_pose(self.receiver, self._present, Float64), dr.width(chains.exists))
         tables = self.slabs.tables(self._present, self._constants, self.frequency_hz / self._stated_hz)
         antennas = self.receiver.antenna, self.options.tx_antenna
         with dr.suspend_grad():
@@ -412,14 +412,3 @@ def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: fl
 def _placed_as(stated_m: FloatArray, traced_m: FloatArray) -> bool:
     """Whether positions of a trace [n, 3] are those of stated antennas, which `before_walls` may have moved by 1 cm."""
     return stated_m.shape == traced_m.shape and np.allclose(stated_m, traced_m, rtol=0, atol=2 * NEAREST_M)
-
-
-def _spread(pose: Pose, count: int) -> Pose:
-    """A pose as arrays of ``count`` values.
-
-    The derivative of a gather is a sum in the same kernel; broadcast numbers would take a kernel for each of the
-    twelve.
-    """
-    table = dr.concat([*pose.position, *(c for row in pose.to_world for c in row)])
-    wide = [dr.gather(Float64, table, dr.full(mi.UInt32, i, count)) for i in range(12)]
-    return Pose(wide[:3], [wide[3:6], wide[6:9], wide[9:12]])
