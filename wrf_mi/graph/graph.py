@@ -29,11 +29,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
-from ..gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
+from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component
 from ..gaussians.tiles import Plane
+from ..tracing.field_calculator import Complex
 from ..tracing.options import FACTOR
 from ..tracing.polarization import check_polarization
 from ..tracing.pose import receiver_pose
@@ -66,6 +67,7 @@ class Batch:
         pose: pose of the receiver.
         plane: directions of the learned signal.
         weight: factor of the learned signal [batch], 0 to 1; None: 1.
+        signal: learned signal without its unit (`Graph.learned`); None: it is evaluated.
     """
 
     condition: Any
@@ -75,6 +77,7 @@ class Batch:
     plane: Plane
     weight: Any | None = None
     carrier: Any | None = None
+    signal: Complex | None = None
 
 
 Alone = Literal["traced", "learned"]
@@ -155,6 +158,11 @@ class Graph:
     def sphere(self) -> bool:
         """Whether receivers cover the full sphere instead of the upper hemisphere."""
         return self.models[0].sphere
+
+    @property
+    def moves(self) -> bool:
+        """Whether poses of receivers are trained."""
+        return self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
     @property
     def corrects(self) -> bool:
@@ -254,33 +262,41 @@ class Graph:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
 
-    def gaussians(
-        self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None, chunked: bool = False
-    ) -> Gaussians:
-        """Gaussians of a batch in the receiver's unit, one signal each; ``chunked`` as in `report`.
+    def learned(self, number: int, params: Mapping[str, Any], batch: Batch, chunked: bool = False) -> Complex:
+        """Signal of the Gaussians on a port's directions, without the receiver's unit (`unit`).
 
-        Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
-        error of a mesh scales with its paths, near and far.
+        Args:
+            number: number of the port.
+            params: parameters of the graph by name.
+            batch: transmitters and pose.
+            chunked: as in `report`.
+
+        Returns:
+            Real and imaginary part, [batch * components * directions].
         """
         assert self.field is not None
         made = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
         gaussians = by_component(made(params, _condition(batch)), self.form.components)
-        if LEVEL not in params and batch.weight is None:
-            return gaussians
-        kind: Any = type(gaussians.signal[0])
-        unit = kind(1)
-        if LEVEL in params:
-            unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
-            if paths is not None:
-                re, im = paths.gain
-                power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
-                unit = dr.sqrt(SHARE**2 * power + unit * unit)
-        if batch.weight is not None:
-            unit = unit * batch.weight
-        if (count := dr.width(unit)) > 1:
-            each = dr.width(gaussians.signal[0]) // count
-            unit = dr.gather(kind, unit, dr.arange(mi.UInt32, count * each) // each)
-        return replace(gaussians, signal=[part * unit for part in gaussians.signal])
+        pose = batch.pose
+        if self.moves:
+            pose = receiver_pose(self.receivers[number // self.carriers], params, mi.Float)
+        return self.evaluation(gaussians, pose, batch.plane, self.sphere, params)
+
+    def unit(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Any | None:
+        """Factor of the learned signal of each transmitter: the receiver's unit and the batch's weights; None: 1.
+
+        Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
+        error of a mesh scales with its paths, near and far.
+        """
+        if LEVEL not in params:
+            return batch.weight
+        kind = type(params[LEVEL].array)
+        unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
+        if paths is not None:
+            re, im = paths.gain
+            power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
+            unit = dr.sqrt(SHARE**2 * power + unit * unit)
+        return unit if batch.weight is None else unit * batch.weight
 
     def report(
         self,
@@ -303,10 +319,8 @@ class Graph:
                 compare; the unit of the Gaussians is that beside the paths. None: both together.
         """
         model: Any = self.models[number]
-        receiver = self.receivers[number // self.carriers]
         if alone is not None:
             model = getattr(model, "unscaled", model)
-        moves = self.scene is not None and (self.traced.position > 0 or self.traced.turn > 0)
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
@@ -314,9 +328,12 @@ class Graph:
             paths = None if side is None else side(params, batch.slots)
             if self.field is None or not learned or alone == "traced":
                 return model(paths, None)
-            here = receiver_pose(receiver, params, mi.Float) if moves else batch.pose
-            gaussians = self.gaussians(params, batch, paths, chunked)
-            signal = self.evaluation(gaussians, here, batch.plane, model.sphere, params)
+            signal = batch.signal or self.learned(number, params, batch, chunked)
+            if (unit := self.unit(params, batch, paths)) is not None:
+                if (count := dr.width(unit)) > 1:
+                    each = dr.width(signal[0]) // count
+                    unit = dr.gather(type(unit), unit, dr.arange(mi.UInt32, count * each) // each)
+                signal = signal[0] * unit, signal[1] * unit
             return model(None if alone == "learned" else paths, signal)
 
         return report

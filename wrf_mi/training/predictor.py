@@ -14,22 +14,21 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import to_float, to_tensor
-from ..backend.recorded import Recorded
+from ..backend.device import to_tensor
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text, rows_by_carrier
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.chunks import CHUNK_SIZE
-from ..gaussians.footprint import Pose
 from ..gaussians.parameters import Gaussians
-from ..gaussians.tiles import Plane, perception_plane
+from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_uplink, normalised_uplink
 from .reach import Reach
+from .recordings import Recordings, Where
 from .static_operator import StaticOperator
 from .step import Params, device_pose, evaluated
 
@@ -83,7 +82,7 @@ class Predictor:
         self._field, self._count = field, -1
         single = self._pixels and self.graph.form.carriers_hz is None
         self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
-        self._reports: dict[int | None, Recorded] = {}
+        self._recordings = Recordings()
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
@@ -93,7 +92,7 @@ class Predictor:
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
             # A recording is valid for one number of Gaussians.
-            self._count, self._reports = count, {}
+            self._count, self._recordings = count, Recordings()
         self._params, self._still = params, None
         dr.eval(self._params)
         for other in self._others.values():
@@ -237,12 +236,14 @@ class Predictor:
         weight: NDArray[Any] | None,
         alone: Alone | None = None,
     ) -> Any:
-        """Report of both sides, flat, unrecorded; positions without paths have learned signals only."""
-        learned = side is None or weight is None or bool(np.any(weight))
+        """Report of both sides, flat, with a recorded learned signal; positions of weight 0 have paths only."""
+        learned = self._field is not None and alone != "traced"
+        learned &= side is None or weight is None or bool(np.any(weight))
+        signal = self._signal(tx_pos_m.T, receiver) if learned else None
         report = self.graph.report(receiver, side, learned, alone=alone)
-        return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight)
+        return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight, signal)
 
-    def _where(self, port: int) -> tuple[int, Pose, Plane, float | None]:
+    def _where(self, port: int) -> Where:
         """Number, pose and directions of a port's receiver, and the logarithm of its carrier."""
         return port // self.graph.carriers, self._poses[port], self._plane, self.graph.log_carrier(port)
 
@@ -276,38 +277,34 @@ class Predictor:
         return self._in_parts(len(tx_pos_m), receiver, found)
 
     def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """Report for conditions [3 or features, at most `TOGETHER`], flat.
-
-        It is recorded, except for so many Gaussians that networks run in chunks: recording saves nothing there, and
-        lists of tiles, which a recorded function cannot count, have room for all.
-        """
-        count, where = condition.shape[1], self._where(receiver)
+        """Report for conditions [3 or features, at most `TOGETHER`], flat; recorded unless networks run in chunks."""
+        where = self._where(receiver)
         if self._count * self._together > CHUNK_SIZE:
             report = self.graph.report(receiver, None, chunked=True)
             return evaluated(report, self._params, condition, *where, weight=weight)
-        key = None if self._pixels else receiver  # one recording serves the pixels of all ports
-        if key not in self._reports:
-            report = self.graph.report(receiver, None)
+        report = self.graph.report(receiver, None)
 
-            def predicted(params: Params, batch: Batch) -> Any:
-                with dr.suspend_grad():
-                    return report(params, batch)
+        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any, ...]:
+            return (report(params, batch),)
 
-            # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(report, self._params, condition[:, :1], *where)
-            self._reports[key] = Recorded(predicted, partial(self.graph.arrays, receiver, None))
-        # The batch size is a constant of the recorded kernels: copies fill the last batch.
-        filled = np.minimum(np.arange(self._together), count - 1)
-        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, self._together)
-        dr.make_opaque(slots)
-        weights = None if weight is None else to_float(weight[filled])
-        number, pose, plane, log_carrier = where
-        carrier = None if log_carrier is None else dr.opaque(mi.Float, log_carrier)
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, number), pose, plane, weights, carrier)
-        found = self._reports[key](self._params, batch)
-        if count == self._together:
-            return found
-        return dr.gather(type(found), found, dr.arange(mi.UInt32, count * (dr.width(found) // self._together)))
+        # One recording serves the pixels of all ports.
+        port, state = None if self._pixels else receiver, partial(self.graph.arrays, receiver, None)
+        name = "report", port
+        return self._recordings(name, self._together, reported, self._params, condition, where, weight, state)[0]
+
+    def _signal(self, condition: FloatArray, port: int) -> tuple[Any, ...] | None:
+        """Recorded signal of the Gaussians for conditions [3, m], without its unit; None: it is not recorded.
+
+        One transmitter and batches of `TOGETHER` are; copies that filled other batches would cost more than they save.
+        """
+        count = condition.shape[1]
+        size = 1 if count == 1 else TOGETHER
+        filled = size // 2 < count <= size
+        if not filled or not self.graph.evaluation.recordable or self._count * size > CHUNK_SIZE:
+            return None
+        # One recording serves the poses of all receivers unless they are trained.
+        name, where = ("signal", port if self.graph.moves else None), self._where(port)
+        return self._recordings(name, size, partial(self.graph.learned, port), self._params, condition, where)
 
     def _reported(
         self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None

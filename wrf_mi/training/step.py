@@ -26,6 +26,7 @@ from ..gaussians.render import splat
 from ..gaussians.tiles import Plane
 from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Field, Report
+from ..tracing.field_calculator import Complex
 from .adam import NonFiniteReport, Params, guarded_step, rated_params
 
 Loss = Callable[..., Any]
@@ -181,17 +182,20 @@ def evaluated(
     carrier: float | None = None,
     slots: NDArray[Any] | None = None,
     weight: NDArray[Any] | None = None,
+    signal: Complex | None = None,
 ) -> Any:
     """A report of conditions [3 or features, m], evaluated without gradients.
 
-    ``carrier`` is `Batch.carrier`; ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m]
-    scales the Gaussians' signal.
+    ``carrier`` and ``signal`` are those of a `Batch`; ``slots`` are rows of the traced side [m], by default the first
+    m; ``weight`` [m] scales the Gaussians' signal.
     """
     with dr.suspend_grad():
         rows = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
         weights = None if weight is None else to_float(weight)
         tx = to_tensor(np.ascontiguousarray(condition))
         log_carrier = None if carrier is None else dr.opaque(mi.Float, carrier)
-        found = report(params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights, log_carrier))
+        found = report(
+            params, Batch(tx, rows, dr.opaque(mi.UInt32, receiver), pose, plane, weights, log_carrier, signal)
+        )
         dr.eval(found)
     return found
