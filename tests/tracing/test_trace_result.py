@@ -155,7 +155,7 @@ def test_derivatives_by_materials_are_central_differences(traced: TraceResult, s
     import mitsuba as mi
 
     surfaces = scene_surfaces(scene)
-    buffer = to_buffer(traced.legs(surfaces), surfaces, valid=True)
+    buffer = to_buffer(traced.legs(surfaces), surfaces)
     material = scene.radio_materials["itu_brick"]
     material.frequency_update_callback = None
     names = "relative_permittivity", "conductivity", "thickness"

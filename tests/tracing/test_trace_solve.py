@@ -197,7 +197,7 @@ def test_paths_of_a_seed_do_not_depend_on_chunks(divided: Any, monkeypatch: pyte
     options = replace(UPRIGHT, transmission=True, max_depth=2, rays=1 << 12)
     whole = trace_paths(divided, tx, rx, options).paths
     equal(trace_paths(divided, tx, rx, options).paths, whole)
-    monkeypatch.setattr(solve_module, "TARGETS_PER_CHUNK", 4)
+    monkeypatch.setattr(solve_module, "PAIRS_TOGETHER", 4)
     monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
     monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
     monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
@@ -221,7 +221,6 @@ def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypat
         raise AssertionError("searched")
 
     monkeypatch.setattr(search_module, "_shoot", refuse)
-    monkeypatch.setattr(images_module, "crossings", refuse)
     monkeypatch.setattr(solve_module, "sampled_paths", refuse)
     tx, rx = inside(2), receiver([1.0, 1.0, 1.0])
     assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, reflection=False)).paths) == 2
@@ -355,17 +354,3 @@ def test_wrong_arguments_are_refused(empty: Any):
         with pytest.raises(InputError, match=next(iter(setting))):
             TraceOptions(**setting)
     assert THICKNESS_M["itu_brick"] == 0.1
-
-
-def test_recorded_tests_of_candidates_find_the_paths_of_unrecorded_ones(shoebox: Any, divided: Any):
-    """In two scenes in turn; a new `Prepared` records nothing in its first trace."""
-    tx, rx = inside(5, 3), receiver([1.0, 4.0, 2.0])
-    shared = {scene: solve_module.Prepared(scene) for scene in (shoebox, divided)}
-    for rows in (tx[:1], tx[1:2], tx[2:3], tx[:2], tx[2:5], tx[3:4]):
-        for scene, prepared in shared.items():
-            known = trace_paths(scene, rows, rx, UPRIGHT, prepared=prepared).paths
-            new = trace_paths(scene, rows, rx, UPRIGHT, prepared=solve_module.Prepared(scene)).paths
-            np.testing.assert_array_equal(known.objects, new.objects)
-            np.testing.assert_array_equal(known.length_m, new.length_m)
-            np.testing.assert_array_equal(known.gain, new.gain)
-    assert all(prepared._test._recorded.n_recordings for prepared in shared.values())

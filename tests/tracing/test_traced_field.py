@@ -162,7 +162,7 @@ def test_derivatives_by_materials_are_those_of_sionna_rt(scene: Any) -> None:
     try:
         concrete.relative_permittivity, concrete.conductivity = permittivity, conductivity
         surfaces = scene_surfaces(scene)
-        buffer = to_buffer(found.legs(surfaces), surfaces, valid=True)
+        buffer = to_buffer(found.legs(surfaces), surfaces)
         gain = field_of(scene, buffer, found.ends(), found.rays, loop_mode="evaluated")
         dr.backward(dr.sum(gain[0] * mi.Float(weight[0]) + gain[1] * mi.Float(weight[1])))
         theirs = [float(dr.grad(permittivity)[0]), float(dr.grad(conductivity)[0])]

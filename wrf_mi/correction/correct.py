@@ -41,7 +41,7 @@ from .options import DEFAULTS, FRAME, GAIN, HIDDEN, PLANES, STRENGTHS, Correctio
 NONE = np.zeros((0, 2), np.int64)
 """No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
 CONFIDENCE = 0.95
-"""One-sided confidence in the gain at receivers: two agree by chance too often to move walls for a third."""
+"""One-sided confidence in the gain of a stage: fits with more freedom also fit what no surface explains."""
 
 
 @dataclass
@@ -160,7 +160,7 @@ def correct_scene(
             others = fit_of(parts.held, parts.held_rows, found).misfit
         scores[stage] = others.scores(parts.with_mean_gain(found.vector, trial.misfit))
     judged = {key: parts.units(score) for key, score in scores.items()}
-    kept = _kept(judged, task.higher_is_better, bool(parts.out))
+    kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
     final = fit_of(record, split.all_train, best)
     vector, deviation, free = final.stated, np.zeros(len(final.stated)), np.zeros(0, np.int64)
@@ -262,17 +262,15 @@ def _at_most(split: Split, count: int) -> Split:
     return replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
 
 
-def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool, of_receivers: bool) -> str:
-    """The last stage that improves on the one kept before by more than the standard error of the mean gain.
+def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
+    """The last stage whose mean gain over the one kept before is more than 0, with the one-sided `CONFIDENCE`.
 
-    Receivers are few; their gain has to exceed the quantile of Student's t distribution.
-
-    Fits with more freedom also fit what no surface explains; a gain within its error does not justify moving walls.
+    By Student's t distribution, as receivers are few.
     """
     kept = ""
     for stage, score in scores.items():
-        errors = float(stdtrit(len(score) - 1, CONFIDENCE)) if of_receivers else 1.0
-        if improves(score, scores[kept], higher_is_better, errors):
+        known = np.count_nonzero(np.isfinite(score - scores[kept]))
+        if known > 1 and improves(score, scores[kept], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
             kept = stage
     return kept
 

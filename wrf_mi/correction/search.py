@@ -210,8 +210,8 @@ def alternatives(
 ) -> list[tuple[float, str, FloatArray]]:
     """Alternatives of a choice, those with the least cost first: cost, name and vector.
 
-    Of a material and a shift together, the best of some shifts, or of each of the materials, are compared after least
-    squares, too.
+    Of a material and a shift together, the best of some shifts, or with ``of_materials`` those of each material and the
+    plane where it is, are compared after least squares, too.
     """
     tried, expected = list[tuple[float, str, FloatArray]](), rules.expected(vector, choice.places)
     for name, values in choice.values.items():
@@ -227,6 +227,11 @@ def alternatives(
             key = name.partition(",")[kind]
             if count[key] < each and len(few) < most:
                 count[key] += 1
+                few.append((name, there))
+        if of_materials:  # also where the plane is, as the shifts above are those of a lattice
+            for name in count:
+                there = next(there for other, there in few if other.partition(",")[0] == name).copy()
+                there[choice.plane] = vector[choice.plane]
                 few.append((name, there))
         places = choice.places if trials is rules.misfit else choice.plane
         for name, there in few:

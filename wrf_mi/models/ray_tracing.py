@@ -41,7 +41,7 @@ from ..tracing.corrected_scene import check_materials, write_corrected_scene
 from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.polarization import warn_of_cross_polarization
 from ..tracing.result import join_traces
-from ..tracing.solve import TARGETS_PER_CHUNK
+from ..tracing.solve import PAIRS_TOGETHER
 from ..tracing.tracer import RayTracer
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
@@ -275,7 +275,7 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     rays, least = tracer.rays(tx_pos_m), TRACED_AT_LEAST
     if not tracer.options.sampled:
         least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
-    parts = row_parts(len(tx_pos_m), scheduler.workers, least, TARGETS_PER_CHUNK)
+    parts = row_parts(len(tx_pos_m), scheduler.workers, least, PAIRS_TOGETHER)
     given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
     sizes = [len(positions) for positions, *_ in given]
     options = replace(tracer.options, rays=rays)

@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "traced-room"
 MEASURED = "room"  # folder beside the spectra with the measured scene, the input of models
-FORMAT = 1  # version of the files, to be raised when they change for equal parameters
+FORMAT = 2  # version of the files, to be raised when they change for equal parameters
 SCATTERING, DIFFRACTION = 2, 8
 """Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
 

@@ -21,11 +21,6 @@ SPECULAR, TRANSMISSION = 1, 4
 
 ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
 """Fields of `Legs` with a value, or a row, for each path."""
-FIELDS: tuple[str, ...] = ("_valid", "_src_indices", "_tgt_indices", "_interaction_types", "_shapes", "_primitives")
-FIELDS += ("_probs", "_vertices_x", "_vertices_y", "_vertices_z")
-"""Fields of a ``PathsBuffer`` that the image method reads or sets."""
-LEAST_RECORDED, MOST_RECORDED = 32, 1 << 14
-"""Sizes of recordings of the image method."""
 WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 """Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
 
@@ -77,11 +72,8 @@ def specular_legs(
     return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
 
 
-def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
-    """A ``PathsBuffer`` of these paths, as candidates for the image method or (``valid``) as found.
-
-    Candidates may hold transmissions without a face: the image method finds it.
-    """
+def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
+    """A ``PathsBuffer`` of these paths."""
     import drjit as dr
     import mitsuba as mi
     from sionna.rt.path_solvers.paths_buffer import PathsBuffer
@@ -91,12 +83,12 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
-    face = np.where(used, np.maximum(legs.face, 0), 0)
+    face = np.where(used, legs.face, 0)
     thing = surfaces.object_of(face)
     shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
     shape[used] = surfaces.shape_ids[thing[used]]
     primitive[used] = (face - surfaces.first_face[thing])[used]
-    buffer._valid = dr.opaque(mi.Bool, valid, count)
+    buffer._valid = dr.opaque(mi.Bool, True, count)
     buffer._src_indices, buffer._tgt_indices = columns_on_device((legs.source, legs.target), mi.UInt32)
     integers: Any = mi.TensorXu
     numbers = columns_on_device((legs.interactions, shape, primitive), mi.UInt32)
@@ -116,8 +108,8 @@ def to_buffer(legs: Legs, surfaces: Surfaces, valid: bool) -> Any:
     return buffer
 
 
-def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
-    """Indices of the valid paths in a buffer, and the paths."""
+def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
+    """The valid paths in a buffer."""
     import drjit as dr
 
     buffer.schedule()
@@ -133,7 +125,7 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> tuple[IntArray, Legs]:
     wedges = buffer.diffracting_wedges
     wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[kept] for name in WEDGE}
     source, target = (index.numpy()[kept].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
-    return kept, Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
+    return Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
 
 
 def exact_paths(mi_scene: Any, buffer: Any, sources_m: Any, targets_m: Any) -> Any:
@@ -148,60 +140,6 @@ def exact_paths(mi_scene: Any, buffer: Any, sources_m: Any, targets_m: Any) -> A
         src_positions=sources_m,
         tgt_positions=targets_m,
     )
-
-
-class SpecularTest:
-    """Tests candidates without diffraction by Sionna RT's image method.
-
-    Few candidates are tested by a recording for each power of two: to trace the operations takes several times longer
-    than the rays of some thousand candidates.
-
-    Args:
-        scene: ``sionna.rt.Scene`` of constant geometry.
-        surfaces: its surfaces.
-    """
-
-    def __init__(self, scene: Any, surfaces: Surfaces) -> None:
-        from ..backend.recorded import Recorded
-
-        self._scene, self._surfaces = scene, surfaces
-        self._recorded = Recorded(_recordable)
-        self._met: set[tuple[int, int]] = set()
-
-    def __call__(self, legs: Legs, sources_m: Any, targets_m: Any) -> tuple[IntArray, Legs]:
-        """Indices of the candidates that are unobstructed paths, and these paths.
-
-        Args:
-            legs: candidates; transmissions need no face.
-            sources_m: ``mi.Point3f`` that `Legs.source` numbers, metres.
-            targets_m: ``mi.Point3f`` that `Legs.target` numbers, metres.
-        """
-        count, surfaces, mi_scene = len(legs), self._surfaces, self._scene.mi_scene
-        if not 0 < count <= MOST_RECORDED:
-            buffer = to_buffer(legs, surfaces, valid=False)
-            return from_buffer(exact_paths(mi_scene, buffer, sources_m, targets_m), surfaces)
-        shape = max(LEAST_RECORDED, 1 << (count - 1).bit_length()), legs.face.shape[1]
-        filled = legs.select(np.minimum(np.arange(shape[0]), count - 1))  # copies of the last
-        buffer = to_buffer(filled, surfaces, valid=False)
-        test = self._recorded if shape in self._met else _recordable  # a recording costs more than a single test
-        self._met.add(shape)
-        fields = {name: getattr(buffer, name) for name in FIELDS}
-        for name, values in test(mi_scene, shape, fields, sources_m, targets_m).items():
-            setattr(buffer, name, values)
-        kept, found = from_buffer(buffer, surfaces)
-        given = kept < count
-        return kept[given], found.select(given)
-
-
-def _recordable(mi_scene: Any, shape: tuple[int, int], fields: dict[str, Any], sources: Any, targets: Any) -> Any:
-    """`exact_paths` on the `FIELDS` of a buffer of candidates and interactions."""
-    from sionna.rt.path_solvers.paths_buffer import PathsBuffer
-
-    buffer: Any = PathsBuffer(*shape, False)
-    for name, values in fields.items():
-        setattr(buffer, name, values)
-    done = exact_paths(mi_scene, buffer, sources, targets)
-    return {name: getattr(done, name) for name in FIELDS}
 
 
 def join(parts: list[Legs], depth: int) -> Legs:

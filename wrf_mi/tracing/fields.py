@@ -148,7 +148,7 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
     gain = np.zeros(len(legs), np.complex128)
     for start in range(0, len(legs), PATHS_PER_CHUNK):
         part = slice(start, start + PATHS_PER_CHUNK)
-        buffer = to_buffer(legs.select(part), surfaces, valid=True)
+        buffer = to_buffer(legs.select(part), surfaces)
         real, imaginary = field_of(scene, buffer, ends, rays)
         dr.eval(real, imaginary)  # in one kernel, not in one for each part
         gain[part] = real.numpy() + 1j * imaginary.numpy()

@@ -59,7 +59,7 @@ def sampled_paths(
         buffer.schedule()
         dr.eval()
         buffer.shrink()
-        _, found = from_buffer(exact_paths(scene.mi_scene, buffer, *ends), surfaces)
+        found = from_buffer(exact_paths(scene.mi_scene, buffer, *ends), surfaces)
         types = found.interactions
         found = found.select(((types != 0) & (types != SPECULAR) & (types != TRANSMISSION)).any(axis=1))
         parts.append(replace(found, target=found.target + start))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -20,9 +20,6 @@ PAIRS_PER_CHUNK = 1 << 24
 """Pairs of chain and position in a chunk: 64 MiB for each single-precision array."""
 RAYS_PER_CHUNK = 1 << 20
 """Rays in a chunk."""
-END_M = 1e-4
-"""Distance from the end of a segment within which a hit is the surface that reflects there."""
-
 MARGIN_M = 1e-3
 """Slack of the bounds of planes."""
 MOST_KEPT = 1 << 27
@@ -32,15 +29,23 @@ _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 @dataclass(frozen=True)
 class ReflectionChains:
-    """Sequences of reflecting planes seen from one source; c chains.
+    """Sequences of reflecting planes seen from sources; c chains.
 
     Attributes:
         plane: planes in their order from the source, shape [c, depth], -1 beyond the last.
         image: images of the source after each reflection, shape [c, depth, 3], metres, float64.
+        source: number of the source of each chain, shape [c].
     """
 
     plane: IntArray
     image: FloatArray
+    source: IntArray
+
+    @classmethod
+    def joined(cls, chains: Sequence[ReflectionChains]) -> ReflectionChains:
+        """Chains from one source each, which are numbered in order."""
+        source = np.repeat(np.arange(len(chains)), [len(part) for part in chains])
+        return cls(np.concatenate([part.plane for part in chains]), np.concatenate([p.image for p in chains]), source)
 
     def __len__(self) -> int:
         """Number of chains."""
@@ -189,7 +194,7 @@ def possible(
 
     Args:
         surfaces: surfaces of the scene.
-        chains: chains from one source.
+        chains: chains from any sources.
         targets_m: positions [n, 3], metres.
 
     Yields:
@@ -228,47 +233,3 @@ def possible(
         chain, target = found // len(targets_m) + start, found % len(targets_m)
         order = np.argsort(length[chain], kind="stable")
         yield chain[order], target[order]
-
-
-def crossings(scene: Any, surfaces: Surfaces, start_m: FloatArray, end_m: FloatArray, most: int) -> IntArray:
-    """Number of surfaces between two points of each row without the ends; ``most + 1`` for more than ``most``.
-
-    Mitsuba's surface interaction takes a call of each shape, which to trace and compile takes longer than the rays:
-    points and normals are computed from distances and faces here.
-
-    Args:
-        scene: ``sionna.rt.Scene``.
-        surfaces: its surfaces.
-        start_m: first points [n, 3], metres.
-        end_m: second points [n, 3], metres.
-        most: largest number that is counted.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    from ..backend.device import to_vectors
-
-    if not len(start_m) or not scene.objects:
-        return np.zeros(len(start_m), np.int64)
-    start, end = to_vectors(start_m, mi.Point3f), to_vectors(end_m, mi.Point3f)
-    length = dr.norm(end - start)
-    direction = (end - start) / length
-    limit = dr.opaque(mi.UInt32, most)
-    (first_face, plane), normal = surfaces.faces_on_device, surfaces.planes_on_device[0]
-
-    def body(active: Any, count: Any, origin: Any) -> tuple[Any, Any, Any]:
-        hit = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
-        met = origin + direction * hit.t
-        # From the start: the ray's origin is moved off the last surface by up to a millimetre.
-        inside = active & hit.is_valid() & (dr.dot(met - start, direction) < length - END_M)
-        count += dr.select(inside, mi.UInt32(1), mi.UInt32(0))
-        shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
-        face = dr.gather(mi.UInt32, first_face, shape, inside) + hit.prim_index
-        n = dr.gather(mi.Vector3f, normal, dr.gather(mi.UInt32, plane, face, inside), inside)
-        # As Mitsuba spawns rays: along the normal, by an error of rounding that grows with the coordinates.
-        offset = dr.mulsign((1 + dr.max(dr.abs(met))) * mi.math.RayEpsilon, dr.dot(n, direction))
-        return inside & (count <= limit), count, mi.Point3f(met + n * offset)
-
-    none = dr.zeros(mi.UInt32, len(start_m))
-    first = length > 2 * END_M, none, start + direction * END_M
-    return np.asarray(dr.while_loop(first, lambda active, *_: active, body)[1], np.int64)

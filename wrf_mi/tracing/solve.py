@@ -16,7 +16,7 @@ from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from .buffer import Legs, SpecularTest, join
+from .buffer import Legs, join
 from .devices import before_walls, check_devices
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-TARGETS_PER_CHUNK = 4096
-"""Targets of one source in a chunk."""
+SOURCES_TOGETHER = 32
+"""Sources whose paths are searched together: a search has a fixed cost."""
+PAIRS_TOGETHER = 4096
+"""Pairs of source and target in a chunk."""
 FIRST_RAYS = 1 << 14
 """First number of rays of `converged_rays`."""
 GROWTH = 5e-4
@@ -53,7 +55,6 @@ class Prepared:
 
     def __init__(self, scene: Any, surfaces: Surfaces | None = None) -> None:
         self.scene, self.surfaces = scene, surfaces or scene_surfaces(scene)
-        self._test = SpecularTest(scene, self.surfaces)
         self._chains: dict[tuple[bytes, TraceOptions, int], ReflectionChains] = {}
         self._rays: dict[TraceOptions, int] = {}
         self._tables: dict[MaterialGrouping, SceneTables] = {}
@@ -104,24 +105,27 @@ class Prepared:
             self._rays[options] = converged_rays(self, sources_m, targets_m, options)
         return self._rays[options]
 
-    def chains(self, source_m: FloatArray, options: TraceOptions, rays: int) -> ReflectionChains:
-        """Sequences of planes that rays from a point [3] meet."""
-        key = source_m.tobytes(), options, rays
+    def chains(self, sources_m: FloatArray, options: TraceOptions, rays: int) -> ReflectionChains:
+        """Sequences of planes that rays from points [s, 3] meet."""
+        key = sources_m.tobytes(), options, rays
         if key not in self._chains:
-            self._chains[key] = self.new_chains(source_m, options, rays, options.seed)
+            self._chains[key] = self.new_chains(sources_m, options, rays, options.seed)
         return self._chains[key]
 
-    def new_chains(self, source_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
-        """Chains from a point [3] by rays of any seed, not kept here."""
-        met, surfaces = options.max_depth if options.transmission else options.reflections, self.surfaces
-        plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed)
-        return ReflectionChains(plane, image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:])
+    def new_chains(self, sources_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
+        """Chains from points [s, 3] by rays of any seed, not kept here."""
+        met, surfaces, found = options.max_depth if options.transmission else options.reflections, self.surfaces, []
+        for source_m in sources_m:
+            plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed)
+            image = image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:]
+            found.append(ReflectionChains(plane, image, np.zeros(len(plane), np.int64)))
+        return ReflectionChains.joined(found)
 
     def specular_paths(
-        self, chains: ReflectionChains, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions
+        self, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
     ) -> Legs:
-        """Paths from a point [3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
-        return specular_paths(self.scene, self.surfaces, self._test, chains, source_m, targets_m, options)
+        """Paths from points [s, 3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
+        return specular_paths(self.scene, self.surfaces, chains, sources_m, targets_m, options)
 
 
 def trace_paths(
@@ -141,8 +145,8 @@ def trace_paths(
     Rays search from the side with fewer devices: by reciprocity a path and its gain are the same both ways. (With
     diffraction transmitters search: Sionna RT's diffraction at lossy wedges is a heuristic that is not reciprocal.)
     Sequences of reflecting planes that the rays of one source find are tried for every position of the other side, so
-    that rays are not shot for each; Sionna RT's image method decides which are paths, and its field calculator gives
-    their gains.
+    that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.visibility`), and
+    Sionna RT's field calculator gives their gains.
 
     Memory grows with the paths found, about 1 kB for each at six interactions (measured), and not with the positions
     tried: chunks are bounded by `wrf_mi.tracing.images.CANDIDATES_PER_CHUNK` and
@@ -208,16 +212,19 @@ def _search(
     bar = Progress(console=Console(stderr=True), transient=True, disable=not progress)
     with bar:
         task = bar.add_task("tracing paths", total=len(sources) * len(targets))
-        for index, source in enumerate(sources):
-            chains = shared.chains(source, options, rays)
-            for start in range(0, len(targets), TARGETS_PER_CHUNK):
-                batch = targets[start : start + TARGETS_PER_CHUNK]
-                found = [shared.specular_paths(chains, source, batch, options)]
+        for first in range(0, len(sources), SOURCES_TOGETHER):
+            some = sources[first : first + SOURCES_TOGETHER]
+            chains, step = shared.chains(some, options, rays), max(1, PAIRS_TOGETHER // len(some))
+            for start in range(0, len(targets), step):
+                batch = targets[start : start + step]
+                found = [shared.specular_paths(chains, some, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
-                    found.append(sampled_paths(scene, shared.surfaces, source, batch, options, rays))
+                    for index, source in enumerate(some):
+                        legs = sampled_paths(scene, shared.surfaces, source, batch, options, rays)
+                        found.append(replace(legs, source=np.full_like(legs.source, index)))
                 legs = join(found, depth)
-                parts.append(replace(legs, source=np.full_like(legs.source, index), target=legs.target + start))
-                bar.advance(task, len(batch))
+                parts.append(replace(legs, source=legs.source + first, target=legs.target + start))
+                bar.advance(task, len(some) * len(batch))
     return join(parts, depth)
 
 
@@ -238,11 +245,9 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
     plain = replace(options, diffraction=False, scattering=False)
     best, calm, rays = np.zeros(2), 0, FIRST_RAYS
     while True:
-        found = np.zeros(2)
-        for source in sources:
-            chains = shared.new_chains(source, plain, rays, options.seed + rays.bit_length())
-            legs = shared.specular_paths(chains, source, targets, plain)
-            found += len(legs), (_lengths(legs, source[None], targets) ** -2).sum()
+        chains = shared.new_chains(sources, plain, rays, options.seed + rays.bit_length())
+        legs = shared.specular_paths(chains, sources, targets, plain)
+        found = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
         calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
         best = np.maximum(best, found)
         logger.info("%d rays: %d paths on a sample of positions", rays, found[0])
