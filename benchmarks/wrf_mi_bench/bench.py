@@ -96,7 +96,7 @@ CASES: Mapping[str, Case] = {
 
 _OWN: Mapping[str, Check] = {
     "traced-and-splatted": _here("Mitsuba integrator", "traced:main"),
-    "image-method": _here("Sionna RT against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
+    "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
     "flat-plan": _here("mesh of a flat", "plan:flat_plan", FLAT),

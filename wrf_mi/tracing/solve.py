@@ -74,20 +74,20 @@ class Prepared:
         names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
         names += [f"receiver {receiver.name}" for receiver in receivers]
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
-        traced = before_walls(self.surfaces, stated)
         for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
-            new = [row for row in side if stated[row].tobytes() not in self._checked]
-            if moved := [row for row in new if (stated[row] != traced[row]).any()]:
+            new = np.array([row for row in side if stated[row].tobytes() not in self._checked], int)
+            traced = before_walls(self.surfaces, stated[new])
+            if len(moved := new[(stated[new] != traced).any(axis=1)]):
                 text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
                 logger.warning(text, len(moved), len(new), names[moved[0]])
-            check_devices(self.surfaces, traced[new], [names[row] for row in new])
-            self._checked.update(stated[row].tobytes() for row in side)
+            check_devices(self.surfaces, traced, [names[row] for row in new])
+            self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
         """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.before_walls`."""
-        positions = before_walls(self.surfaces, np.stack([receiver.position_m for receiver in receivers]))
-        moved = tuple(replace(rx, position_m=position) for rx, position in zip(receivers, positions, strict=True))
-        return before_walls(self.surfaces, tx_pos_m), moved
+        stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
+        positions, others = np.split(before_walls(self.surfaces, stated), [len(tx_pos_m)])
+        return positions, tuple(replace(rx, position_m=here) for rx, here in zip(receivers, others, strict=True))
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""

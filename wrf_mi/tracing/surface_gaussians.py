@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -76,6 +77,10 @@ class SurfaceGaussians:
         """Number of Gaussians."""
         return self.discs.shape[1]
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.discs[:3].T)
+
     @classmethod
     def covering(cls, met: Interactions, spacing_m: float) -> SurfaceGaussians:
         """Gaussians where interactions lie: at their mean in each cell of a lattice of ``spacing_m`` in each plane."""
@@ -99,9 +104,7 @@ class SurfaceGaussians:
         # Twice as many neighbours as needed, as those of other planes do not count.
         count = min(2 * NEAREST, len(self))
         ranks = np.arange(1, count + 1)
-        distance, found = cKDTree(self.discs[:3].T).query(
-            met.position_m, ranks, distance_upper_bound=EXTENT * self.size_m
-        )
+        distance, found = self._tree.query(met.position_m, ranks, distance_upper_bound=EXTENT * self.size_m)
         real = found < len(self)
         found = np.where(real, found, 0)
         normal = self.discs[3:].T[found]

@@ -50,6 +50,10 @@ from .surfaces import Surfaces, scene_surfaces
 Float64: Any = dr.float64_array_t(mi.Float)
 
 
+SINGLE = 16
+"""Numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all."""
+
+
 @dataclass(frozen=True)
 class TracedOptions:
     """Options of a traced field.
@@ -198,6 +202,11 @@ class TracedField:
         return [self.chains, self._constants, self._planes, self._weights]
 
     @property
+    def form(self) -> tuple[int, int, int]:
+        """Sizes that a recording has as constants: fields of equal forms differ in `arrays` alone."""
+        return self._each, len(self.chains.levels), 0 if self._weights is None else self._weights.each
+
+    @property
     def gain_name(self) -> str:
         """Name of the parameter [2]: logarithm of the instrument's amplitude, and its phase in rad."""
         return gain_name(self.receiver)
@@ -328,6 +337,8 @@ class TracedField:
             kept = np.flatnonzero(without_faint(tx, self._amplitudes(found), share))
         tx, types, face, vertices_m = tx[kept], types[kept], face[kept], traced.paths.vertices_m[kept]
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
+        if len(self) == 1:
+            each = -(-each // SINGLE) * SINGLE
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
         place[entry], present[entry] = kept, True

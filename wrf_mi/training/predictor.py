@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -83,6 +83,7 @@ class Predictor:
         single = self._pixels and self.graph.form.carriers_hz is None
         self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
         self._recordings = Recordings()
+        self._traced: dict[Hashable, TracedField] = {}
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
         self.update({name: to_tensor(values) for name, values in params.items()})
@@ -236,9 +237,11 @@ class Predictor:
         weight: NDArray[Any] | None,
         alone: Alone | None = None,
     ) -> Any:
-        """Report of both sides, flat, with a recorded learned signal; positions of weight 0 have paths only."""
+        """Report of both sides, flat, recorded where it can be; positions of weight 0 have paths only."""
         learned = self._field is not None and alone != "traced"
         learned &= side is None or weight is None or bool(np.any(weight))
+        if side is not None and len(side) == 1 and self._may_record(1):
+            return self._single(tx_pos_m.T, receiver, side, learned, weight, alone)
         signal = self._signal(tx_pos_m.T, receiver) if learned else None
         report = self.graph.report(receiver, side, learned, alone=alone)
         return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight, signal)
@@ -292,19 +295,41 @@ class Predictor:
         name = "report", port
         return self._recordings(name, self._together, reported, self._params, condition, where, weight, state)[0]
 
+    def _may_record(self, size: int) -> bool:
+        """Whether functions of Gaussians are recorded for batches of a size: see `Recordings`."""
+        return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
+
+    def _single(
+        self,
+        condition: FloatArray,
+        port: int,
+        side: TracedField,
+        learned: bool,
+        weight: NDArray[Any] | None,
+        alone: Alone | None,
+    ) -> Any:
+        """Recorded report of the only transmitter of a traced side, whose arrays are inputs of the recording."""
+        name = "both", port, learned, alone, side.form
+        self._traced[name] = side
+
+        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any]:
+            return (self.graph.report(port, self._traced[name], learned, alone=alone)(params, batch),)
+
+        def read() -> list[Any]:
+            return self.graph.arrays(port, self._traced[name])
+
+        return self._recordings(name, 1, reported, self._params, condition, self._where(port), weight, read)[0]
+
     def _signal(self, condition: FloatArray, port: int) -> tuple[Any, ...] | None:
         """Recorded signal of the Gaussians for conditions [3, m], without its unit; None: it is not recorded.
 
-        One transmitter and batches of `TOGETHER` are; copies that filled other batches would cost more than they save.
+        Batches of `TOGETHER` are; copies that filled others would cost more than they save.
         """
-        count = condition.shape[1]
-        size = 1 if count == 1 else TOGETHER
-        filled = size // 2 < count <= size
-        if not filled or not self.graph.evaluation.recordable or self._count * size > CHUNK_SIZE:
+        if not TOGETHER // 2 < condition.shape[1] <= TOGETHER or not self._may_record(TOGETHER):
             return None
         # One recording serves the poses of all receivers unless they are trained.
         name, where = ("signal", port if self.graph.moves else None), self._where(port)
-        return self._recordings(name, size, partial(self.graph.learned, port), self._params, condition, where)
+        return self._recordings(name, TOGETHER, partial(self.graph.learned, port), self._params, condition, where)
 
     def _reported(
         self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
