@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import shapely
@@ -12,6 +13,7 @@ import shapely
 from ..core import InputError
 from ..core.angles import FloatArray
 from .classify import kinds
+from .layers import layers
 from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
 from .points import thin
@@ -55,17 +57,32 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     planes, noise = find_planes(cloud)
     points = points.astype(np.float32)
     kept: list[Plane] = []
-    areas, reach = [], []
+    areas, reach, niches = [], [], dict[int, Any]()
     # A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
     free = np.ones(len(points), bool)
-    for plane in _refined(planes, points, noise):
-        index = np.flatnonzero(near(plane, points, 2 * noise) & free)
+    for stated in _refined(planes, points, noise):
+        plane, parallel = layers(stated, points, free, noise)
+        behind = []
+        for layer in parallel:
+            area, cell = outline(layer.plane, points[layer.rows])
+            if area.area >= SMALLEST_M2:
+                kept.append(layer.plane)
+                areas.append(area)
+                reach.append(3 * noise + cell)
+                free[layer.rows] = False
+                behind += [] if layer.before else [area]
+        mine = near(plane, points, 2 * noise) & free
+        for layer in parallel:
+            mine[layer.rows] = layer.before  # a wall goes on behind a board
+        index = np.flatnonzero(mine)
         if len(index) < FEWEST_POINTS:
             continue
         area, cell = outline(plane, points[index])
         away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise)]))
         inside, beside = np.count_nonzero(away < 2 * noise) / 2, np.count_nonzero(away > 3 * noise) / 3
         if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
+            if behind:
+                niches[len(kept)] = shapely.union_all(behind)
             kept.append(plane)
             areas.append(area)
             reach.append(3 * noise + cell)
@@ -81,6 +98,7 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
             things &= ~over(plane, area, cloud.points_m, BAND * noise)
     standing = cloud.points_m[things]
     areas = [fill_shadows(*each, standing, noise) for each in zip(kept, areas, roles, strict=True)]
+    areas = [shapely.difference(area, niches[i]) if i in niches else area for i, area in enumerate(areas)]
     areas = [shapely.simplify(area, STRAIGHT_M) for area in join(kept, areas, reach)]
     logger.info("%d planes in %d points, noise %.1f mm", len(kept), len(points), 1e3 * noise)
     order = sorted(range(len(kept)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
