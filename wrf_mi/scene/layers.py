@@ -80,8 +80,7 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
     error = MEDIAN_ERROR * noise_m / np.sqrt(np.maximum(count, 1))
     level = _location(median[seen], error[seen])
     step = median - level
-    found = list[Layer]()
-    inner = np.sign(np.median(plane.distance(points_m)) - level)
+    found = list[tuple[Plane, IntArray, int]]()
     for sign in (1, -1):
         ratio = np.nan_to_num(sign * step / np.maximum(error, LEAST_STEP / ERRORS * noise_m)).reshape(shape)
         mask = apply_hysteresis_threshold(ratio, GROWN_ERRORS, ERRORS)
@@ -99,15 +98,16 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
             (u0, v0), (u1, v1) = low + side * corners.min(axis=0), low + side * (corners.max(axis=0) + 1)
             moved = replace(plane, offset_m=plane.offset_m + level + here)
             patch = moved.lift(np.array([[[u0, v0], [u1, v0], [u1, v1], [u0, v1]]]))
-            found.append(
-                Layer(replace(moved, patches_m=patch, centre_m=patch[0].mean(axis=0)), rows[chosen], sign == inner)
-            )
-    if found:
-        shift = level * plane.normal
-        plane = replace(
-            plane, offset_m=plane.offset_m + level, patches_m=plane.patches_m + shift, centre_m=plane.centre_m + shift
-        )
-    return plane, found
+            moved = replace(moved, patches_m=patch, centre_m=patch[0].mean(axis=0))
+            found.append((moved, rows[chosen], sign))
+    if not found:
+        return plane, []
+    inner = np.sign(np.median(plane.distance(points_m)) - level)
+    shift = level * plane.normal
+    plane = replace(
+        plane, offset_m=plane.offset_m + level, patches_m=plane.patches_m + shift, centre_m=plane.centre_m + shift
+    )
+    return plane, [Layer(moved, which, bool(sign == inner)) for moved, which, sign in found]
 
 
 def _location(values: NDArray[np.float64], error: FloatArray) -> float:
