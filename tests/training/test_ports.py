@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from box_room import CEILING, PARTITION, WALLS, receiver, transmitters
+from made_spectra import true_field
 from traced_rooms import write_xml
 
 import wrf_mi
@@ -162,3 +163,18 @@ def test_paths_are_calibrated_at_several_carriers(xml: Path, tmp_path: Path) -> 
     run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", settings=calibration, **given)
     assert run.metrics["ssim"]["mean"] > plain.metrics["ssim"]["mean"] + 0.01
     assert open_scene(run.folder / "corrected", BETWEEN_HZ).radio_materials
+
+
+@pytest.mark.parametrize("receiver_model", ["array", "power"])
+def test_single_predictions_are_those_of_a_batch(receiver_model: str, xml: Path) -> None:
+    """Recordings of one transmitter serve others, whose numbers of paths differ, with Gaussians beside the paths."""
+    field, params = true_field("wrf-gs+")
+    form = Form(receiver_model, SIZE, frequencies_hz=np.array([CARRIERS_HZ[1]]))
+    graph = Graph(field, (array(),), form, open_scene(xml, CARRIERS_HZ[1]), CONFIG)
+    predict = Predictor(field, params, (array(),), *SIZE, graph=graph)
+    tx = transmitters(12)
+    alone = np.concatenate([predict(tx[k : k + 1], 0) for k in range(12)])
+    traced = Predictor(None, {}, (array(),), *SIZE, graph=Graph(None, (array(),), form, graph.scene, CONFIG))
+    assert np.abs(alone - traced(tx, 0)).max() > 0.01  # the Gaussians tell
+    np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=SINGLE if receiver_model == "array" else SINGLE_DB)
+    assert any(name[0] == "both" and one.n_recordings for (name, _), one in predict._recordings._recorded.items())
