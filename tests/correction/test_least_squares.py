@@ -14,7 +14,12 @@ TRUE = np.array([0.5, -1.0, 2.0])
 
 
 def fitted(observed: np.ndarray, prior: Prior) -> Solution:
-    return solve(lambda v: MATRIX @ v - observed, lambda v: MATRIX, np.zeros(3), prior, 30)
+    return solve(lambda v: MATRIX @ v - observed, lambda v: first(MATRIX), np.zeros(3), prior, 30)
+
+
+def first(matrix: np.ndarray) -> np.ndarray:
+    """Derivatives [p, rows, values] of a product with a matrix [rows, values, p]."""
+    return np.moveaxis(matrix, -1, 0)
 
 
 def weak(deviation: float = 100.0) -> Prior:
@@ -29,7 +34,7 @@ def test_parameters_without_data_stay_at_the_prior() -> None:
     blind = MATRIX * [1, 1, 0]
     prior = Prior(np.array([0, 0, 0.7]), np.diag([1e-4, 1e-4, 1 / 0.3**2]))
     noisy = blind @ TRUE + np.random.default_rng(2).normal(0, 0.1, (ROWS, VALUES))
-    found = solve(lambda v: blind @ v - noisy, lambda v: blind, prior.mean, prior, 30)
+    found = solve(lambda v: blind @ v - noisy, lambda v: first(blind), prior.mean, prior, 30)
     assert found.vector[2] == pytest.approx(0.7)
     assert np.sqrt(found.covariance[2, 2]) == pytest.approx(0.3)
 
@@ -53,7 +58,7 @@ def test_correlated_values_count_once() -> None:
     slope = np.ones((ROWS, 1, 1))
     prior = Prior(np.zeros(1), np.full((1, 1), 1e-6))
     found = [
-        solve(lambda v, s=s, x=x: s @ v - x, lambda v, s=s: s, np.zeros(1), prior, 30).covariance[0, 0]
+        solve(lambda v, s=s, x=x: s @ v - x, lambda v, s=s: first(s), np.zeros(1), prior, 30).covariance[0, 0]
         for s, x in ((slope, one), (np.repeat(slope, 50, axis=1), many))
     ]
     assert found[1] == pytest.approx(found[0], rel=0.2)
@@ -77,7 +82,7 @@ def test_rows_that_nothing_explains_hardly_count() -> None:
 def test_rows_without_observation_are_left_out() -> None:
     noisy = MATRIX @ TRUE + np.random.default_rng(5).normal(0, 0.1, (ROWS, VALUES))
     part = fitted(np.where(np.arange(ROWS)[:, None] < 200, noisy, np.nan), weak())
-    alone = solve(lambda v: MATRIX[:200] @ v - noisy[:200], lambda v: MATRIX[:200], np.zeros(3), weak(), 30)
+    alone = solve(lambda v: MATRIX[:200] @ v - noisy[:200], lambda v: first(MATRIX[:200]), np.zeros(3), weak(), 30)
     np.testing.assert_allclose(part.vector, alone.vector, atol=1e-6)
 
 

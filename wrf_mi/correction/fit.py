@@ -16,7 +16,7 @@ from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .doubts import Doubts
 from .frame import rigid_motions
-from .least_squares import Noise, Prior, Solution, solve
+from .least_squares import Noise, Prior, Solution, minimised, solve
 from .misfit import Misfit
 from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
@@ -255,14 +255,14 @@ class Fit:
             vector[places] = part
             return vector
 
-        found = solve(
+        found, _ = minimised(
             lambda part: trials.residual(whole(part)),
             lambda part: trials.jacobian(whole(part), places),
             start[places],
             self.prior(mean, places),
             REFINING_STEPS,
         )
-        return whole(found.vector)
+        return whole(found)
 
     def _progress(self, what: str) -> Callable[[int, int], None]:
         return lambda done, of: self.on_stage(what, done / max(of, 1))

@@ -124,23 +124,40 @@ def solve(
     steps: int,
     on_step: Callable[[int, float], None] = lambda step, cost: None,
 ) -> Solution:
+    """Most probable parameters, as `minimised`, with their covariance."""
+    vector, found = minimised(residual, jacobian, start, prior, steps, on_step)
+    noise = Noise.of(found)
+    information, _ = _normal(jacobian(vector), found, noise)
+    return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)
+
+
+def minimised(
+    residual: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], NDArray[np.floating]],
+    start: FloatArray,
+    prior: Prior,
+    steps: int,
+    on_step: Callable[[int, float], None] = lambda step, cost: None,
+) -> tuple[FloatArray, FloatArray]:
     """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise of its beginning has it.
 
     Args:
         residual: residuals [rows, values] of parameters [p], model minus observation; NaN without observation.
-        jacobian: their derivatives [rows, values, p], or 0 without observation.
+        jacobian: their derivatives [p, rows, values], or 0 without observation.
         start: parameters [p].
         prior: prior of the parameters.
         steps: largest number of steps.
         on_step: called with the number of a step, from 1, and the cost after it.
+
+    Returns:
+        Parameters [p] and their residuals.
     """
     vector, damping = np.asarray(start, float), FIRST_DAMPING
     found = residual(vector)
-    noise = Noise.of(found)
-    derivative = jacobian(vector)
     for step in range(1, steps + 1):
+        noise = Noise.of(found)
         before = noise.cost(found) + prior.cost(vector)
-        information, slope = _normal(derivative, found, noise)
+        information, slope = _normal(jacobian(vector), found, noise)
         whole = information + prior.precision
         downhill = -slope - prior.precision @ (vector - prior.mean)
         for _ in range(TRIALS):
@@ -154,17 +171,14 @@ def solve(
             break
         vector, found, damping = there, tried, max(damping / HARDER, LEAST_DAMPING)
         on_step(step, after)
-        noise, derivative = Noise.of(found), jacobian(vector)
         if before - after < CONVERGED:
             break
-    information, _ = _normal(derivative, found, noise)
-    return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)
+    return vector, found
 
 
 def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Fisher information [p, p] and gradient [p]."""
-    weight = noise.weights(residual)
-    columns = derivative.shape[-1]
-    scaled = (derivative * np.sqrt(weight)[:, None, None].astype(derivative.dtype)).reshape(-1, columns)
-    values = (np.where(weight[:, None] > 0, residual, 0) * np.sqrt(weight)[:, None]).ravel()
-    return (scaled.T @ scaled).astype(float), (scaled.T @ values.astype(derivative.dtype)).astype(float)
+    root = np.sqrt(noise.weights(residual))[:, None]
+    scaled = (derivative * root.astype(derivative.dtype)).reshape(len(derivative), -1)
+    values = (np.where(root > 0, residual, 0) * root).ravel()
+    return (scaled @ scaled.T).astype(float), (scaled @ values.astype(derivative.dtype)).astype(float)

@@ -228,16 +228,16 @@ class Misfit:
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
     ) -> NDArray[np.float32]:
-        """Derivatives [n_rx * rows, values, columns] of `residual`, 0 where nothing was received."""
-        slopes = np.zeros((*self.observed.shape, len(columns)), np.float32)
+        """Derivatives [columns, n_rx * rows, values] of `residual`, 0 where nothing was received."""
+        slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
         for place, column in enumerate(columns):
             direction = self._device(np.eye(1, len(vector), column)[0])
             for tangent, places in zip(self._tangents, self.places, strict=True):
-                slopes[places, :, place] = tangent(params, direction).numpy().reshape(len(places), -1)
+                slopes[place, places] = tangent(params, direction).numpy().reshape(len(places), -1)
             on_column(place)
-        slopes /= self.unit[:, None, None]
-        slopes[~np.isfinite(self.observed).all(axis=1)] = 0
+        slopes /= self.unit[:, None].astype(np.float32)
+        slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return slopes
 
     def scores(self, vector: FloatArray) -> FloatArray:

@@ -71,7 +71,7 @@ class PathSum:
             self._reports, self._k = Channels(), 2 * np.pi * hz[None] / speed_of_light
             self._unit = np.exp(-1j * length[:, None] * self._k)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
-        self._touched: dict[tuple[bytes, bytes], IntArray] = {}
+        self._touched: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
         self._phase: tuple[tuple[bytes, ...], Complex] = (), np.zeros((0, 0), complex)
         count = len(misfit.sides[0].surfaces.normal)
         self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])[: len(self._plane_places)]
@@ -87,6 +87,7 @@ class PathSum:
         every = np.arange(len(self._row))
         self._waves = self._waves_of(every, self._gain, np.zeros(len(self._plane_places)), ())
         self._total = self._sums(self._waves, every)
+        self._residual = self._residual_of(self._total, np.arange(len(misfit.observed)), self.at)
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
@@ -111,54 +112,69 @@ class PathSum:
         return channels and SHIFT in misfit.parts and misfit.carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
-        """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
-        touched, waves = self._changed(vector)
-        total, factor = self._total + self._sums(waves - self._waves[touched], touched), self._factor(vector)
-        return self._reports.report(total, factor) / self.misfit.unit[:, None] - self.misfit.observed
+        """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector.
+
+        Reports of rows without a changed path or gain are kept.
+        """
+        touched, rows, waves = self._changed(vector)
+        total = self._total + self._sums(waves - self._waves[touched], touched)
+        rows = np.union1d(rows, np.flatnonzero((self._factor(vector) != self._factor(self.at))[:, 0]))
+        found = self._residual.copy()
+        found[rows] = self._residual_of(total, rows, vector)
+        return found
+
+    def _residual_of(self, total: Complex, rows: IntArray, vector: FloatArray) -> FloatArray:
+        """Residuals of some rows of totals."""
+        reported = self._reports.report(total[rows], self._factor(vector)[rows], rows)
+        return reported / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
     ) -> NDArray[np.float32]:
-        """Derivatives of `residual`, 0 where nothing was received; those by materials are differences over `STEP`."""
-        touched, waves = self._changed(vector)
+        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; those by materials are
+        differences over `STEP`.
+        """
+        touched, _, waves = self._changed(vector)
         present = self._waves.copy()
         present[touched] = waves
         total = self._total + self._sums(waves - self._waves[touched], touched)
-        factor = self._factor(vector)
         receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
-        slopes = np.zeros((*self.misfit.observed.shape, len(columns)), np.float32)
+        changes = list[tuple[IntArray, Complex]]()
         for number, column in enumerate(columns):
-            change = np.zeros_like(total)
             if column in receiver:
-                imaginary, places = receiver[column]
-                if self._unit is not None:
-                    change[places] = total[places] * (1j if imaginary else 1)
-                elif not imaginary:
-                    change[places] = 2 * total[places]
+                imaginary, rows = receiver[column]
+                by_gain = (1j if imaginary else 1) if self._unit is not None else (0 if imaginary else 2)
+                changes.append((rows, by_gain * total[rows]))
             elif column in self._plane_places:
                 slope = self.slope[:, np.flatnonzero(self._plane_places == column)[0]]
                 moved = np.flatnonzero(slope)
-                change = self._sums(present[moved] * (-1j * slope[moved, None] * self._wavenumber(moved)), moved)
+                rows = np.unique(self._row[moved])
+                change = present[moved] * (-1j * slope[moved, None] * self._wavenumber(moved))
+                changes.append((rows, self._sums(change, moved)[rows]))
             else:
                 there = vector.copy()
                 there[column] += STEP
-                moved, waves = self._changed(there)
+                moved, rows, waves = self._changed(there)
                 # Parameters are rounded to single precision, gains are not.
                 step = float(np.float32(there[column])) - float(np.float32(vector[column]))
-                change = self._sums((waves - present[moved]) / step, moved)
-            slopes[..., number] = self._reports.slope(total, change, factor)
+                changes.append((rows, self._sums((waves - present[moved]) / step, moved)[rows]))
             on_column(number)
-        slopes /= self.misfit.unit[:, None, None]
-        slopes[~np.isfinite(self.misfit.observed).all(axis=1)] = 0
-        return slopes
+        every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
+        slopes = self._reports.slopes(total[every], self._factor(vector)[every], every)
+        found = np.zeros((len(columns), *self.misfit.observed.shape), np.float32)
+        for one, (rows, change) in zip(found, changes, strict=True):
+            one[rows] = slopes(change, np.searchsorted(every, rows)) / self.misfit.unit[rows, None]
+        found[:, ~np.isfinite(self.misfit.observed).all(axis=1)] = 0
+        return found
 
     def accept(self, vector: FloatArray) -> None:
         """Take a vector as the present one."""
-        touched, waves = self._changed(vector)
+        residual = self.residual(vector)
+        touched, _, waves = self._changed(vector)
         self._gain[touched] = self._gain_at(vector, touched)
         self._total = self._total + self._sums(waves - self._waves[touched], touched)
         self._waves[touched] = waves
-        self.at = np.array(vector, float)
+        self.at, self._residual = np.array(vector, float), residual
         self._gains.clear()
 
     def _factor(self, vector: FloatArray) -> Complex:
@@ -170,26 +186,26 @@ class PathSum:
         return found
 
     def _sums(self, waves: Complex, which: IntArray) -> Complex:
-        """Sums [rows, frequencies or elements] of waves of some paths; of powers [rows, 1]."""
+        """Sums [rows, frequencies or elements] of waves of some paths, in their order; of powers [rows, 1]."""
         total = np.zeros((len(self.misfit.observed), waves.shape[1]), complex)
         if len(which):
             row = self._row[which]
             first = np.flatnonzero(np.diff(row, prepend=-1))
-            np.add.at(total, row[first], np.add.reduceat(waves, first, axis=0))
+            total[row[first]] = np.add.reduceat(waves, first, axis=0)
         return total
 
-    def _changed(self, vector: FloatArray) -> tuple[IntArray, Complex]:
-        """Paths that meet a changed plane or surface, and their waves."""
+    def _changed(self, vector: FloatArray) -> tuple[IntArray, IntArray, Complex]:
+        """Paths that meet a changed plane or surface, their rows, and their waves."""
         differs = vector != self.at
         planes = np.unique(self._plane_of[differs[self._plane_places]])
         slabs = np.flatnonzero(differs[self._material].any(axis=0))
         key = planes.tobytes(), slabs.tobytes()
         if key not in self._touched:
-            met = np.isin(self._planes, planes).any(axis=1) | np.isin(self._slabs, slabs).any(axis=1)
-            self._touched[key] = np.flatnonzero(met)
-        touched = self._touched[key]
+            met = np.flatnonzero(np.isin(self._planes, planes).any(axis=1) | np.isin(self._slabs, slabs).any(axis=1))
+            self._touched[key] = met, np.unique(self._row[met])
+        touched, rows = self._touched[key]
         shifts = (vector - self._start)[self._plane_places]
-        return touched, self._waves_of(touched, self._gain_at(vector, touched), shifts, key)
+        return touched, rows, self._waves_of(touched, self._gain_at(vector, touched), shifts, key)
 
     def _wavenumber(self, which: IntArray) -> FloatArray:
         """Wavenumbers of some paths, [paths or 1, frequencies or 1]."""

@@ -1,17 +1,19 @@
 """What instruments report of sums over paths, and the derivatives of the reports.
 
-Each kind takes totals [rows, values], sums of waves or of powers, and factors [rows, 1] of the receivers' gains.
+Each kind takes totals [n, values], sums of waves or of powers, and factors [n, 1] of the receivers' gains, of some rows
+[n], in ascending order.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.angles import FloatArray, pixel_directions
-from ..core.types import SQUARED_MAGNITUDE_EPS
+from ..core.types import SQUARED_MAGNITUDE_EPS, IntArray
 from ..graph.combine import LEAST_POWER, SILENCE, ArrayReceiver, PowerReceiver
 from ..graph.ports import steering
 
@@ -21,28 +23,32 @@ if TYPE_CHECKING:
 Complex = NDArray[np.complex128]
 
 
+Slopes = Callable[[Complex, IntArray], FloatArray]
+"""Derivatives of reports by changes of totals, and the places of their rows among those of the reports."""
+
+
 class Reports(Protocol):
     """Reports of totals."""
 
-    def report(self, total: Complex, factor: Complex) -> FloatArray:
-        """Reports [rows, values] as those of `Misfit`, before the unit of each row."""
+    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
+        """Reports [n, values] as those of `Misfit`, before the unit of each row."""
         ...
 
-    def slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
-        """Derivative of `report` by that of the totals, [rows, values]."""
+    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
+        """Derivative of `report` by that of the totals."""
         ...
 
 
 class Channels:
     """Channels of a single antenna, real and imaginary part in turn."""
 
-    def report(self, total: Complex, factor: Complex) -> FloatArray:
+    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
         """Reports as of `Reports`."""
         return np.ascontiguousarray(total * factor).view(float)
 
-    def slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
+    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
         """Derivative as of `Reports`."""
-        return self.report(change, factor)
+        return lambda change, which: self.report(change, factor[which], rows[which])
 
 
 class Strengths:
@@ -58,16 +64,17 @@ class Strengths:
             assert isinstance(model, PowerReceiver)
             self._floor[places] = model.floor
 
-    def report(self, total: Complex, factor: Complex) -> FloatArray:
+    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
         """Reports as of `Reports`."""
         power = total.real * np.abs(factor) ** 2 + LEAST_POWER
-        return 10 * np.log10(np.where(power > SILENCE, power + LEAST_POWER, self._floor))
+        return 10 * np.log10(np.where(power > SILENCE, power + LEAST_POWER, self._floor[rows]))
 
-    def slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
+    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
         """Derivative as of `Reports`."""
         scale = np.abs(factor) ** 2
-        power, slope = total.real * scale + LEAST_POWER, change.real * scale
-        return np.where(power > SILENCE, 10 / np.log(10) * slope / (power + LEAST_POWER), 0)
+        power = total.real * scale + LEAST_POWER
+        weight = np.where(power > SILENCE, 10 / np.log(10) * scale / (power + LEAST_POWER), 0)
+        return lambda change, which: weight[which] * change.real
 
 
 class Spectra:
@@ -78,38 +85,60 @@ class Spectra:
     """
 
     def __init__(self, misfit: Misfit) -> None:
-        self._parts = list[tuple[ArrayReceiver, NDArray[np.complex64], NDArray[np.int64]]]()
-        for model, places in zip(misfit.models, misfit.places, strict=True):
+        self._matrices, self._scaled = list[NDArray[np.complex64]](), list[bool]()
+        self._side = np.zeros(len(misfit.observed), np.int64)
+        for side, (model, places) in enumerate(zip(misfit.models, misfit.places, strict=True)):
             assert isinstance(model, ArrayReceiver)
             directions = pixel_directions(model.height, model.width).reshape(-1, 3)
             matrix = steering(model.elements_m, directions, model.frequency_hz).values
-            self._parts.append((model, matrix.astype(np.complex64), places))
+            self._matrices.append(matrix.astype(np.complex64))
+            self._scaled.append(model.instrument_scale)
+            self._side[places] = side
 
-    def report(self, total: Complex, factor: Complex) -> FloatArray:
+    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
         """Reports as of `Reports`."""
-        return self._each(total * factor, None)
+        spectrum = _magnitude(self._images(total * factor, rows))
+        low, _, inverse = self._scale(spectrum, rows)
+        least = np.where(self._scaled_rows(rows), np.take_along_axis(spectrum, low, axis=1), 0)
+        return np.asarray((spectrum - least) * inverse, float)
 
-    def slope(self, total: Complex, change: Complex, factor: Complex) -> FloatArray:
+    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
         """Derivative as of `Reports`."""
-        return self._each(total * factor, change * factor)
+        image = self._images(total * factor, rows)
+        spectrum = _magnitude(image)
+        low, high, inverse = self._scale(spectrum, rows)
+        weight = image.conj() / spectrum
+        scaled = self._scaled_rows(rows)
+        share = (spectrum - np.take_along_axis(spectrum, low, axis=1)) * inverse
 
-    def _each(self, signal: Complex, change: Complex | None) -> FloatArray:
-        """Spectra of element signals, or their derivatives by that of the signals."""
-        found = np.empty((len(signal), self._parts[0][1].shape[1]))
-        for model, matrix, places in self._parts:
-            image = signal[places].astype(np.complex64) @ matrix
-            spectrum = np.sqrt(np.square(np.abs(image)) + SQUARED_MAGNITUDE_EPS)
-            row = np.arange(len(places))
-            low, high = spectrum.argmin(axis=1), spectrum.argmax(axis=1)
-            span = (spectrum[row, high] - spectrum[row, low])[:, None]
-            inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0) if model.instrument_scale else 1
-            least = spectrum[row, low][:, None] if model.instrument_scale else 0
-            if change is None:
-                found[places] = (spectrum - least) * inverse
-                continue
-            slope = (image.conj() * (change[places].astype(np.complex64) @ matrix)).real / spectrum
-            if model.instrument_scale:
-                ends = [slope[row, end][:, None] for end in (low, high)]
-                slope = (slope - ends[0] - (spectrum - least) * inverse * (ends[1] - ends[0])) * inverse
-            found[places] = slope
+        def slope(change: Complex, which: IntArray) -> FloatArray:
+            found = (weight[which] * self._images(change * factor[which], rows[which])).real
+            least, most = (np.take_along_axis(found, end[which], axis=1) for end in (low, high))
+            ends = least + share[which] * (most - least)
+            return np.asarray((found - np.where(scaled[which], ends, 0)) * inverse[which], float)
+
+        return slope
+
+    def _images(self, signal: Complex, rows: IntArray) -> NDArray[np.complex64]:
+        """Element signals of some rows in all directions, complex."""
+        side, single = self._side[rows], signal.astype(np.complex64)
+        if len(self._matrices) == 1:
+            return single @ self._matrices[0]
+        found = np.empty((len(rows), self._matrices[0].shape[1]), np.complex64)
+        for number in np.unique(side):
+            found[side == number] = single[side == number] @ self._matrices[number]
         return found
+
+    def _scaled_rows(self, rows: IntArray) -> NDArray[np.bool_]:
+        return np.array(self._scaled)[self._side[rows], None]
+
+    def _scale(self, spectrum: NDArray[np.float32], rows: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Places of the extremes of each row [n, 1], and the factor by which its instrument scales it."""
+        low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
+        span = np.take_along_axis(spectrum, high, axis=1) - np.take_along_axis(spectrum, low, axis=1)
+        inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+        return low, high, np.where(self._scaled_rows(rows), inverse, 1)
+
+
+def _magnitude(image: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))
