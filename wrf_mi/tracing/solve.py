@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -209,9 +210,7 @@ def _search(
 ) -> Legs:
     """Paths from all sources to all targets."""
     parts, depth = [], max(options.max_depth, 1)
-    bar = Progress(console=Console(stderr=True), transient=True, disable=not progress)
-    with bar:
-        task = bar.add_task("tracing paths", total=len(sources) * len(targets))
+    with _progress("tracing paths", len(sources) * len(targets), progress) as advance:
         for first in range(0, len(sources), SOURCES_TOGETHER):
             some = sources[first : first + SOURCES_TOGETHER]
             chains, step = shared.chains(some, options, rays), max(1, PAIRS_TOGETHER // len(some))
@@ -224,8 +223,19 @@ def _search(
                         found.append(replace(legs, source=np.full_like(legs.source, index)))
                 legs = join(found, depth)
                 parts.append(replace(legs, source=legs.source + first, target=legs.target + start))
-                bar.advance(task, len(some) * len(batch))
+                advance(len(some) * len(batch))
     return join(parts, depth)
+
+
+@contextmanager
+def _progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
+    """A function that advances a progress bar on standard error; a hidden bar would cost as much as a short search."""
+    if not shown:
+        yield lambda count: None
+        return
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda count: bar.advance(task, count)
 
 
 def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
