@@ -23,7 +23,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..scene.folder import read_scene_folder
-from ..scene.hidden import with_hidden_faces
+from ..scene.hidden import Boxes, with_hidden_faces
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.surfaces import KINDS, Kind
 from ..tasks import task_of
@@ -125,9 +125,10 @@ def correct_scene(
         options = replace(options, parts=(*options.parts, GAIN))
     split = _at_most(split, options.rows)
     carrier_hz = scene_carrier(record, split.all_train)
-    completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, frozenset[str]()))
-    with completed as (place, supposed):
+    completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
+    with completed as (place, boxes):
         opened, copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
+    supposed = frozenset(face.name for face in boxes.hidden)
     if not supposed:
         options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
     check_materials(opened)
@@ -143,7 +144,7 @@ def correct_scene(
             absent = trial.absent(found.known, found.vector)
             searched = moved_search(copy, prepared.surfaces, trial.misfit.named(found.vector), absent)
         how = search_options(options), options.changes, prepared, searched
-        return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed)
+        return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed, boxes.members)
 
     trial = fit_of(parts.known, parts.known_rows)
     if not any(side.exists.any() for side in trial.misfit.sides):

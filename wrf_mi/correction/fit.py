@@ -14,6 +14,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
+from .bodies import Bodies
 from .doubts import Doubts
 from .frame import rigid_motions
 from .least_squares import Noise, Prior, Solution, minimised, solve
@@ -89,9 +90,12 @@ class Fit:
         options: CorrectionOptions,
         on_stage: OnStage,
         supposed: frozenset[str] = frozenset(),
+        bodies: Sequence[frozenset[str]] = (),
     ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
         names = misfit.sides[0].slabs.names
+        own = [[slab for slab, name in enumerate(names) if name.partition("/")[0] in body] for body in bodies]
+        self.bodies = [np.array(slabs) for slabs in own if len(slabs) > 1]
         self.supposed = {name: slab for slab, name in enumerate(names) if name.partition("/")[0] in supposed}
         self.stated = misfit.start.copy()
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
@@ -168,6 +172,7 @@ class Fit:
         known = Known(stage, self.stated, dict.fromkeys(self.supposed, ABSENT))
         vector, known, _ = self.chosen(known, self.stated, choices, f"{title}, round 1")
         found = self._rounds(self.solved(vector, known), choices, range(2, ROUNDS + 1))
+        found = Bodies(self, choices, title).settled(found)
         return Doubts(self, choices, title).settled(found)
 
     def _rounds(self, found: Found, choices: Sequence[Choice], numbers: Iterable[int]) -> Found:

@@ -187,7 +187,7 @@ def choose(
         for number, choice in enumerate(choices):
             on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
             least, name, there = alternatives(rules, trials, noise, choice, vector)[0]
-            if least < _cost(rules, trials, noise, vector) - GAIN:
+            if least < cost(rules, trials, noise, vector) - GAIN:
                 taken[choice.what], vector, changed = name.partition(",")[0], there, True
                 if isinstance(trials, PathSum):
                     trials.accept(there)
@@ -196,7 +196,8 @@ def choose(
     return vector, taken
 
 
-def _cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
+def cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
+    """Negative logarithm of the likelihood of a vector and of the planes' prior, without its constant."""
     return noise.cost(trials.residual(vector)) + rules.planes_cost(vector)
 
 
@@ -217,7 +218,7 @@ def alternatives(
     for name, values in choice.values.items():
         there = vector.copy()
         there[choice.places] = np.where(np.isnan(values), expected, values)
-        tried.append((_cost(rules, trials, noise, there), name, there))
+        tried.append((cost(rules, trials, noise, there), name, there))
     tried.sort(key=itemgetter(0))
     if choice.joint:
         # A plane that is tilted, too, fits at the right shift only once its tilts do.
@@ -236,5 +237,5 @@ def alternatives(
         places = choice.places if trials is rules.misfit else choice.plane
         for name, there in few:
             better = rules.refined(trials, there, places)
-            tried.append((_cost(rules, trials, noise, better), name, better))
+            tried.append((cost(rules, trials, noise, better), name, better))
     return sorted(tried, key=itemgetter(0))

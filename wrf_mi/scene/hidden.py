@@ -1,7 +1,8 @@
 """Faces of furniture that a scan could not see, supposed from those that it saw.
 
-Most furniture is made of boxes with upright sides. Two sides that meet in a corner, or a top and a side at its edge,
-state where the other sides and the top of a box are. Whether they are there, and of what, measurements have to tell.
+Most furniture is made of boxes with upright sides. Two sides that meet in a corner or are opposite, or a top and a side
+at its edge, state where the other sides and the top of a box are. Whether they are there, and of what, measurements
+have to tell.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -45,10 +47,12 @@ class Rectangle:
     Attributes:
         centre: its centre [3], metres.
         sides: its half sides [2, 3], metres, at right angles.
+        name: name of its surface; "": it has none.
     """
 
     centre: FloatArray
     sides: FloatArray
+    name: str = ""
 
     @property
     def normal(self) -> FloatArray:
@@ -73,9 +77,9 @@ class Rectangle:
         ]
         return bool(shapely.intersection(*flat).area > COVERED * flat[0].area)
 
-    def surface(self, name: str) -> Surface:
+    def surface(self) -> Surface:
         """The face as a surface."""
-        return Surface(name, "other", self.corners, np.array([[0, 1, 2], [0, 2, 3]]))
+        return Surface(self.name, "other", self.corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 @dataclass(frozen=True)
@@ -97,9 +101,21 @@ class Box:
         yield Rectangle(middle + up, np.stack([along, across]))
 
 
+class Boxes(NamedTuple):
+    """Boxes of furniture.
+
+    Attributes:
+        hidden: faces that complete them, as surfaces.
+        members: names of the surfaces of each box, those of ``hidden`` included.
+    """
+
+    hidden: list[Surface]
+    members: list[frozenset[str]]
+
+
 @contextmanager
-def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, frozenset[str]]]:
-    """A scene folder with its `hidden_faces` for as long as the context lasts, and their names.
+def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
+    """A scene folder with the hidden faces of its `boxes` for as long as the context lasts, and these.
 
     They are of the material that its rules give furniture. The scene itself where it has none.
 
@@ -107,38 +123,46 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, frozenset
         scene: see `wrf_mi.tracing.open_scene`.
     """
     if not (Path(scene) / FILE).is_file():
-        yield scene, frozenset()
+        yield scene, Boxes([], [])
         return
     surfaces, materials = read_surfaces(scene)
-    if not (faces := hidden_faces(surfaces)):
-        yield scene, frozenset()
+    found = boxes(surfaces)
+    if not found.hidden:
+        yield scene, found
         return
-    stated = replace(materials, surfaces={**materials.surfaces, **{face.name: face.kind for face in faces}})
+    stated = replace(materials, surfaces={**materials.surfaces, **{face.name: face.kind for face in found.hidden}})
     with TemporaryDirectory() as place:
         folder = Path(place) / "scene"
-        write_scene(folder, [*surfaces, *faces], frame=f"that of {scene}", source=str(scene), materials=stated)
-        yield folder, frozenset(face.name for face in faces)
+        write_scene(folder, [*surfaces, *found.hidden], frame=f"that of {scene}", source=str(scene), materials=stated)
+        yield folder, found
 
 
-def hidden_faces(surfaces: Sequence[Surface]) -> list[Surface]:
-    """Faces that complete boxes of furniture, none where other surfaces lie.
+def boxes(surfaces: Sequence[Surface]) -> Boxes:
+    """Boxes of furniture, with faces that complete them where no other surfaces lie.
 
-    They are named ``hidden_01`` and so on, less the names that surfaces have.
+    Faces are named ``hidden_01`` and so on, less the names that surfaces have.
 
     Args:
         surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
     """
     furniture = list(_faces([one for one in surfaces if one.kind == "other"]))
-    known = [*furniture, *_faces([one for one in surfaces if one.kind != "other"])]
-    found = list[Rectangle]()
+    around = list(_faces([one for one in surfaces if one.kind != "other"]))
+    taken = {surface.name for surface in surfaces}
+    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in taken)
+    hidden, members = list[Rectangle](), dict[frozenset[str], None]()
     for box in _boxes(furniture):
         sizes = np.linalg.norm(box.base[1:3] - box.base[:2], axis=1)
         if min(*sizes, box.high - box.low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
             continue
-        found += [face for face in box.faces() if not any(map(face.covered_by, [*known, *found]))]
-    taken = {surface.name for surface in surfaces}
-    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in taken)
-    return [face.surface(name) for face, name in zip(found, names, strict=False)]
+        own = set[str]()
+        for face in box.faces():
+            there = [other.name for other in (*furniture, *hidden) if face.covered_by(other)]
+            if not there and not any(map(face.covered_by, around)):
+                hidden.append(replace(face, name=next(names)))
+                there = [hidden[-1].name]
+            own.update(there)
+        members[frozenset(own)] = None
+    return Boxes([face.surface() for face in hidden], list(members))
 
 
 def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
@@ -166,7 +190,7 @@ def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
             flat = (corners - centre) @ axes.T
             low, high = flat.min(axis=0), flat.max(axis=0)
             if (high - low > FLAT_M).all():
-                yield Rectangle(centre + (low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes)
+                yield Rectangle(centre + (low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes, surface.name)
 
 
 def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
@@ -179,6 +203,7 @@ def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
                 yield Box(top.corners[:, :2], low, float(top.centre[2]))
     for one, other in combinations(sides, 2):
         base = _corner(one, other)
+        base = _between(one, other) if base is None else base
         if base is not None:
             heights = np.array([face.centre[2] + s * face.sides[1, 2] for face in (one, other) for s in (-1, 1)])
             yield Box(base, float(heights.min()), float(heights.max()))
@@ -217,3 +242,17 @@ def _corner(one: Rectangle, other: Rectangle) -> FloatArray | None:
                 along = -2 * s * a
                 return np.stack([corner, corner + along, corner + along + across, corner + across])
     return None
+
+
+def _between(one: Rectangle, other: Rectangle) -> FloatArray | None:
+    """Base [4, 2] of the box between two sides of equal outline; None: they are not opposite."""
+    a, gap = one.sides[0, :2], other.centre - one.centre
+    size = np.linalg.norm(a)
+    along, across = float(gap[:2] @ a / size), gap[:2] - (gap[:2] @ a) / size**2 * a
+    longer = np.linalg.norm(one.sides, axis=1) - np.linalg.norm(other.sides, axis=1)
+    if abs(one.normal @ other.normal) < np.sqrt(1 - UPRIGHT**2) or np.linalg.norm(across) < SAME_M:
+        return None
+    if max(abs(along), abs(gap[2]), *np.abs(longer)) > TOUCH_M:
+        return None
+    corner = one.centre[:2] - a
+    return np.stack([corner, corner + 2 * a, corner + 2 * a + across, corner + across])
