@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from wrf_mi.core.files import one_line, write_atomically, write_figure
 from wrf_mi.runs.figures import score_cdf
 from wrf_mi.tasks import TASKS
 
-from .table_plan import PARTS, SHARES, Part, plan
+from .table_plan import MADE_HERE, PARTS, SHARES, Part, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
@@ -73,8 +74,11 @@ NOTE = (
     "compare orders, not figures. Networks of blocked splits are fitted in five folds, all but the VAE with a fifth "
     "to a half of their steps; in the traced room NeRF2, VAE and DCGAN take the steps of the ten times smaller "
     "laboratory, WRF-GS and WRF-GS+ 18,000. Times are of the machine in each file, which others may have used too, "
-    "with as many threads as `worker_threads` says there, or else all: read ratios."
+    "with as many threads as `worker_threads` says there, or else all: read ratios. Rows with † are of a data set of "
+    "this package as an earlier recipe made it; `wrf-mi bench tables` measures them anew."
 )
+FORMER = "†"
+"""Mark of rows that were measured on other data than the newest rows of their part."""
 
 
 Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
@@ -90,16 +94,33 @@ def grouped(part: Part, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     return groups
 
 
+def is_former(part: Part, rows: Sequence[Mapping[str, Any]], newest: str | None) -> bool:
+    """Whether one of some rows was measured on other data than those of a digest; measured data do not change."""
+    return part.dataset.startswith(MADE_HERE) and any(row.get("data") != newest for row in rows)
+
+
+def newest_data(groups: Groups) -> str | None:
+    """Digest of the data of most of the newest rows."""
+    rows = [row for found in groups.values() for row in found]
+    last = max(row["date"] for row in rows)
+    return Counter(row.get("data") for row in rows if row["date"] == last).most_common(1)[0][0]
+
+
 def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> str:
     """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
     """
     columns: dict[Part, dict[str, float]] = {}
+    former = set[tuple[Part, str]]()
     for part in PARTS:
-        for (share, method), rows in grouped(part, stored, quick).items() if part.table == name else ():
+        groups = grouped(part, stored, quick) if part.table == name else {}
+        newest = newest_data(groups) if groups else None
+        for (share, method), rows in groups.items():
             if quick or share == SHARES[0]:
                 columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
+                if is_former(part, rows, newest):
+                    former.add((part, method))
     if not columns:
         return ""
     task = TASKS[next(iter(columns)).task]
@@ -115,7 +136,8 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         cells = []
         for part, medians in columns.items():
             cell = f"{medians[method]:.{task.digits}f}" if method in medians else ""
-            cells.append(f"**{cell}**" if cell and medians[method] == best[part] else cell)
+            cell = f"**{cell}**" if cell and medians[method] == best[part] else cell
+            cells.append(f"{cell} {FORMER}" if (part, method) in former else cell)
         # Where labels differ between columns, as the inputs do, the plain name is shown.
         labels = {entry.label for entry in entries[method]}
         label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
@@ -146,7 +168,7 @@ def part_table(part: Part, groups: Groups) -> str:
 
     heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
     lines = _head([*heads, "paper, other data"])
-    digits = task.digits
+    digits, newest = task.digits, newest_data(groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
         found = groups[share, method]
         each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
@@ -154,7 +176,7 @@ def part_table(part: Part, groups: Groups) -> str:
         spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
         cells = [
             str(found[0]["n_train"]),
-            part.entries[method].label,
+            part.entries[method].label + (f" {FORMER}" if is_former(part, found, newest) else ""),
             f"**{each['median']:.{digits}f}**{spread}",
             *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
             f"{np.median([one['train_seconds'] for one in found]):.0f} s",

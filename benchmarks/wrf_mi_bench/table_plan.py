@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 from wrf_mi.datasets.registry import locate
 
+MADE_HERE = "traced-"
+"""Names of data sets that this package makes begin with it."""
 SEEDS = (0, 1, 2)
 ONE = SEEDS[:1]
 SHARES = (1.0, 0.3, 0.1)
@@ -299,4 +301,4 @@ def plan(quick: bool = False) -> list[Row]:
 
 def available(part: Part) -> bool:
     """Whether the data of a part are on this machine or can be made here."""
-    return part.dataset.startswith("traced-") or locate(part.dataset) is not None
+    return part.dataset.startswith(MADE_HERE) or locate(part.dataset) is not None

@@ -32,6 +32,7 @@ def made_row(row: Row, median: float) -> dict:
         "share": row.share,
         "seed": row.seed,
         "command": row.command,
+        "date": "2026-01-01",
         "versions": tables.package_versions(),
         "n_train": 10,
         "n_test": 5,
@@ -195,6 +196,27 @@ def test_overview_has_a_line_per_method_with_the_mean_over_seeds(monkeypatch):
     assert lines[0] == "| CEA (dB) | traced-csi-flat | traced-csi-office | paper, other data |"
     assert lines[2:] == ["| R2F2 | **9.50** |  | 8.57 |", "| FIRE | 6.00 | **3.00** | 15.29 |"]
     assert table_pages.overview("rssi", stored) == ""
+
+
+def test_rows_of_data_as_they_were_made_before_are_marked(monkeypatch, tmp_path):
+    """Of data that are made here; measured ones stay as they are, whether or not their rows state a digest."""
+    parts = [next(part for part in PARTS if part.dataset == name) for name in ("traced-csi-flat", "flat-ble")]
+    rows = [Row(part, method, 1.0, 0) for part in parts for method in ("wrf-gs", "wrf-gs+", "kriging")]
+    monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
+    stated = [{"date": "2026-01-02", "data": "new"}, {"date": "2026-01-01", "data": "old"}, {"date": "2026-01-01"}]
+    stored = {
+        row.name: {key: value for key, value in made_row(row, 5.0).items() if key != "data"} | facts
+        for row, facts in zip(rows, stated * 2, strict=True)
+    }
+    shown = [table_pages.part_table(part, table_pages.grouped(part, stored)) for part in parts]
+    assert [line.split("|")[2].strip() for line in shown[0].splitlines()[2:5]] == [
+        "WRF-GS",
+        "WRF-GS+ †",
+        "kriging, from positions †",
+    ]
+    assert "†" not in shown[1]
+    assert table_pages.overview("uplink", stored).count("†") == 2
+    assert "†" not in table_pages.overview("rssi", stored)
 
 
 @pytest.mark.parametrize("name", table_pages.IN_README)
