@@ -57,6 +57,8 @@ class Bodies:
             each = [self._with_material(trials, noise, faces, material, found.vector) for material in faces[0].values]
             _, material, vector = min(each, key=lambda one: one[0])
             changed = [face for face in faces if found.known.materials.get(face.what) != material]
+            if not changed:
+                continue
             known = found.known
             for face in changed:
                 known = known.with_material(face, material, vector)

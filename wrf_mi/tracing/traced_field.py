@@ -39,6 +39,7 @@ from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters, pattern_name
 from .material_parameters import MaterialGrouping
 from .options import FACTOR
+from .path_chains import chains_of
 from .pattern_parameters import pattern_factor
 from .pose import component, moved_m, receiver_pose, spread_pose
 from .result import without_faint
@@ -331,7 +332,7 @@ class TracedField:
         face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
-        found = self._chains_of(tx, types, face)
+        found = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
         share, kept = self.options.faint, np.arange(len(tx))
         if share:
             kept = np.flatnonzero(without_faint(tx, self._amplitudes(found), share))
@@ -357,27 +358,6 @@ class TracedField:
             self.chains.exists = dr.gather(Float64, found.exists, index, mask)
             self.chains.levels = [dr.gather(Level, level, index, mask) for level in found.levels]
         dr.eval(self.chains)
-
-    def _chains_of(self, tx: IntArray, types: NDArray[np.uint8], face: IntArray) -> Chains:
-        """Chains of paths from transmitters [p] with interactions [p, depth] at faces [p, depth]."""
-        surfaces, depth = self.surfaces, types.shape[1] if types.any() else 0
-        types, face = types[:, :depth], face[:, :depth]
-        plane, used, material = np.append(surfaces.plane, 0)[face], types != 0, self._slab(face).astype(np.uint32)
-        # All columns of a type by one copy: each copy is a kernel of its own.
-        normal, offset = surfaces.normal[plane] * used[..., None], surfaces.offset[plane] * used
-        columns = [column for k in range(depth) for column in (*normal[:, k].T, offset[:, k])]
-        numbers = columns_on_device([*columns, *self._source_columns(tx), np.ones(len(tx))], Float64)
-        kinds = [types[:, k] == kind for k in range(depth) for kind in (SPECULAR, TRANSMISSION)]
-        masks = columns_on_device(kinds, mi.Bool)
-        indices = columns_on_device([table[:, k] for k in range(depth) for table in (material, plane)], mi.UInt32)
-        levels = [
-            Level(
-                numbers[4 * k : 4 * k + 3], numbers[4 * k + 3], *masks[2 * k : 2 * k + 2], *indices[2 * k : 2 * k + 2]
-            )
-            for k in range(depth)
-        ]
-        *sources, exists = numbers[4 * depth :]
-        return Chains(sources[:3], tuple(sources[3:]), exists, levels)
 
     def _source_columns(self, tx: IntArray) -> list[FloatArray]:
         """Coordinates of transmitters, and cosines and sines of their headings."""
