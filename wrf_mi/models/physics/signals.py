@@ -22,7 +22,8 @@ minorise-maximise steps of Zhou, Hu, Zhou and Lange, "MM algorithms for variance
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -158,7 +159,6 @@ class SignalProcess:
     Attributes:
         basis: principal components in its columns, [m, m].
         weight, noise: shares of the dictionary [m, c] and variance of the noise [m] of each component.
-        precision: inverse covariance of the rows for each component, [m, n, n].
     """
 
     tx_pos_m: FloatArray
@@ -167,21 +167,26 @@ class SignalProcess:
     basis: ComplexArray
     weight: FloatArray
     noise: FloatArray
-    precision: ComplexArray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Factor the covariance."""
+        """Factor the covariances of the components."""
         self._components: ComplexArray = self.signals @ self.basis.conj()
         mixed = self.covariances.mixed(self.tx_pos_m, self.tx_pos_m, self.weight)
-        systems = zip(mixed, self.noise, strict=True)
-        self.precision = np.stack([KrigingSystem(matrix, level).precision for matrix, level in systems])
-        self._solved: ComplexArray = np.einsum("cij,jc->ci", self.precision, self._components)
+        self._systems = [KrigingSystem(matrix, level) for matrix, level in zip(mixed, self.noise, strict=True)]
+        pairs = zip(self._systems, self._components.T, strict=True)
+        self._solved: ComplexArray = np.stack([system.solve(component) for system, component in pairs])
+
+    @cached_property
+    def precision(self) -> ComplexArray:
+        """Inverse covariance of the rows for each component, [m, n, n]."""
+        return np.stack([system.precision for system in self._systems])
 
     def predict(self, tx_pos_m: ArrayLike) -> Posterior:
         """Posterior at positions [q, 3], metres."""
         cross = self.covariances.mixed(np.asarray(tx_pos_m, float), self.tx_pos_m, self.weight)
         mean = np.einsum("cqi,ci->qc", cross, self._solved)
-        known = np.einsum("cqi,cij,cqj->qc", cross, self.precision, cross.conj(), optimize=True).real
+        whitened = (system.whiten(part.conj().T) for system, part in zip(self._systems, cross, strict=True))
+        known = np.stack([np.square(np.abs(part)).sum(axis=0) for part in whitened], axis=1)
         return self._posterior(mean, self.prior - known)
 
     @property
