@@ -36,6 +36,8 @@ SAME_M = 0.1
 """Distance within which parallel faces are one: a cabinet's back at a wall is the wall."""
 COVERED = 0.3
 """Share of a face, seen along its normal, from which on another one in its place stands for it."""
+GRID_M = 1e-4
+"""Grid of outlines that are compared."""
 LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0
 """Sides of boxes."""
 
@@ -75,7 +77,8 @@ class Rectangle:
         flat = [
             shapely.Polygon((face.corners - self.centre) @ (self.sides / length[:, None]).T) for face in (self, other)
         ]
-        return bool(shapely.intersection(*flat).area > COVERED * flat[0].area)
+        # On a grid: of outlines that are equal but for rounding, GEOS may else find no intersection.
+        return bool(shapely.intersection(*flat, grid_size=GRID_M).area > COVERED * flat[0].area)
 
     def surface(self) -> Surface:
         """The face as a surface."""
