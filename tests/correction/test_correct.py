@@ -20,6 +20,7 @@ from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.scene.edit import read_surfaces
@@ -48,6 +49,13 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Correction, Any
     stated = stated_scene(folder / "stated")
     found = correct_scene(stated, record, make_splits(record, "official")[0], CorrectionOptions(steps=10))
     return found, record, shift, tilt, folder
+
+
+def test_picture_shows_shifts_or_the_materials_where_no_plane_moved(corrected: Any) -> None:
+    found, facts = corrected[0], _facts(corrected[0])
+    assert _picture(found, facts).axes[0].get_title() == "shifts of planes along their normals"
+    still = [plane | {"shift_mm": 0.0} for plane in facts["planes"]]
+    assert _picture(found, facts | {"planes": still}).axes[0].get_title() == "materials of surfaces"
 
 
 def test_planes_are_recovered_from_channels(corrected: Any) -> None:

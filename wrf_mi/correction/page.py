@@ -281,10 +281,10 @@ def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list
 
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
-    """The scene coloured by the shifts of its planes, or of its materials alone, and the held-out scores."""
+    """The scene coloured by the shifts of its planes, or where none moved by its materials, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
     triangles = moved_triangles(surfaces, correction.parameters if correction.kept else {})
-    shift = np.array([plane["shift_mm"] for plane in facts["planes"]]) if facts["planes"] else None
+    shift = np.array([plane["shift_mm"] for plane in facts["planes"]])
     figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
     shown = [
@@ -292,7 +292,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
         for k in range(len(triangles))
         if correction.kinds.get(surfaces.names[surfaces.object_of(np.array([k]))[0]]) != "ceiling"
     ]
-    if shift is None:
+    if not shift.any():
         label, which = "materials of surfaces", _changes_of_materials(correction, facts)
         colours = np.array([to_rgba(CHANGES[one], alpha=0.45) for one in which])[shown]
         room.legend(handles=[Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES], fontsize=8)
@@ -300,7 +300,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
         label, most = "shifts of planes along their normals", max(1.0, float(np.abs(shift).max()))
         shades = ScalarMappable(Normalize(-most, most), "RdBu")
         colours = shades.to_rgba(shift[surfaces.plane][shown], alpha=0.45)
-        figure.colorbar(shades, ax=room, shrink=0.6, label="shift (mm)")
+        figure.colorbar(shades, ax=room, shrink=0.6, pad=0.14, label="shift (mm)")
     room.add_collection3d(Poly3DCollection(triangles[shown], facecolors=colours, edgecolors="0.4", linewidths=0.3))
     room.plot(*correction.misfit.record.tx_pos_m[correction.misfit.rows].T, ",", color="0.2")
     for receiver in correction.misfit.receivers:
