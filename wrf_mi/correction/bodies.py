@@ -54,7 +54,8 @@ class Bodies:
             fit.on_stage(f"{self.title} of boxes", number / len(fit.bodies))
             faces = material_choices(fit.misfit, slabs, fit.frequency_hz)
             noise, trials = found.solution.noise, near(fit.misfit, found.vector)
-            each = [self._with_material(trials, noise, faces, material, found.vector) for material in faces[0].values]
+            materials = [material for material in faces[0].values if material != ABSENT]
+            each = [self._with_material(trials, noise, faces, material, found.vector) for material in materials]
             _, material, vector = min(each, key=lambda one: one[0])
             changed = [face for face in faces if found.known.materials.get(face.what) != material]
             if not changed:
@@ -71,8 +72,6 @@ class Bodies:
         self, trials: Misfit | PathSum, noise: Noise, faces: Sequence[Choice], material: str, vector: FloatArray
     ) -> tuple[float, str, FloatArray]:
         """Cost of all faces of a material, supposed ones at their best shifts, the material, and the vector [p]."""
-        if material == ABSENT:
-            return np.inf, material, vector
         there = vector.copy()
         for face in faces:
             there[face.places] = face.values[material]

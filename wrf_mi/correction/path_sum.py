@@ -87,7 +87,7 @@ class PathSum:
         every = np.arange(len(self._row))
         self._waves = self._waves_of(every, self._gain, np.zeros(len(self._plane_places)), ())
         self._total = self._sums(self._waves, every)
-        self._residual = self._residual_of(self._total, np.arange(len(misfit.observed)), self.at)
+        self._residual = self._residual_of(self._total, self._factor(self.at), np.arange(len(misfit.observed)))
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
@@ -104,10 +104,9 @@ class PathSum:
             powers = (isinstance(model, PowerReceiver) and not model.interference for model in misfit.models)
             return all(powers)
         if task.image:
-            pairs = zip(misfit.models, misfit.entries(), strict=True)
-            waves = [len(m.elements_m) * len(found) for m, found in pairs if isinstance(m, ArrayReceiver)]
-            sizes = {len(m.elements_m) for m in misfit.models if isinstance(m, ArrayReceiver)}
-            return len(waves) == len(misfit.models) and len(sizes) == 1 and sum(waves) <= MOST_WAVES
+            arrays = [m for m in misfit.models if isinstance(m, ArrayReceiver) and m.instrument_scale]
+            sizes, count = {len(m.elements_m) for m in arrays}, sum(len(found) for found in misfit.entries())
+            return len(arrays) == len(misfit.models) and len(sizes) == 1 and max(sizes) * count <= MOST_WAVES
         channels = task.is_complex and record.observation.ndim == 3
         return channels and SHIFT in misfit.parts and misfit.carriers == 1
 
@@ -118,14 +117,15 @@ class PathSum:
         """
         touched, rows, waves = self._changed(vector)
         total = self._total + self._sums(waves - self._waves[touched], touched)
-        rows = np.union1d(rows, np.flatnonzero((self._factor(vector) != self._factor(self.at))[:, 0]))
+        factor = self._factor(vector)
+        rows = np.union1d(rows, np.flatnonzero((factor != self._factor(self.at))[:, 0]))
         found = self._residual.copy()
-        found[rows] = self._residual_of(total, rows, vector)
+        found[rows] = self._residual_of(total, factor, rows)
         return found
 
-    def _residual_of(self, total: Complex, rows: IntArray, vector: FloatArray) -> FloatArray:
+    def _residual_of(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
         """Residuals of some rows of totals."""
-        reported = self._reports.report(total[rows], self._factor(vector)[rows], rows)
+        reported = self._reports.report(total[rows], factor[rows], rows)
         return reported / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
     def jacobian(

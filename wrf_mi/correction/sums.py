@@ -78,44 +78,40 @@ class Strengths:
 
 
 class Spectra:
-    """Bartlett spectra of element signals, as `wrf_mi.graph.combine.ArrayReceiver` reports them.
+    """Bartlett spectra of element signals, scaled as `wrf_mi.graph.combine.ArrayReceiver.instrument_scale` does.
 
     Args:
         misfit: residuals of spectra.
     """
 
     def __init__(self, misfit: Misfit) -> None:
-        self._matrices, self._scaled = list[NDArray[np.complex64]](), list[bool]()
+        self._matrices = list[NDArray[np.complex64]]()
         self._side = np.zeros(len(misfit.observed), np.int64)
         for side, (model, places) in enumerate(zip(misfit.models, misfit.places, strict=True)):
             assert isinstance(model, ArrayReceiver)
             directions = pixel_directions(model.height, model.width).reshape(-1, 3)
             matrix = steering(model.elements_m, directions, model.frequency_hz).values
             self._matrices.append(matrix.astype(np.complex64))
-            self._scaled.append(model.instrument_scale)
             self._side[places] = side
 
     def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
         """Reports as of `Reports`."""
         spectrum = _magnitude(self._images(total * factor, rows))
-        low, _, inverse = self._scale(spectrum, rows)
-        least = np.where(self._scaled_rows(rows), np.take_along_axis(spectrum, low, axis=1), 0)
-        return np.asarray((spectrum - least) * inverse, float)
+        low, _, inverse = _scale(spectrum)
+        return np.asarray((spectrum - np.take_along_axis(spectrum, low, axis=1)) * inverse, float)
 
     def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
         """Derivative as of `Reports`."""
         image = self._images(total * factor, rows)
         spectrum = _magnitude(image)
-        low, high, inverse = self._scale(spectrum, rows)
+        low, high, inverse = _scale(spectrum)
         weight = image.conj() / spectrum
-        scaled = self._scaled_rows(rows)
         share = (spectrum - np.take_along_axis(spectrum, low, axis=1)) * inverse
 
         def slope(change: Complex, which: IntArray) -> FloatArray:
             found = (weight[which] * self._images(change * factor[which], rows[which])).real
             least, most = (np.take_along_axis(found, end[which], axis=1) for end in (low, high))
-            ends = least + share[which] * (most - least)
-            return np.asarray((found - np.where(scaled[which], ends, 0)) * inverse[which], float)
+            return np.asarray((found - least - share[which] * (most - least)) * inverse[which], float)
 
         return slope
 
@@ -129,15 +125,12 @@ class Spectra:
             found[side == number] = single[side == number] @ self._matrices[number]
         return found
 
-    def _scaled_rows(self, rows: IntArray) -> NDArray[np.bool_]:
-        return np.array(self._scaled)[self._side[rows], None]
 
-    def _scale(self, spectrum: NDArray[np.float32], rows: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
-        """Places of the extremes of each row [n, 1], and the factor by which its instrument scales it."""
-        low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
-        span = np.take_along_axis(spectrum, high, axis=1) - np.take_along_axis(spectrum, low, axis=1)
-        inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
-        return low, high, np.where(self._scaled_rows(rows), inverse, 1)
+def _scale(spectrum: NDArray[np.float32]) -> tuple[IntArray, IntArray, NDArray[np.float32]]:
+    """Places of the least and the largest value of each row [n, 1], and the factor that scales them to 0 and 1."""
+    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
+    span = np.take_along_axis(spectrum, high, axis=1) - np.take_along_axis(spectrum, low, axis=1)
+    return low, high, np.divide(1, span, out=np.zeros_like(span), where=span > 0)
 
 
 def _magnitude(image: NDArray[np.complex64]) -> NDArray[np.float32]:
