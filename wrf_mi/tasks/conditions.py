@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
@@ -129,6 +129,23 @@ def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
             turned = turned if np.isfinite(turned).all() else np.array(UPRIGHT)
         placed.append(replace(receiver, position_m=position, orientation_xyzw=turned))
     return tuple(placed)
+
+
+def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> FloatArray | None:
+    """Headings [count] of transmitters, radians; None where a model does not use them.
+
+    Raises:
+        InputError: headings that are missing, not used, of another shape or not finite.
+    """
+    if (heading_rad is not None) != used:
+        unused = "does not know how the transmitter is turned; omit heading_rad"
+        raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")
+    if heading_rad is None:
+        return None
+    heading = np.asarray(heading_rad, float)
+    if heading.shape != (count,) or not np.isfinite(heading).all():
+        raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
+    return heading
 
 
 def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:

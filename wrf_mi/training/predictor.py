@@ -26,7 +26,7 @@ from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
-from ..tasks.conditions import known_uplink, normalised_uplink
+from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
 from .reach import Reach
 from .recordings import Recordings, Where
 from .static_operator import StaticOperator
@@ -179,7 +179,7 @@ class Predictor:
             ``whole`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.report`), [m, ...], NaN where Gaussians
             are out of reach; and statistics of the paths before the instrument's gain.
         """
-        turned = self._headings(tx_heading_rad, len(tx_pos_m))
+        turned = known_headings(tx_heading_rad, len(tx_pos_m), self.graph.form.headings)
         self.graph.check(tx_pos_m)
         reports, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
         for rows, predictor, port, side in self._sides(tx_pos_m, receiver, turned, carriers_hz):
@@ -214,19 +214,6 @@ class Predictor:
         else:
             order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
         return [order[start : start + size] for start in range(0, len(order), size)]
-
-    def _headings(self, tx_heading_rad: ArrayLike | None, count: int) -> FloatArray | None:
-        """Checked headings, or None where they are not used."""
-        used = self.graph.form.headings  # a trained pattern turns with them
-        if (tx_heading_rad is not None) != used:
-            unused = "does not know how the transmitter is turned; omit heading_rad"
-            raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")
-        if tx_heading_rad is None:
-            return None
-        heading = np.asarray(tx_heading_rad, float)
-        if heading.shape != (count,) or not np.isfinite(heading).all():
-            raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
-        return heading
 
     def _evaluated(
         self,
@@ -417,7 +404,7 @@ class Predictor:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
         given = np.asarray(tx_pos_m, float)
-        turned = self._headings(tx_heading_rad, len(given))
+        turned = known_headings(tx_heading_rad, len(given), self.graph.form.headings)
         self.graph.check(given)
         if self.graph.form.carriers_hz is None:
             return self._of_positions(given, index, turned, None)
