@@ -35,6 +35,17 @@ def test_every_training_row_is_held_out_and_no_test_row_is_used(flat_folder: Pat
         assert set(fold.test) | set(fold.all_train) == set(split.all_train)
 
 
+def test_few_rows_leave_out_a_region_or_rows_in_between_at_a_time(flat_folder: Path):
+    """Of 20 rows each is held out once with its region and once with rows in between; four fifths remain on average."""
+    record = load(flat_folder)
+    split = make_splits(record, "official", n_train=20)[0]
+    folds = hold_out_folds(record, split)
+    rows, counts = np.unique(np.concatenate([fold.test for fold in folds]), return_counts=True)
+    assert rows.tolist() == sorted(split.all_train)
+    assert set(counts) == {2}
+    assert np.mean([len(fold.all_train) for fold in folds]) == pytest.approx(16)
+
+
 def test_distances_are_those_to_the_rows_that_remain(flat_folder: Path):
     record = load(flat_folder)
     _, folds = folds_of(record)

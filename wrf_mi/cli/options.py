@@ -57,7 +57,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
-    text = "calibrate predicted standard deviations on training rows held out in space (up to five more fits)"
+    text = "calibrate predicted standard deviations on training rows held out in space (five to ten more fits)"
     add("--intervals", action="store_true", help=text)
     add("--preset", choices=("default", "paper", "quick"), help="named set of settings")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")

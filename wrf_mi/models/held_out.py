@@ -22,6 +22,9 @@ from .model import Fitted, Model, Problem, Session, inputs_of
 
 FEW_ROWS = 10
 """Number of training rows up to which each is held out by itself."""
+SEPARATE_ROWS = 100
+"""Number of training rows up to which regions and rows in between are held out in turn, not together: models that are
+fitted to few rows gain by each."""
 MANY_ROWS = 600
 """Number of training rows from which two folds are enough."""
 FOLDS = 5
@@ -36,7 +39,8 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
 
     The rows are divided into as many k-means clusters of positions as there are folds, and at random into as many
     parts. A fold holds out a cluster, whose rows lie as far from the remaining ones as those of a blocked split, and a
-    part, whose rows lie as near as those of a random split. Up to `FEW_ROWS` rows are held out one by one.
+    part, whose rows lie as near as those of a random split; up to `SEPARATE_ROWS` rows, a cluster or a part. Up to
+    `FEW_ROWS` rows are held out one by one.
 
     Where the split holds out receivers, the trained receivers are held out in as many groups as there are folds, with
     as many rows left to each as the split leaves, and those rows of its receivers are held out in turn, too; where it
@@ -69,7 +73,8 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
             warnings.simplefilter("ignore", UserWarning)  # an empty cluster holds nothing out
             _, cluster = kmeans2(positions, count, iter=50, minit="++", missing="warn", rng=rng)
         part = rng.permutation(np.arange(n) % count)
-        held = [(cluster == fold) | (part == fold) for fold in range(count)]
+        regions, between = ([label == fold for fold in range(count)] for label in (cluster, part))
+        held = [*regions, *between] if n <= SEPARATE_ROWS else list(map(np.logical_or, regions, between))
     folds = []
     for number, out in enumerate(held):
         train, validation = (np.setdiff1d(part, rows[out]) for part in (split.train, split.validation))

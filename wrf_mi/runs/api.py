@@ -195,7 +195,7 @@ def train(
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
         intervals: calibrate the standard deviations of predictions on training rows that are held out in space; the
-            model is fitted up to five more times.
+            model is fitted five more times, ten up to 100 rows.
         on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
         stop: called wherever nothing would be lost; True ends the run, and `resume` continues it.
         scheduler: computes parts of the work of models that have some (ray tracing), with the same result; None: this

@@ -7,7 +7,7 @@ import pytest
 
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
-from wrf_mi.models.hybrid.mixture import FORMS, Mixture, RowScores, choose
+from wrf_mi.models.hybrid.mixture import FORMS, Mixture, RowScores, averaged, choose
 
 ROWS = 200
 RNG = np.random.default_rng(0)
@@ -31,8 +31,7 @@ def chosen(errors: FloatArray) -> tuple[str, Mixture]:
 
 def test_prediction_that_is_best_everywhere_has_all_the_weight():
     noise = RNG.normal(size=(3, ROWS))
-    form, mixture = chosen(np.stack([noise[0], 0.01 * noise[1], noise[2]]))
-    assert form == "mixed"
+    _, mixture = chosen(np.stack([noise[0], 0.01 * noise[1], noise[2]]))
     assert mixture(np.array([0.0, 0.5, 9.0])) == pytest.approx(np.tile([0.0, 1.0, 0.0], (3, 1)))
 
 
@@ -52,6 +51,15 @@ def test_equal_weights_hedge_where_few_rows_tell_predictions_apart_by_chance():
         others = score(mixture(np.zeros(100)), rows[5:]).mean()
         better.append(others - score(np.broadcast_to(single, (100, 3)), rows[5:]).mean())
     assert np.mean(better) > 0.15  # 0.2; the mean of three has 0.34 less error than each
+
+
+def test_clearly_worse_predictions_have_no_share_in_a_mean():
+    """Two predictions of equal errors among five of ten times these: held-out rows tell which to average."""
+    errors = np.random.default_rng(4).normal(size=(7, 40)) * np.repeat([1.0, 10.0], [2, 5])[:, None]
+    every = np.arange(40)
+    weights = averaged(errors_of(errors), np.zeros(40), every, every, 7).weights[0]
+    assert weights[2:].max() == 0
+    assert weights[:2] == pytest.approx([0.5, 0.5], abs=0.25)
 
 
 def test_a_trusted_prediction_is_left_where_rows_show_a_gain():
@@ -99,6 +107,6 @@ def test_more_freedom_without_evidence_is_refused():
 def test_no_form_is_below_the_best_single_prediction_on_its_rows(form: str):
     errors = np.random.default_rng(3).normal(size=(4, ROWS)) * np.array([[1.0], [2.0], [1.5], [0.8]])
     score, every = errors_of(errors), np.arange(ROWS)
-    mixture = FORMS[form](score, DISTANCE, every, 4)
+    mixture = FORMS[form](score, DISTANCE, every, every, 4)
     best = max(score(np.broadcast_to(one, (ROWS, 4)), every).mean() for one in np.eye(4))
     assert score(mixture(DISTANCE), every).mean() >= best - 1e-3

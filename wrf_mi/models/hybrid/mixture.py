@@ -16,6 +16,9 @@ KNOTS, KNOT_ROWS = 4, 20
 FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
 
+DOUBT = 2.0
+"""Standard errors of a difference that is clear: by chance five rows exceed one of them one time in five."""
+
 RowScores = Callable[[FloatArray, IntArray], FloatArray]
 """From weights [n, k] of some held-out observations and their numbers [n] to scores [n], the higher the better."""
 
@@ -42,20 +45,25 @@ def constant(weights: FloatArray) -> Mixture:
     return Mixture(np.zeros(1), weights[None])
 
 
-def averaged(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+def averaged(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
     """One mixture for all distances, by forward selection that starts from equal weights.
 
     Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
+    Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
     """
-    return constant(_selected(score, rows, np.ones(len(rows)), np.full(count, 1 / count), count))
+    scores = [score(np.broadcast_to(one, (len(rows), count)), rows) for one in np.eye(count)]
+    means = [_means(values, unit[rows]) for values in scores]
+    best = max(means, key=np.mean)
+    alike = np.array([not improves(best, one, True, DOUBT) for one in means])
+    return constant(_selected(score, rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
 
 
-def mixed(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+def mixed(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
     """One mixture for all distances, by forward selection that starts from the best single prediction."""
     return constant(_best_selected(score, rows, np.ones(len(rows)), count))
 
 
-def by_distance(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+def by_distance(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
     """A mixture as `mixed` at each of some distances.
 
     An observation counts at the two knots next to its distance, the more the nearer.
@@ -71,8 +79,6 @@ FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
 """Forms of the weights, in the order of their freedom."""
 SINGLE = "single"
 """Form before these: one prediction alone, which is named beforehand."""
-DOUBT = 2.0
-"""Standard errors by which a mixture has to gain on it: by chance five rows exceed one of them one time in five."""
 
 
 def choose(
@@ -100,7 +106,7 @@ def choose(
         trusted: number of the prediction that is used alone unless a mixture gains; None: mixtures only.
     """
 
-    def single(score: RowScores, distance_m: FloatArray, rows: IntArray, count: int) -> Mixture:
+    def single(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
         return constant(np.eye(count)[trusted])
 
     forms = FORMS if trusted is None else {SINGLE: single, **FORMS}
@@ -109,7 +115,7 @@ def choose(
     for done, number in enumerate(folds):
         out = fold == number
         for name, form in forms.items():
-            chosen = form(score, distance_m, every[~out] if len(folds) > 1 else every, count)
+            chosen = form(score, distance_m, unit, every[~out] if len(folds) > 1 else every, count)
             found[name][out] = score(chosen(distance_m[out]), every[out])
         on_fold((done + 1) / len(folds))
     best = next(iter(forms))
@@ -117,7 +123,7 @@ def choose(
         errors = DOUBT if best == SINGLE else 1.0
         if improves(_means(found[name], unit), _means(found[best], unit), True, errors):
             best = name
-    return best, forms[best](score, distance_m, every, count)
+    return best, forms[best](score, distance_m, unit, every, count)
 
 
 def _means(values: FloatArray, unit: IntArray) -> FloatArray:
