@@ -65,6 +65,7 @@ class OptMLSettings(PathSettings, NetworkSettings):
     rounds: Count = 5
     at_once: Count = 10
     threshold: float = 0.15
+    max_paths: Count = 40
     between: int = 3
     final: int = 5
 

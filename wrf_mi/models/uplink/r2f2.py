@@ -57,7 +57,7 @@ class PathSettings(CheckedSettings):
     """
 
     wavefront: Kind = "auto"
-    max_paths: Count = 40
+    max_paths: Count = 100
     max_distance_m: Positive = 100.0
     between: int = 1
     final: int = 15
