@@ -44,6 +44,7 @@ INGREDIENTS = {
     "trees": Ingredient("trees"),
     "mri": Ingredient("mri"),
     "idw": Ingredient("idw"),
+    "r2f2-scene": Ingredient("r2f2", scene=True),
     **{name: Ingredient(name) for name in ("r2f2", "optml", "fire", "linear")},
     "learned": Ingredient("wrf-gs+", default=False),
     "joint": Ingredient("wrf-gs+", scene=True, default=False),

@@ -66,8 +66,9 @@ class HybridSettings(CheckedSettings):
     Attributes:
         ingredients: names of the mixed models, separated by commas: idw, kriging, trees, mri, physics-no-mesh, learned
             (wrf-gs+), or a model's name; with an uplink r2f2, optml, fire and linear; with a scene ray-tracing, surface
-            (its gain, materials and Gaussians on its surfaces trained), physics and joint (wrf-gs+ with the scene).
-            null: all of them that serve the data, but learned and joint, each fit of which takes minutes.
+            (its gain, materials and Gaussians on its surfaces trained), physics, joint (wrf-gs+ with the scene) and,
+            with an uplink, r2f2-scene. null: all of them that serve the data, but learned and joint, each fit of which
+            takes minutes.
     """
 
     ingredients: str | None = None

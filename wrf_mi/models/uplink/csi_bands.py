@@ -89,9 +89,13 @@ def principal(elements_m: FloatArray) -> FloatArray:
 
     Axes along which it is flat (`FLAT`) are left out: a plane array has two, a line one, a single antenna none.
     """
-    centred = elements_m - elements_m.mean(axis=0)
-    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
-    return np.asarray(centred @ axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)].T)
+    return np.asarray((elements_m - elements_m.mean(axis=0)) @ principal_axes(elements_m).T)
+
+
+def principal_axes(elements_m: FloatArray) -> FloatArray:
+    """Unit vectors [q, 3] of the principal axes along which an array is not flat, see `principal`."""
+    _, extent, axes = np.linalg.svd(elements_m - elements_m.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
 
 
 def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:

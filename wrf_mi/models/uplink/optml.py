@@ -31,7 +31,7 @@ from ...core.settings import Count
 from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..model import Arrays, Model, Problem, keyed, settings_array, stored_settings, under
+from ..model import Arrays, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
 from ..networks.layers import columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .csi_bands import Bands
@@ -78,7 +78,7 @@ class OptML(R2F2):
         self.settings: OptMLSettings = settings
         self.network = network
 
-    def paths(self, h: Complex) -> Paths:
+    def paths(self, h: Complex, inputs: Inputs) -> Paths:
         """Paths of uplinks [m, antennas, f]."""
         s, waves = self.settings, self.waves
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))

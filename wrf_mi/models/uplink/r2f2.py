@@ -13,6 +13,9 @@ by non-linear least squares, are evaluated at the downlink's frequencies. Differ
   have a subcarrier between them, the carrier of 802.11.
 - The Bayesian information criterion chooses the number of paths up to ``max_paths``; the paper sets a threshold of the
   residual.
+- With a scene the paths of its mesh start the search, and their lengths and directions have a prior
+  (`wrf_mi.models.uplink.scene_paths`).
+- Gains have priors, too, each of a power of its own (`wrf_mi.models.uplink.uplink_paths.expected_gains`).
 - The solver is Levenberg and Marquardt's with exact derivatives (`wrf_mi.models.uplink.uplink_paths`).
 
 Training rows choose the kind of wave front alone. The method is exact on noise-free channels of few, well separated
@@ -31,9 +34,11 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings, Count, Positive
+from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, under
 from .csi_bands import Bands, bands_of, known_rows, relative_error
+from .scene_paths import ScenePaths
 from .uplink_paths import Paths, find_paths
 from .uplink_waves import Complex, waves_of
 
@@ -54,6 +59,8 @@ class PathSettings(CheckedSettings):
         final: steps of refinement after the last addition.
         spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
         choice_rows: validation rows that choose the wave model.
+        depth: with a scene: most interactions of its paths.
+        reflections: with a scene: reflections among them at most.
     """
 
     wavefront: Kind = "auto"
@@ -63,20 +70,26 @@ class PathSettings(CheckedSettings):
     final: int = 15
     spacing_hz: Positive = 312.5e3
     choice_rows: Count = 16
+    depth: Count = 5
+    reflections: int = 3
 
 
 def choose(
-    name: str, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress
+    name: str, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress, directions: bool = False
 ) -> tuple[str, Bands]:
     """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
 
-    The criterion is the median over rows and antennas. Without validation rows, training rows decide.
+    The criterion is the median over rows and antennas. Without validation rows, training rows decide. ``directions``:
+    among the wave models whose paths have a direction.
 
     Raises:
         InputError: as `bands_of` and `known_rows`, or a wave front that needs elements where there are none.
     """
     train, validation = known_rows(name, record, split)
     first = bands_of(record, settings.spacing_hz)
+    if directions and (first.elements_m is None or settings.wavefront == "free"):
+        text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
+        raise InputError(f"{record.name}: {text}; give them or omit the scene")
     if first.elements_m is None:
         if settings.wavefront in ("spherical", "plane"):
             raise InputError(
@@ -86,6 +99,7 @@ def choose(
         kinds: tuple[str, ...] = ("free",)
     else:
         kinds = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
+    kinds = tuple(kind for kind in kinds if not directions or kind != "free")
     options = [
         (kind, bands)
         for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
@@ -108,21 +122,24 @@ def choose(
 
 
 class R2F2(Fitted):
-    """Downlink from paths of the uplink, with the chosen wave model ``kind`` and bands."""
+    """Downlink from paths of the uplink, with the chosen wave model ``kind`` and bands, and the paths of a scene."""
 
-    def __init__(self, kind: str, bands: Bands, settings: PathSettings) -> None:
-        self.kind, self.bands, self.settings = kind, bands, settings
+    def __init__(self, kind: str, bands: Bands, settings: PathSettings, scene: ScenePaths | None = None) -> None:
+        self.kind, self.bands, self.settings, self.scene = kind, bands, settings, scene
         self.waves = waves_of(kind, bands, settings.max_distance_m)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
-        paths = self.paths(np.asarray(inputs.uplink, complex))
+        paths = self.paths(np.asarray(inputs.uplink, complex), inputs)
         found = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
         return Prediction(found.astype(np.complex64))
 
-    def paths(self, h: Complex) -> Paths:
-        """Paths of uplinks [m, antennas, f]."""
-        return find_paths(self.waves, h, self.settings.max_paths, self.settings.between, self.settings.final)
+    def paths(self, h: Complex, inputs: Inputs) -> Paths:
+        """Paths of uplinks [m, antennas, f] from the positions of ``inputs``."""
+        s, known = self.settings, None
+        if self.scene is not None:
+            known = self.scene(self.waves, h, inputs.tx_pos_m, inputs.tx_heading_rad)
+        return find_paths(self.waves, h, s.max_paths, s.between, s.final, known)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Wave model, bands and settings."""
@@ -132,14 +149,25 @@ class R2F2(Fitted):
 
 def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
     """Choose the wave model and, where frequencies are unknown, the bands."""
-    return R2F2(*choose(MODEL.name, problem.record, split, problem.settings, session.report), problem.settings)
+    settings, record = problem.settings, problem.record
+    with_scene = problem.scene is not None
+    chosen = choose(MODEL.name, record, split, settings, session.report, with_scene)
+    return R2F2(*chosen, settings, _scene_paths(problem, settings))
+
+
+def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
+    if problem.scene is None:
+        return None
+    options = TraceOptions(transmission=True, max_depth=settings.depth, max_reflections=settings.reflections)
+    return ScenePaths(problem.opened_scene, problem.record.receivers[0], problem.record.tx_antenna, options)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
     """The model that `R2F2.arrays` described."""
     settings = {name: value.item() for name, value in under("settings/", arrays).items()}
-    return R2F2(*Bands.load(arrays), PathSettings(**settings))
+    found = PathSettings(**settings)
+    return R2F2(*Bands.load(arrays), found, _scene_paths(problem, found))
 
 
 SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
-MODEL = Model("r2f2", ("csi",), PathSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = Model("r2f2", ("csi",), PathSettings, fit, load, SOURCE, scene="optional", uplink="required", headings=True)

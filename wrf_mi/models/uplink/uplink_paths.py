@@ -3,7 +3,7 @@
 Paths are found one after the other at the maximum of the matched filter of the residual, and after each addition all
 paths are refined together (Levenberg and Marquardt). A row takes no further path once the Bayesian information
 criterion of complex white noise of unknown power, 2 N log(residual energy) + freedom log(2 N) for N coefficients, would
-rise.
+rise. Paths of a scene may be known before: their parameters have a Gaussian prior.
 
 Source: Vasisht et al. (2016), sections 5.2 to 5.4 (search on a grid, then refinement); Mamandipoor et al., "Newtonized
 orthogonal matching pursuit" (2016) (refinement after each path); Schwarz, "Estimating the dimension of a model" (1978)
@@ -15,16 +15,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ...core.angles import FloatArray
+from ...core.types import IntArray
 from .uplink_waves import Complex, Mask, Solved, Waves, strongest
 
 T = TypeVar("T")
+
+PASSES = 8
+"""Passes of `expected_gains`."""
 
 ROWS = 16
 """Rows refined together: more leave the processor's cache."""
@@ -51,12 +55,55 @@ class Paths:
     gains: Complex
 
 
-def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
+@dataclass
+class Start:
+    """Paths of n rows that are known before the search, such as those of a scene.
+
+    Attributes:
+        theta: expected parameters [n, k, p], see `Waves`.
+        present: whether a row has each of the k paths, [n, k].
+        precision: inverse variances of the parameters [n, k, p]; 0: nothing is known.
+    """
+
+    theta: FloatArray
+    present: Mask
+    precision: FloatArray
+
+    @classmethod
+    def none(cls, rows: int, parameters: int) -> Start:
+        """No path of any row."""
+        return cls(np.zeros((rows, 0, parameters)), np.zeros((rows, 0), bool), np.zeros((rows, 0, parameters)))
+
+    def __getitem__(self, rows: slice | IntArray) -> Start:
+        """The paths of some rows."""
+        return Start(self.theta[rows], self.present[rows], self.precision[rows])
+
+    def joined(self, theta: FloatArray) -> Start:
+        """With further paths [n, m, p] of which nothing is known."""
+        absent = np.zeros(theta.shape[:2], bool)
+        parts = (self.theta, theta), (self.present, absent), (self.precision, np.zeros_like(theta))
+        return Start(*(np.concatenate(pair, axis=1) for pair in parts))
+
+    def cost(self, theta: FloatArray) -> FloatArray:
+        """Squared differences of parameters from the expected ones, in standard deviations, summed [n]."""
+        return np.asarray((self.precision * np.square(theta - self.theta)).sum(axis=(1, 2)))
+
+
+def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int, start: Start | None = None) -> Paths:
     """Paths of uplinks [n, antennas, f].
 
     All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last.
+
+    Args:
+        waves: wave model.
+        h: uplinks.
+        max_paths: most paths of a row that are searched for.
+        between: steps of refinement after an addition.
+        final: steps of refinement in the end, and of known paths in the beginning.
+        start: paths that are known before; None: none.
     """
-    return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final), len(h)))
+    known = start or Start.none(len(h), 1 + waves.cosines.shape[1])
+    return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final, known[rows]), len(h)))
 
 
 def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
@@ -88,66 +135,100 @@ def join_paths(parts: list[Paths]) -> Paths:
     return Paths(*(np.concatenate([padded(part, name) for part in parts]) for name in ("theta", "present", "gains")))
 
 
-def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int) -> Paths:
-    n, count = len(h), h.shape[1] * h.shape[2]
+def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, known: Start) -> Paths:
+    count = h.shape[1] * h.shape[2]
     energy = np.square(np.abs(h)).sum(axis=(1, 2))
     # An uplink of zeros has no paths; its row is predicted as zero.
     active = np.flatnonzero(energy > 0)
-    theta: FloatArray = np.zeros((n, 0, 1 + waves.cosines.shape[1]))
-    present: Mask = np.zeros((n, 0), bool)
-    best = energy.copy()
-    residual = h
-    for number in range(max_paths):
+    present: Mask = known.present & (energy > 0)[:, None]
+    theta, best, residual = known.theta, energy.copy(), h.copy()
+    if present.any():
+        theta, solved = refine(waves, h, theta, present, final, known)
+        best, residual = solved.energy, solved.residual
+    for _ in range(max_paths):
         # A finished row gets its first path's parameters, masked.
-        fresh = strongest(waves, residual) if number == 0 else theta[:, 0].copy()
-        if number:
+        fresh = theta[:, 0].copy() if theta.shape[1] else strongest(waves, residual)
+        if theta.shape[1] and len(active):
             fresh[active] = strongest(waves, residual[active])
         # A single path costs little to refine, and brings the refinement of all nearer to convergence.
         single = np.ones((len(active), 1), bool)
         fresh[active] = refine(waves, residual[active], fresh[active][:, None], single, FIRST_STEPS)[0][:, 0]
-        theta = np.concatenate([theta, fresh[:, None]], axis=1)
-        present = np.concatenate([present, np.zeros((n, 1), bool)], axis=1)
+        theta, known = np.concatenate([theta, fresh[:, None]], axis=1), known.joined(fresh[:, None])
+        present = np.concatenate([present, np.zeros((len(h), 1), bool)], axis=1)
         trial = present[active]
         trial[:, -1] = True
-        refined, solved = refine(waves, h[active], theta[active], trial, between)
+        refined, solved = refine(waves, h[active], theta[active], trial, between, known[active])
         left = solved.energy
         floor = ACCURACY * energy[active]
         gain = 2 * count * np.log(np.maximum(best[active], floor) / np.maximum(left, floor))
         better = gain > waves.freedom * np.log(2 * count)
         kept = active[better]
-        theta[kept], present[kept], best[kept] = refined[better], True, left[better]
-        if number == 0:
-            residual = h.copy()
+        theta[kept], present[kept, -1], best[kept] = refined[better], True, left[better]
         residual[kept] = solved.residual[better]
         active = kept[best[kept] > ACCURACY * energy[kept]]
         if not len(active):
             break
-    return _finish(waves, h, theta, present, final)
+    return _finish(waves, h, theta, present, final, known)
 
 
-def _finish(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
-    """Refine, then solve for gains with a prior of the channel's power, which limits the gains of close pairs."""
-    count = h.shape[1] * h.shape[2]
-    theta, solved = refine(waves, h, theta, present, steps)
-    power = np.square(np.abs(h)).mean(axis=(1, 2))
-    free = np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
-    ridge = solved.energy / free / np.maximum(power, np.finfo(float).tiny)
-    gains = waves.solve(theta, present, h, ridge).gains
-    return Paths(theta, present, gains)
+def _finish(
+    waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, known: Start | None = None
+) -> Paths:
+    theta, solved = refine(waves, h, theta, present, steps, known)
+    return Paths(theta, present, expected_gains(waves, h, theta, present, solved)[0])
 
 
-def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> tuple[FloatArray, Solved]:
-    """Levenberg and Marquardt's steps on all paths of each row; a step that raises the residual is discarded."""
+def expected_gains(
+    waves: Waves, h: Complex, theta: FloatArray, present: Mask, solved: Solved
+) -> tuple[Complex, FloatArray]:
+    """Expected gains of known paths, and their expected powers [n, k].
+
+    Gains are complex Gaussians a priori, each of a power of its own that makes the uplink most probable; so those of
+    paths that the uplink cannot tell apart stay small. The noise is what the best gains leave.
+
+    Source: Tipping, "Sparse Bayesian learning and the relevance vector machine" (2001), section 3 (expectation
+    maximisation).
+    """
+    count, diagonal = h.shape[1] * h.shape[2], np.arange(present.shape[1])
+    tiny = np.finfo(float).tiny
+    noise = solved.energy / np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
+    whole = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
+    power = np.where(present, whole[:, None], 0.0)
+    for _ in range(PASSES):
+        ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
+        found = waves.solve(theta, present, h, ridge)
+        loaded = found.gram.copy()
+        loaded[:, diagonal, diagonal] += ridge
+        variance = noise[:, None] * np.linalg.inv(loaded)[:, diagonal, diagonal].real
+        mean = np.square(np.abs(found.gains)).reshape(*present.shape, -1).mean(axis=2)
+        power = np.where(present, mean + np.maximum(variance, 0), 0.0)
+    return found.gains, power
+
+
+def refine(
+    waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, known: Start | None = None
+) -> tuple[FloatArray, Solved]:
+    """Levenberg and Marquardt's steps on all paths of each row; a step that raises the cost is discarded.
+
+    The cost is the energy of the residual, and with ``known`` paths that of their differences from it, of which a
+    standard deviation counts as much as the mean power of the residual at first.
+    """
     theta, solved = theta.copy(), waves.solve(theta, present, h)
+    if known is None:
+        known = Start.none(len(h), theta.shape[2]).joined(theta)
+    noise = solved.energy / (h.shape[1] * h.shape[2])
+    known = replace(known, precision=known.precision * noise[:, None, None])
     damping = np.full(len(h), 1e-3)
-    energy, whole = solved.energy, np.square(np.abs(h)).sum(axis=(1, 2))
+    energy, whole = solved.energy + known.cost(theta), np.square(np.abs(h)).sum(axis=(1, 2))
     active = np.flatnonzero(energy > ACCURACY * whole)
     for _ in range(steps):
         if not len(active):
             break
         now = Solved(*(values[active] for values in vars(solved).values()))
         normal, right = waves.normal(theta[active], now)
-        diagonal = np.arange(normal.shape[1])
+        diagonal, precision = np.arange(normal.shape[1]), known.precision[active]
+        normal[:, diagonal, diagonal] += precision.reshape(len(active), -1)
+        right = right + (precision * (known.theta[active] - theta[active])).reshape(len(active), -1)
         scale = np.maximum(normal[:, diagonal, diagonal], 0)
         scale = np.maximum(scale, 1e-12 * scale.max(axis=1, keepdims=True, initial=0) + np.finfo(float).tiny)
         normal[:, diagonal, diagonal] += damping[active, None] * scale
@@ -156,7 +237,7 @@ def refine(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: in
         step = np.linalg.solve(normal / (root[:, :, None] * root[:, None]), (right / root)[..., None])[..., 0] / root
         trial = waves.limit(theta[active] + step.reshape(theta[active].shape) * present[active][..., None])
         tried = waves.solve(trial, present[active], h[active])
-        left = tried.energy
+        left = tried.energy + known[active].cost(trial)
         better = left < energy[active]
         converged = better & (left > (1 - CONVERGED) * energy[active])
         kept = active[better]

@@ -70,7 +70,7 @@ def strongest(waves: Waves, residual: Complex) -> FloatArray:
 def _solve(gram: Complex, right: Complex, ridge: Any, size: float) -> Complex:
     loaded = gram.copy()
     diagonal = np.arange(gram.shape[-1])
-    loaded[:, diagonal, diagonal] += np.reshape(ridge, (-1, 1)) + SINGULAR * size
+    loaded[:, diagonal, diagonal] += np.asarray(ridge) + SINGULAR * size
     return np.asarray(np.linalg.solve(loaded, right))
 
 
@@ -125,7 +125,7 @@ class Waves:
         return np.asarray(np.exp(theta * self.slope))
 
     def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n]: noise over path power."""
+        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n, paths]: noise over path power."""
         atoms = self.unit(theta) * present[..., None]
         count = atoms.shape[2]
         left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
