@@ -21,7 +21,7 @@ from .uplink_waves import Complex, Waves
 
 CHUNK_SIZE = 256
 """Positions that are traced together."""
-LENGTH_SD_M, COSINE_SD = 0.1, 0.01
+LENGTH_SD_M, COSINE_SD = 0.3, 0.03
 """Standard deviations of a path's length and its direction's cosines, by a mesh that is some centimetres off."""
 ALIKE_M, ALIKE_COSINE = 0.02, 0.01
 """Paths that differ by less count as one."""
