@@ -69,7 +69,7 @@ class ScenePaths:
 
         def needed(part: slice) -> Any:
             solved = waves.solve(theta[part], present[part], h[part])
-            return expected_gains(waves, h[part], theta[part], present[part], solved)[1]
+            return expected_gains(waves, h[part], present[part], solved)[1]
 
         power = np.concatenate(in_parts(needed, len(h)))
         present &= power > NEEDED * power.max(axis=1, keepdims=True)

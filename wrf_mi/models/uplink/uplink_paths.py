@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .uplink_waves import Complex, Mask, Solved, Waves, strongest
+from .uplink_waves import SINGULAR, Complex, Mask, Solved, Waves, products, strongest
 
 T = TypeVar("T")
 
@@ -175,13 +175,11 @@ def _finish(
     waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, known: Start | None = None
 ) -> Paths:
     theta, solved = refine(waves, h, theta, present, steps, known)
-    return Paths(theta, present, expected_gains(waves, h, theta, present, solved)[0])
+    return Paths(theta, present, expected_gains(waves, h, present, solved)[0])
 
 
-def expected_gains(
-    waves: Waves, h: Complex, theta: FloatArray, present: Mask, solved: Solved
-) -> tuple[Complex, FloatArray]:
-    """Expected gains of known paths, and their expected powers [n, k].
+def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> tuple[Complex, FloatArray]:
+    """Expected gains of paths, and their expected powers [n, k], from the best gains (`Waves.solve`).
 
     Gains are complex Gaussians a priori, each of a power of its own that makes the uplink most probable; so those of
     paths that the uplink cannot tell apart stay small. The noise is what the best gains leave.
@@ -190,19 +188,21 @@ def expected_gains(
     maximisation).
     """
     count, diagonal = h.shape[1] * h.shape[2], np.arange(present.shape[1])
+    right = products(solved.atoms, h)
     tiny = np.finfo(float).tiny
     noise = solved.energy / np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
     whole = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
     power = np.where(present, whole[:, None], 0.0)
     for _ in range(PASSES):
         ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
-        found = waves.solve(theta, present, h, ridge)
-        loaded = found.gram.copy()
-        loaded[:, diagonal, diagonal] += ridge
-        variance = noise[:, None] * np.linalg.inv(loaded)[:, diagonal, diagonal].real
-        mean = np.square(np.abs(found.gains)).reshape(*present.shape, -1).mean(axis=2)
+        loaded = solved.gram.copy()
+        loaded[:, diagonal, diagonal] += ridge + SINGULAR * solved.atoms.shape[2]
+        inverse = np.linalg.inv(loaded)
+        gains = inverse @ right
+        variance = noise[:, None] * inverse[:, diagonal, diagonal].real
+        mean = np.square(np.abs(gains)).reshape(*present.shape, -1).mean(axis=2)
         power = np.where(present, mean + np.maximum(variance, 0), 0.0)
-    return found.gains, power
+    return gains, power
 
 
 def refine(

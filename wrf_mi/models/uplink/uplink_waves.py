@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +66,16 @@ def strongest(waves: Waves, residual: Complex) -> FloatArray:
     return np.concatenate([waves.grid[at][:, None], waves.cosines[direction]], axis=1)
 
 
-def _solve(gram: Complex, right: Complex, ridge: Any, size: float) -> Complex:
+def products(atoms: Complex, h: Complex) -> Complex:
+    """Products of atoms [n, paths, m] with uplinks [n, antennas, f]: [n, paths, antennas], or 1 where m is all."""
+    parts = h.reshape(len(h), h.shape[1] * h.shape[2] // atoms.shape[2], atoms.shape[2])
+    return np.asarray(atoms.conj() @ parts.transpose(0, 2, 1))
+
+
+def _solve(gram: Complex, right: Complex, size: float) -> Complex:
     loaded = gram.copy()
     diagonal = np.arange(gram.shape[-1])
-    loaded[:, diagonal, diagonal] += np.asarray(ridge) + SINGULAR * size
+    loaded[:, diagonal, diagonal] += SINGULAR * size
     return np.asarray(np.linalg.solve(loaded, right))
 
 
@@ -124,15 +129,13 @@ class Waves:
         """Uplink coefficients of paths of unit gain, [n, paths, f] or, with one gain for all antennas, antennas * f."""
         return np.asarray(np.exp(theta * self.slope))
 
-    def solve(self, theta: FloatArray, present: Mask, h: Complex, ridge: FloatArray | float = 0.0) -> Solved:
-        """Gains that fit an uplink [n, antennas, f] best; ``ridge`` [n, paths]: noise over path power."""
+    def solve(self, theta: FloatArray, present: Mask, h: Complex) -> Solved:
+        """Gains that fit an uplink [n, antennas, f] best."""
         atoms = self.unit(theta) * present[..., None]
-        count = atoms.shape[2]
-        left, right = atoms.conj(), h.reshape(len(h), h.shape[1] * h.shape[2] // count, count).transpose(0, 2, 1)
-        gram, diagonal = left @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
+        gram, diagonal = atoms.conj() @ atoms.transpose(0, 2, 1), np.arange(atoms.shape[1])
         # The atoms of absent paths are zero: 1 on the diagonal keeps the matrix regular and their gains zero.
         gram[:, diagonal, diagonal] += ~present
-        gains = _solve(gram, left @ right, ridge, count)
+        gains = _solve(gram, products(atoms, h), atoms.shape[2])
         return Solved(gains, h - (gains.transpose(0, 2, 1) @ atoms).reshape(h.shape), atoms, gram)
 
     def normal(self, theta: FloatArray, solved: Solved) -> tuple[FloatArray, FloatArray]:
@@ -140,7 +143,7 @@ class Waves:
         tilt = solved.atoms * self.slope
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
         products = tilt.conj() @ tilt.transpose(0, 2, 1)
-        projected = products - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, len(self.slope))
+        projected = products - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, len(self.slope))
         shared = solved.gains.conj() @ solved.gains.transpose(0, 2, 1)
         right = (solved.gains.conj() * (tilt.conj() @ solved.residual.transpose(0, 2, 1))).sum(axis=-1)
         return (projected * shared).real, right.real
@@ -271,7 +274,7 @@ class ArrayWaves(Waves):
         pairs, residual = tilt.view(float), solved.residual.reshape(n, -1, 1).view(float).reshape(n, -1, 1)
         products = pairs @ pairs.transpose(0, 2, 1)
         size = antennas * subcarriers
-        shadow = cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, 0.0, size)
+        shadow = cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, size)
         return products - shadow.real, (pairs @ residual)[..., 0]
 
     def limit(self, theta: FloatArray) -> FloatArray:
