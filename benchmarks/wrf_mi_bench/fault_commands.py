@@ -151,11 +151,12 @@ class Correction(Command):
 
     def content(self, place: Path) -> dict[str, Any]:
         """All files of the scene folder, without the duration on its page."""
-        from wrf_mi.correction.page import FIGURES, PAGE
+        from wrf_mi.correction.page import PAGE
+        from wrf_mi.scene.correction_data import FILE
 
         content = _file_content(place / "scene")
         content[PAGE] = re.sub(rb"Duration: \d+ s", b"", content[PAGE])
-        return content | {FIGURES: {key: v for key, v in json.loads(content[FIGURES]).items() if key != "seconds"}}
+        return content | {FILE: {key: v for key, v in json.loads(content[FILE]).items() if key != "seconds"}}
 
 
 class Tables(Command):

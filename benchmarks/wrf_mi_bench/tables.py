@@ -25,11 +25,11 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
 from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers, write_atomically
-from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files, source_files
 from wrf_mi.runs.folder import CONFIG, is_finished, package_versions
 from wrf_mi.runs.results import read_run
+from wrf_mi.scene.correction_data import FILE as CORRECTION
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_channels import MEASURED

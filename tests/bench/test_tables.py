@@ -12,8 +12,8 @@ from wrf_mi_bench.bench import BenchFailed
 from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, plan
 
 from wrf_mi.core import InputError
-from wrf_mi.correction.page import FIGURES as CORRECTION
 from wrf_mi.models import MODELS
+from wrf_mi.scene.correction_data import FILE as CORRECTION
 from wrf_mi.tracing import open_scene
 
 CHECKOUT = Path(__file__).parents[2]

@@ -16,6 +16,7 @@ from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene,
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.build_laboratory import sheet
 
+import wrf_mi
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
@@ -23,6 +24,7 @@ from wrf_mi.correction.misfit import Misfit, search_options
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
+from wrf_mi.scene.correction_data import read_correction_data
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.scene.surfaces import Surface
@@ -95,6 +97,24 @@ def test_paths_are_those_of_the_scene_that_was_found(corrected: Any) -> None:
     """
     found, *_ = corrected
     assert np.mean(found.scores[found.kept]) > 50
+
+
+def test_rows_are_told_to_models_of_the_corrected_scene(
+    corrected: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The data set and its rows are in the scene folder; a run that is tested on them warns."""
+    found, record, *_ = corrected
+    split = make_splits(record, "official")[0]
+    write_page(found, tmp_path / "scene")
+    data = read_correction_data(tmp_path / "scene")
+    assert data is not None
+    assert data.rows.tolist() == split.all_train.tolist()
+    assert data.error_ratio >= 1
+    assert data.error_ratio == found.data.error_ratio
+    for rows, warned in ((split, False), (replace(split, train=split.test, test=split.train[:7]), True)):
+        caplog.clear()
+        wrf_mi.train(record, tmp_path / str(warned), "ray-tracing", scene=str(tmp_path / "scene"), split=rows)
+        assert ("corrected by 7 of the 7 test rows" in caplog.text) is warned
 
 
 def test_planes_alone_are_corrected(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrf_mi.correction.least_squares import FREEDOM, Noise, Prior, Solution, solve
+from wrf_mi.correction.least_squares import FREEDOM, Noise, Prior, Solution, left_out_residuals, solve
 
 ROWS, VALUES = 400, 6
 RNG = np.random.default_rng(1)
@@ -47,6 +47,29 @@ def test_standard_deviations_are_those_of_repeated_measurements() -> None:
         vectors.append(found.vector)
         stated.append(np.sqrt(np.diag(found.covariance)))
     np.testing.assert_allclose(np.std(vectors, axis=0), np.mean(stated, axis=0), rtol=0.25)
+
+
+def test_residuals_of_rows_left_out_are_those_of_fits_to_the_others() -> None:
+    """Of ten rows and three parameters, all with the weights of the fit to all rows; one row was not observed."""
+    rng, prior = np.random.default_rng(4), weak(1.0)
+    slope, observed = rng.normal(size=(10, 2, 3)), rng.normal(size=(10, 2))
+    observed[3] = np.nan
+    noise, seen = Noise(0.5, 2.0), np.arange(10) != 3
+
+    def fit(weights: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        part, values = slope[rows], observed[rows]
+        information = np.einsum("r,rvp,rvq->pq", weights[rows], part, part) + prior.precision
+        return np.linalg.solve(information, np.einsum("r,rvp,rv->p", weights[rows], part, values)), information
+
+    weights = noise.weights(observed)
+    for _ in range(200):
+        vector, information = fit(weights, np.flatnonzero(seen))
+        weights = noise.weights(slope @ vector - observed)
+    found = left_out_residuals(first(slope), slope @ vector - observed, np.linalg.inv(information), noise)
+    assert np.isnan(found[3]).all()
+    for row in np.flatnonzero(seen):
+        without, _ = fit(weights, np.flatnonzero(seen & (np.arange(10) != row)))
+        np.testing.assert_allclose(found[row], slope[row] @ without - observed[row], rtol=1e-6)
 
 
 def test_correlated_values_count_once() -> None:

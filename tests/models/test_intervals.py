@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,17 @@ import pytest
 from calling import refused
 
 import wrf_mi
-from wrf_mi.core import Record, Split
+from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.held_out import HeldOut, hold_out_folds
+from wrf_mi.models import MODELS, Problem, Session
+from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out_folds
 from wrf_mi.models.intervals import fit_intervals
+from wrf_mi.models.model import default_settings
+from wrf_mi.scene.correction_data import FILE, CorrectionData
 from wrf_mi.tasks.scores import crps, inside_interval
 
+ROUNDING_DB = 2e-5
+"""Of powers near -60 dBm in single precision, a few units in the last place."""
 COVERED = 0.02
 """Allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors."""
 
@@ -101,6 +107,29 @@ def test_crps_equals_its_integral():
     assert crps([mean], [std], [truth]) == pytest.approx(integral, abs=1e-4)
     assert crps([mean + 1j * mean], [std * 2**0.5], [truth + 1j * truth]) == pytest.approx(integral, abs=1e-4)
     assert crps([mean, 0], [std, 1], [truth, np.nan]) == crps([mean], [std], [truth])
+
+
+def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: Path, tmp_path: Path):
+    record = load(flat_folder)
+    _, folds = folds_of(record)
+    held = HeldOut.of(record, folds, 0)
+    entry, observed = MODELS["kriging"], held.observed(record)
+
+    def errors(scene: Path) -> np.ndarray:
+        problem = Problem(record, default_settings(entry, (), {}), scene=str(scene))
+        found = held_out_predictions(entry, problem, folds, held, Session(tmp_path, tmp_path), "kriging")
+        return found.mean - observed
+
+    plain = errors(tmp_path)
+    known = np.unique(held.row)[::2]
+    data = CorrectionData(record.name, known, 1.5)
+    for name, factor in ((record.name, 1.5), ("another", 1)):
+        (tmp_path / FILE).write_text(json.dumps({"data": {**data.facts(), "name": name}}))
+        expected = plain * np.where(np.isin(held.row, known), factor, 1)
+        np.testing.assert_allclose(errors(tmp_path), expected, atol=ROUNDING_DB)
+    (tmp_path / FILE).write_text('{"data": {"rows": 3}}')
+    with pytest.raises(InputError, match="correct the scene again"):
+        errors(tmp_path)
 
 
 def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder: Path, tmp_path: Path):

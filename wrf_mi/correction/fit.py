@@ -17,7 +17,7 @@ from ..tracing.plane_parameters import SHIFT, TILT
 from .bodies import Bodies
 from .doubts import Doubts
 from .frame import rigid_motions
-from .least_squares import Noise, Prior, Solution, minimised, solve
+from .least_squares import Noise, Prior, Solution, left_out_residuals, minimised, solve
 from .misfit import Misfit
 from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
@@ -302,3 +302,9 @@ class Fit:
         if FRAME in stage.split("+"):  # too few paths meet them
             vector[others] = self.expected(vector, others)
         return replace(found, vector=vector)
+
+    def left_out_residuals(self, stage: str, solution: Solution) -> FloatArray:
+        """Residuals [n_rx * rows, values] of each row by a fit to the others, see `left_out_residuals`."""
+        free, vector = self.free(stage), solution.vector
+        derivative = near(self.misfit, vector).jacobian(vector, free)
+        return left_out_residuals(derivative, self.misfit.residual(vector), solution.covariance, solution.noise)

@@ -176,6 +176,28 @@ def minimised(
     return vector, found
 
 
+def left_out_residuals(
+    derivative: NDArray[np.floating], residual: FloatArray, covariance: FloatArray, noise: Noise
+) -> FloatArray:
+    """Residuals [rows, values] of each row by a fit to the others, to first order; NaN without observation.
+
+    Source: the residual of a row over one minus its leverage, Cook and Weisberg, "Residuals and Influence in
+    Regression" (1982), section 2.2; here of all values of a row.
+
+    Args:
+        derivative: derivatives [p, rows, values] at the solution.
+        residual: residuals [rows, values] there.
+        covariance: covariance [p, p] of the solution.
+        noise: noise of the solution.
+    """
+    found = np.full(residual.shape, np.nan)
+    for row in np.flatnonzero(np.isfinite(residual).all(axis=1)):
+        slope = derivative[:, row].astype(float)
+        leverage = noise.weights(residual[row : row + 1])[0] * slope.T @ covariance @ slope
+        found[row] = np.linalg.solve(np.eye(len(leverage)) - leverage, residual[row])
+    return found
+
+
 def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Fisher information [p, p] and gradient [p]."""
     root = np.sqrt(noise.weights(residual))[:, None]

@@ -25,6 +25,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_figure
+from ..scene.correction_data import FILE
+from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
 from ..tracing.corrected_scene import (
     material_constants,
@@ -40,7 +42,7 @@ from .frame import rigid_motion
 from .options import FRAME, MATERIALS
 from .search import CONSTANTS, QUANTITIES
 
-PAGE, FIGURES, PICTURE = "correction.md", "correction.json", "correction.png"
+PAGE, PICTURE = "correction.md", "correction.png"
 SUPPORTED = 0.5
 """Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
 AS_STATED, FITTED, ANOTHER, LEFT_OUT = "as stated", "constants fitted", "another material", "left out"
@@ -73,7 +75,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
             absent=correction.absent,
             replace=True,
         )
-        write_atomically(part / FIGURES, json.dumps(facts, indent=1, default=_plain) + "\n")
+        write_atomically(part / FILE, json.dumps(facts, indent=1, default=_plain) + "\n")
         write_atomically(part / PAGE, _text(correction, facts))
         write_figure(part / PICTURE, _picture(correction, facts))
     return facts
@@ -107,6 +109,7 @@ def _facts(correction: Correction) -> dict[str, Any]:
         "held_out_scores": scores,
         "seconds": correction.seconds,
         **correction.facts,
+        DATA: correction.data and correction.data.facts(),
         "frame": _frame(correction),
         "planes": _planes(correction),
         "materials": _materials(correction),
@@ -211,6 +214,9 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
     ]
     for stage, score in facts["held_out_scores"].items():
         lines.append(f"| {stage} | {score['median']:.{task.digits}f} | {score['mean']:.{task.digits}f} |")
+    if correction.data is not None:
+        ratio = f"{correction.data.error_ratio:.2f}"
+        lines += ["", f"Errors at rows that the scene does not know are about {ratio} times those at the rows above."]
     lines += ["", f"![surfaces and scores]({PICTURE})", ""]
     if (frame := facts["frame"]) is not None:
         lines += ["## Frame", "", "Common motion of all planes, about the mean of their centres.", ""]

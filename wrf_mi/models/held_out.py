@@ -6,6 +6,7 @@ import shutil
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import IntArray
 from ..datasets.splits import rows_left
+from ..scene.correction_data import read_correction_data
+from ..tasks import task_of
 from ..training.loop import Progress
 from .model import Fitted, Model, Problem, Session, inputs_of
 
@@ -220,6 +223,18 @@ def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int
     return fitted.predict_rows(rows, receiver) or fitted.predict(inputs_of(record, rows), receiver)
 
 
+def _as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[Any]:
+    """Predictions [q, ...] whose errors are as large as if the scene did not know the held-out rows."""
+    record, data = problem.record, read_correction_data(problem.scene)
+    if data is None:
+        return mean
+    observed, known = held.observed(record), data.knows(record.name, held.row)
+    enlarged = observed + data.error_ratio * (mean - observed)
+    if task_of(record).image:
+        enlarged = np.maximum(enlarged, 0)
+    return np.where(known.reshape(-1, *[1] * (mean.ndim - 1)), enlarged, mean)
+
+
 def held_out_predictions(
     entry: Model,
     problem: Problem,
@@ -274,4 +289,5 @@ def held_out_predictions(
     for number in range(len(folds)):
         shutil.rmtree(session.folder / f"fold{number}", ignore_errors=True)
     known = [one for one in deviations if one is not None]
-    return Prediction(np.concatenate(means), np.concatenate(known) if len(known) == len(means) else None)
+    mean = _as_unseen(np.concatenate(means), problem, held)
+    return Prediction(mean, np.concatenate(known) if len(known) == len(means) else None)

@@ -35,13 +35,15 @@ Signal strengths of a made-up receiver, in the layout of flat-ble:
 
 from __future__ import annotations
 
+import logging
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
@@ -55,6 +57,7 @@ from ..models.calibrated import with_intervals
 from ..models.checks import check_held_receivers, check_record
 from ..models.model import default_settings
 from ..parallel import Scheduler
+from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
@@ -72,6 +75,8 @@ from .folder import (
     write_fitted,
 )
 from .run import Run, load_fitted, open_run, predict_to_file
+
+logger = logging.getLogger(__name__)
 
 Settings = Iterable[str] | object
 """``key=value`` of the model's settings, or all settings as its dataclass."""
@@ -219,6 +224,7 @@ def train(
     fit: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
     fit["intervals"] = intervals
     problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
+    _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)
     folder.mkdir(parents=True, exist_ok=True)
@@ -232,6 +238,19 @@ def train(
                 shutil.rmtree(folder)
             raise
     return Run(folder, problem.record)
+
+
+def _warn_of_known_rows(problem: Problem, splits: Sequence[Split]) -> None:
+    """Warn of a scene that was corrected by rows that the run is to be tested on."""
+    data = read_correction_data(problem.scene)
+    if data is None:
+        return
+    # Of receivers that are held out, the correction knew the others.
+    tested = np.unique([row for split in splits if not split.held_receivers for row in split.test]).astype(np.int64)
+    count = int(data.knows(problem.record.name, tested).sum())
+    if count:
+        text = "%s was corrected by %d of the %d test rows: scores are too good; correct it by the training rows"
+        logger.warning(text, problem.scene, count, len(tested))
 
 
 @alone_in_process()
