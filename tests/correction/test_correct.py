@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import correction_rooms
@@ -20,6 +21,7 @@ import wrf_mi
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
+from wrf_mi.correction.correct import _error_ratio
 from wrf_mi.correction.misfit import Misfit, search_options
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
@@ -109,12 +111,24 @@ def test_rows_are_told_to_models_of_the_corrected_scene(
     data = read_correction_data(tmp_path / "scene")
     assert data is not None
     assert data.rows.tolist() == split.all_train.tolist()
-    assert data.error_ratio >= 1
     assert data.error_ratio == found.data.error_ratio
     for rows, warned in ((split, False), (replace(split, train=split.test, test=split.train[:7]), True)):
         caplog.clear()
         wrf_mi.train(record, tmp_path / str(warned), "ray-tracing", scene=str(tmp_path / "scene"), split=rows)
         assert ("corrected by 7 of the 7 test rows" in caplog.text) is warned
+
+
+@pytest.mark.parametrize(("held", "left_out", "expected"), [(3.0, 1.5, 3.0), (1.2, 1.5, 1.5), (0.5, 0.8, 1.0)])
+def test_error_ratio_is_the_larger_one_of_equal_rows(held: float, left_out: float, expected: float) -> None:
+    """Of two receivers, two of whose four rows were held out; what was not observed counts in neither error."""
+    fitted = np.random.default_rng(0).normal(size=(8, 30))
+    fitted[5] = np.nan
+    # Rows that were not held out have errors of another size.
+    fitted[[0, 2, 4, 6]] *= 10
+    record = SimpleNamespace(receivers=("a", "b"))
+    final: Any = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
+    unseen: Any = SimpleNamespace(rows=np.array([4, 8]), residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
+    assert _error_ratio(unseen, np.zeros(1), final, np.zeros(1), left_out * fitted) == pytest.approx(expected)
 
 
 def test_planes_alone_are_corrected(tmp_path: Path) -> None:

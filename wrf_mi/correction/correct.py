@@ -219,8 +219,8 @@ def _error_ratio(unseen: Misfit, found: FloatArray, final: Misfit, vector: Float
     ratios = [1.0]
     for before, after in errors:
         seen = np.isfinite(before) & np.isfinite(after)
-        size = (np.quantile(values[seen], LEVEL) for values in (before, after))
-        ratios.append(float(next(size) / max(next(size), np.finfo(np.float32).tiny)))
+        larger, smaller = (float(np.quantile(values[seen], LEVEL)) for values in (before, after))
+        ratios.append(larger / max(smaller, float(np.finfo(np.float32).tiny)))
     return max(ratios)
 
 

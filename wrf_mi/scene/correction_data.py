@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError
+from ..core.files import readable
 from ..core.types import IntArray
 
 FILE, KEY = "correction.json", "data"
@@ -54,11 +54,9 @@ def read_correction_data(scene: str | Path | None) -> CorrectionData | None:
     path = Path(scene or "") / FILE
     if scene is None or not path.is_file():
         return None
-    try:
+    with readable(path, f"{path}: missing", "correct the scene again"):
         found = json.loads(path.read_text(encoding="utf-8")).get(KEY)
-        if found is None:  # of a correction that changed nothing
+        if found is None:  # nothing was changed, or the file is older than the entry
             return None
         rows = np.asarray(found["rows"], np.int64).reshape(-1)
         return CorrectionData(str(found["name"]), rows, max(float(found["error_ratio"]), 1.0))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not the file of a correction ({error}); correct the scene again") from None
