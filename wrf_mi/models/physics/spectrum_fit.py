@@ -117,7 +117,7 @@ def fit_constants(
     def loss(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         constants = prior.with_vector(centre + z * deviation)
         plain, steering = waves.gain(constants.slabs), waves.steering(constants.offset_m)
-        losses, slope = waves.instrument.grid.loss(waves.sum @ ((plain * factor)[:, None] * steering), shapes)
+        losses, slope = waves.instrument.grid.loss_and_slope(waves.sum @ ((plain * factor)[:, None] * steering), shapes)
         by_gain = ((waves.sum.T @ slope) * steering.conj()).sum(axis=1) * np.conj(factor)
         each = [2 * (by_gain[path].conj() * change).real.sum() for path, change in gain_slopes(waves, constants, plain)]
         return losses, np.array(each) * deviation
@@ -134,7 +134,7 @@ def scan_offsets(
         scores = []
         for value in np.linspace(-2, 2, 13) * offset_sd_m:
             offset[plane] = value
-            losses, _ = waves.instrument.grid.loss(waves.sum @ (gain[:, None] * waves.steering(offset)), shapes)
+            losses = waves.instrument.grid.loss(waves.sum @ (gain[:, None] * waves.steering(offset)), shapes)
             scores.append((losses.sum() + (value / offset_sd_m) ** 2 / 2, value))
         offset[plane] = min(scores)[1]
     return replace(start, offset_m=offset)
@@ -202,7 +202,9 @@ def fit_maps(waves: Waves, shapes: FloatArray, constants: Constants, maps: Maps,
 
     def loss(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         weight = (z[:k] + 1j * z[k:]) * deviation
-        losses, slope = waves.instrument.grid.loss(waves.sum @ ((1 + matrix @ weight)[:, None] * arriving), shapes)
+        losses, slope = waves.instrument.grid.loss_and_slope(
+            waves.sum @ ((1 + matrix @ weight)[:, None] * arriving), shapes
+        )
         change = 2 * deviation * (matrix.T @ ((waves.sum.T @ slope) * arriving.conj()).sum(axis=1))
         return losses, np.concatenate([change.real, change.imag])
 

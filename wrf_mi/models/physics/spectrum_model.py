@@ -197,7 +197,7 @@ class Fit:
     def losses(self, model: SpectrumModel, rows: IntArray, waves: Waves | None = None) -> FloatArray:
         """Loss of each of some rows."""
         signals = model.signals(waves or model.waves(self.tx_pos_m[rows]))
-        return self.instrument.grid.loss(signals, self.shapes[rows])[0]
+        return self.instrument.grid.loss(signals, self.shapes[rows])
 
     def validation_loss(self, model: SpectrumModel) -> float:
         """Mean loss of the validation rows."""

@@ -35,6 +35,8 @@ LEAST_SEED = 8.0
 SEEDS, GROWN = 40, 10
 """Patches that are tried in one round, and the best of them that are grown."""
 SHEETS_PER_ROUND = 4
+STEPS = 16
+"""Planes to a wavelength that are tried."""
 SCANNED_ROWS = 600
 """Rows of the scan for patches: enough to rank them."""
 LEAST_M = 0.15
@@ -144,6 +146,21 @@ class Plane:
     crossing: FloatArray
 
 
+@dataclass(frozen=True)
+class ConductingPlane:
+    """A conducting plane of a family at an offset: rows with a point of reflection on it [k], and these points [k, 2].
+
+    ``change`` [k, m] is what it changes of the rows' signals. Those of all planes are kept while a search lasts, in
+    single precision: they rank patches.
+    """
+
+    frame: int
+    offset_m: float
+    row: IntArray
+    point: FloatArray
+    change: NDArray[np.complex64]
+
+
 @dataclass
 class Search:
     """Search for sheets with transmitters [n, 3], their spectra's shapes [n, r * c] and present paths."""
@@ -163,25 +180,30 @@ class Search:
 
     def loss(self, signals: ComplexArray, row: IntArray | slice = slice(None)) -> FloatArray:
         """Loss of element signals of some rows."""
-        return self.instrument.grid.loss(signals, self.shapes[row])[0]
+        return self.instrument.grid.loss(signals, self.shapes[row])
 
     def plane(self, frame: int, offset_m: float, kinds: int = KINDS.shape[1]) -> Plane:
         """Effect of a plane of a family."""
         axes = self.frames[frame].axes
         normal = axes[2]
-        height = self.tx_pos_m @ normal - offset_m
-        image = mirrored(self.tx_pos_m, normal, offset_m) - self._rx
-        n = len(image)
-        zeros = np.zeros((n, 1), np.int64)
-        paths = ChainPaths(zeros[:, 0], zeros[:, 0], image, zeros, zeros, np.broadcast_to(normal, (n, 1, 3)))
-        antennas, hz = self.instrument.antennas, self.instrument.frequency_hz
-        gain = np.stack([gains(paths, KINDS[:, [kind]], antennas, hz) for kind in range(kinds)])
-        near = float(self._rx @ normal - offset_m)
+        near, height = float(self._rx @ normal - offset_m), self.tx_pos_m @ normal - offset_m
         fine = near * height > 0
-        share = near / np.where(fine, near + height, 1.0)
-        point = (self._rx + share[:, None] * image) @ axes[:2].T
-        wave = gain[:, :, None] * spherical_waves(image, self.instrument)
+        row = np.flatnonzero(fine)
+        image = mirrored(self.tx_pos_m[row], normal, offset_m) - self._rx
+        point = np.zeros((len(fine), 2))
+        point[row] = (self._rx + (near / (near + height[row]))[:, None] * image) @ axes[:2].T
+        wave = np.zeros((kinds, len(fine), len(self.instrument.elements_m)), complex)
+        wave[:, row] = self._gains(image, normal, kinds)[:, :, None] * spherical_waves(image, self.instrument)
         return Plane(wave, point, fine, *self.known.crossings(axes, offset_m))
+
+    def _gains(self, image_m: FloatArray, normal: FloatArray, kinds: int) -> ComplexArray:
+        """Gains [kinds, n] of a reflection at a plane of each kind; images [n, 3] less the receiver's position."""
+        n = len(image_m)
+        kind, row = (index.ravel()[:, None] for index in np.indices((kinds, n)))
+        paths = ChainPaths(
+            row[:, 0], row[:, 0], image_m[row[:, 0]], kind, kind, np.broadcast_to(normal, (len(row), 1, 3))
+        )
+        return gains(paths, KINDS, self.instrument.antennas, self.instrument.frequency_hz).reshape(kinds, n)
 
     def change(self, sheet: Sheet, plane: Plane | None = None) -> tuple[IntArray, ComplexArray]:
         """Rows that a sheet changes [k] and the change of their signals [k, m]."""
@@ -205,10 +227,10 @@ class Search:
         ``least_gain`` is the least gain of a sheet in the logarithm of the likelihood.
         """
         found: list[Sheet] = []
-        signals = signals.copy()
+        signals, tried_planes = signals.copy(), self._conducting_planes()
         while len(found) < most:
             before = self.loss(signals)
-            tried = [Growth(self, signals, before, *seed) for seed in self._seeds(signals)]
+            tried = [Growth(self, signals, before, *seed) for seed in self._seeds(signals, tried_planes)]
             tried.sort(key=lambda growth: -growth.best[0])
             taken = 0
             for gain, sheet in sorted((growth.grow() for growth in tried[:GROWN]), key=lambda pair: -pair[0]):
@@ -227,40 +249,51 @@ class Search:
                 break
         return found
 
-    def _seeds(self, signals: ComplexArray) -> list[tuple[int, float, FloatArray]]:
-        """Most promising patches: family, offset, centre and half size.
+    def _conducting_planes(self) -> list[ConductingPlane]:
+        """Planes of all families, `STEPS` to a wavelength, and the rows that each changes.
 
-        A conducting plane is tried as a whole, row by row; the gain of a patch is the sum over the rows whose point of
-        reflection lies in it, as rows are independent. A row loses the known paths that cross the plane near its point.
+        A row loses the known paths that cross the plane near its point of reflection.
         """
-        rows = min(len(signals), SCANNED_ROWS)
-        signals, known = signals[:rows], self.known.select(rows)
+        rows = min(len(self.tx_pos_m), SCANNED_ROWS)
+        known = self.known.select(rows)
         some = Search(self.frames, self.instrument, self.tx_pos_m[:rows], self.shapes[:rows], known)
-        before = some.loss(signals)
-        candidates: list[tuple[float, int, float, FloatArray]] = []
+        step, found = self.wavelength_m / STEPS, list[ConductingPlane]()
         for index, frame in enumerate(self.frames):
-            for offset in np.arange(frame.low[2], frame.high[2] + self.wavelength_m / 16, self.wavelength_m / 16):
+            for offset in np.arange(frame.low[2], frame.high[2] + step, step):
                 if abs(float(self._rx @ frame.axes[2]) - offset) < self.wavelength_m / 4:
                     continue
                 plane = some.plane(index, float(offset), kinds=1)
-                if plane.fine.sum() < LEAST_ROWS:
+                use = np.flatnonzero(plane.fine)
+                if len(use) < LEAST_ROWS:
                     continue
                 tx = known.tx[plane.path]
                 near = np.abs(plane.crossing - plane.point[tx]).max(axis=1) < PATCH_M
                 hidden = np.unique(plane.path[near & plane.fine[tx]])
-                changed = plane.wave[0].copy()
+                changed = plane.wave[0]
                 np.subtract.at(changed, known.tx[hidden], known.wave[hidden])
-                use = np.flatnonzero(plane.fine)
-                gain = before[use] - some.loss(signals[use] + changed[use], use)
-                for half in HALF_M:
-                    grid = [np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1)]
-                    first, second = (
-                        (np.abs(plane.point[use, i] - grid[i][:, None]) < half).astype(float) for i in (0, 1)
-                    )
-                    total = (first * gain) @ second.T
-                    for i, j in np.argwhere(total > LEAST_SEED):
-                        patch = np.array([grid[0][i], grid[1][j], half])
-                        candidates.append((float(total[i, j]), index, float(offset), patch))
+                found.append(
+                    ConductingPlane(index, float(offset), use, plane.point[use], changed[use].astype(np.complex64))
+                )
+        return found
+
+    def _seeds(self, signals: ComplexArray, planes: list[ConductingPlane]) -> list[tuple[int, float, FloatArray]]:
+        """Most promising patches: family, offset, centre and half size.
+
+        A conducting plane is tried as a whole, row by row; the gain of a patch is the sum over the rows whose point of
+        reflection lies in it, as rows are independent.
+        """
+        before = self.loss(signals[:SCANNED_ROWS], slice(0, SCANNED_ROWS))
+        candidates: list[tuple[float, int, float, FloatArray]] = []
+        for plane in planes:
+            frame, use = self.frames[plane.frame], plane.row
+            gain = before[use] - self.loss(signals[use] + plane.change, use)
+            for half in HALF_M:
+                grid = [np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1)]
+                first, second = ((np.abs(plane.point[:, i] - grid[i][:, None]) < half).astype(float) for i in (0, 1))
+                total = (first * gain) @ second.T
+                for i, j in np.argwhere(total > LEAST_SEED):
+                    patch = np.array([grid[0][i], grid[1][j], half])
+                    candidates.append((float(total[i, j]), plane.frame, plane.offset_m, patch))
         candidates.sort(key=lambda candidate: -candidate[0])
         seeds: list[tuple[int, float, FloatArray]] = []
         for _, index, offset, patch in candidates:

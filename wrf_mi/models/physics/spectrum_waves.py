@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
+from scipy.spatial.distance import cdist
 
 from ...core import Antenna, Receiver
 from ...core.angles import FloatArray, pixel_directions
@@ -62,21 +63,28 @@ class Grid:
         norm = np.linalg.norm(values, axis=1, keepdims=True)
         return np.asarray(np.divide(values, norm, out=np.zeros_like(values), where=norm > 0))
 
-    def loss(self, signals: ComplexArray, shapes: FloatArray) -> tuple[FloatArray, ComplexArray]:
-        """Losses [n], at least 0, of element signals [n, m] of any unit, and derivative G [n, m].
+    def loss(self, signals: ComplexArray, shapes: FloatArray) -> FloatArray:
+        """Losses [n], at least 0, of element signals [n, m] of any unit; shapes [n, r * c] are from `shapes`."""
+        _, magnitude, norm = self._magnitude(signals)
+        likeness = (shapes * magnitude).sum(axis=1) / norm[:, 0]
+        return np.asarray(FREEDOM * np.log1p((1 - likeness**2) / FLOOR))
 
-        A change dh of the signals changes a loss by 2 Re(conj(G) . dh). Shapes [n, r * c] are from `shapes`.
-        """
-        field = signals @ self.steering.T
-        power = np.abs(field) ** 2
-        # The root has no derivative at zero: a millionth of the mean is far below the resolution of 8 bits.
-        magnitude = np.sqrt(power + 1e-6 * power.mean(axis=1, keepdims=True) + np.finfo(float).tiny)
-        norm = np.linalg.norm(magnitude, axis=1, keepdims=True)
+    def loss_and_slope(self, signals: ComplexArray, shapes: FloatArray) -> tuple[FloatArray, ComplexArray]:
+        """As `loss`, and its derivative G [n, m]: a change dh of the signals changes a loss by 2 Re(conj(G) . dh)."""
+        field, magnitude, norm = self._magnitude(signals)
         likeness = (shapes * magnitude).sum(axis=1, keepdims=True) / norm
         slope = -2 * likeness * (shapes / norm - likeness * magnitude / norm**2)
         share = 1 - likeness[:, 0] ** 2
         slope *= FREEDOM / (share + FLOOR)[:, None]
         return FREEDOM * np.log1p(share / FLOOR), (slope / (2 * magnitude) * field) @ self.steering.conj()
+
+    def _magnitude(self, signals: ComplexArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """Field of element signals [n, m] at the directions [n, r * c], its magnitude, and the norm of that [n, 1]."""
+        field = signals @ self.steering.T
+        power = np.square(field.real) + np.square(field.imag)
+        # The root has no derivative at zero: a millionth of the mean is far below the resolution of 8 bits.
+        magnitude = np.sqrt(power + 1e-6 * power.mean(axis=1, keepdims=True) + np.finfo(float).tiny)
+        return field, magnitude, np.linalg.norm(magnitude, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -211,5 +219,5 @@ class Waves:
 def spherical_waves(image_m: FloatArray, instrument: Spectrometer) -> ComplexArray:
     """Waves [p, m] at the array's elements from points [p, 3] relative to its origin, of amplitude one there."""
     length = np.linalg.norm(image_m, axis=1)[:, None]
-    distance = np.linalg.norm(image_m[:, None] - instrument.elements_m, axis=-1)
+    distance = cdist(image_m, instrument.elements_m)
     return np.asarray(length / distance * np.exp(-1j * instrument.wavenumber * distance))
