@@ -73,7 +73,7 @@ def test_intervals_cover_new_errors_that_grow_with_size_and_distance(is_complex:
         return mean, mean + noise * (0.1 + distance[:, None]) * np.abs(mean), distance
 
     mean, observed, distance = draw(400)
-    intervals = fit_intervals(mean, observed, np.abs(mean), distance)
+    intervals = fit_intervals(mean, observed, np.abs(mean), distance, np.arange(400))
     mean, truth, distance = draw(400)
     found = intervals(mean, np.abs(mean), distance)
     assert inside_interval(mean, found.stated_std, truth) == pytest.approx(0.9, abs=COVERED)
@@ -82,10 +82,30 @@ def test_intervals_cover_new_errors_that_grow_with_size_and_distance(is_complex:
     assert found.stated_std[distance > 0.7].mean() > 2 * found.stated_std[distance < 0.3].mean()
 
 
+def test_intervals_of_few_rows_are_not_too_narrow():
+    """Channels of 15 rows, each held out twice, whose errors have the scale of their row: sizes say nothing of them."""
+    rng, inside = np.random.default_rng(2), []
+
+    def draw(rows: int) -> tuple[np.ndarray, np.ndarray]:
+        scale, phase = np.exp(rng.normal(0, 1, (rows, 1))), np.exp(2j * np.pi * rng.uniform(size=(rows, 8)))
+        mean = rng.uniform(1, 3, (rows, 1)) * phase
+        return mean, mean + 0.1 * scale * (rng.normal(size=mean.shape) + 1j * rng.normal(size=mean.shape))
+
+    for _ in range(100):
+        mean, observed = (np.concatenate([half, half]) for half in draw(15))
+        distance = rng.uniform(0, 1, 30)
+        intervals = fit_intervals(mean, observed, np.abs(mean), distance, np.tile(np.arange(15), 2))
+        mean, truth = draw(100)
+        found = intervals(mean, np.abs(mean), rng.uniform(0, 1, 100))
+        inside.append(inside_interval(mean, found.stated_std, truth))
+    # Of one draw the share varies by 0.06, so that the mean of 100 is known to 0.01; groups of single rows have 0.82.
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
+
+
 def test_intervals_beyond_all_distances_are_as_wide_as_the_widest():
     rng = np.random.default_rng(1)
     distance, mean = np.linspace(0, 1, 100), np.zeros((100, 5))
-    intervals = fit_intervals(mean, rng.normal(size=mean.shape), np.ones(mean.shape), distance)
+    intervals = fit_intervals(mean, rng.normal(size=mean.shape), np.ones(mean.shape), distance, np.arange(100))
     far = intervals(np.zeros((1, 5)), np.ones((1, 5)), np.array([np.inf])).stated_std
     near = intervals(np.zeros((100, 5)), np.ones((100, 5)), distance).stated_std
     assert np.isfinite(far).all()
@@ -94,7 +114,7 @@ def test_intervals_beyond_all_distances_are_as_wide_as_the_widest():
 
 def test_exact_predictions_have_intervals_that_are_not_empty():
     mean = np.ones((20, 3))
-    found = fit_intervals(mean, mean, mean, np.arange(20.0))(mean, mean, np.arange(20.0))
+    found = fit_intervals(mean, mean, mean, np.arange(20.0), np.arange(20))(mean, mean, np.arange(20.0))
     assert (found.stated_std > 0).all()
 
 

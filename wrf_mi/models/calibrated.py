@@ -91,7 +91,7 @@ def with_intervals(entry: Model) -> Model:
         found = held_out_predictions(entry, problem, folds, held, place, entry.name)
         place.folder.rmdir()
         size = expected_size(task_of(record), found)
-        intervals = fit_intervals(found.mean, held.observed(record), size, held.distance_m)
+        intervals = fit_intervals(found.mean, held.observed(record), size, held.distance_m, held.row)
         return FittedWithIntervals(fitted, record, problem.rows(split), intervals)
 
     def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:

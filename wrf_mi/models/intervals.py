@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from ..core import Prediction
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..tasks import Task
 from ..tasks.scores import COMPLEX_90, REAL_90
 
 LEVEL = 0.9
 SIZES, DISTANCES = 8, 4
-"""Numbers of groups by size and by distance."""
+"""Largest numbers of groups by size and by distance."""
 GROUP_ROWS = 12
-"""Least average number of held-out observations in a group by distance."""
+"""Least average number of rows in a group: intervals of smaller ones follow their rows and are too narrow elsewhere."""
 MOST_VALUES = 400_000
 """Largest number of errors that are sorted; more are thinned evenly."""
 GAPS = ("distance_m",)
@@ -72,7 +73,9 @@ def expected_size(task: Task, found: Prediction) -> FloatArray:
     return np.ones(found.mean.shape) if task.in_decibel else np.abs(found.mean).astype(float)
 
 
-def fit_intervals(mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, distance_m: FloatArray) -> Intervals:
+def fit_intervals(
+    mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, distance_m: FloatArray, row: IntArray
+) -> Intervals:
     """Intervals from held-out predictions.
 
     Args:
@@ -80,6 +83,7 @@ def fit_intervals(mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, 
         observed: observations [q, ...].
         size: size of the expected error of each value [q, ...], see `expected_size`.
         distance_m: distance of each to the nearest row of its fit [q], metres.
+        row: row that each belongs to [q]: those of one row, held out twice or received by several, have errors alike.
     """
     inside = COMPLEX_90 if np.iscomplexobj(observed) else REAL_90
     step = max(1, mean.size // MOST_VALUES)
@@ -87,11 +91,11 @@ def fit_intervals(mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, 
     distance = np.broadcast_to(_columns(distance_m, mean.ndim), mean.shape).ravel()[::step]
     level = min(LEVEL * (1 + 1 / error.size), 1.0)
     floor = SMALLEST * max(float(np.median(error)), float(np.finfo(np.float32).tiny))
-    knots, std = _by_group(sizes, error, SIZES if len(mean) >= SIZES else 1, level)
+    groups = max(1, len(np.unique(row)) // GROUP_ROWS)
+    knots, std = _by_group(sizes, error, min(groups, SIZES), level)
     std = np.maximum(std / inside, floor)
     ratio = error / (inside * np.interp(sizes, knots, std))
-    groups = int(np.clip(len(mean) // GROUP_ROWS, 1, DISTANCES))
-    places, factor = _by_group(distance, ratio, groups, level)
+    places, factor = _by_group(distance, ratio, min(groups, DISTANCES), level)
     # Beyond the largest distance errors are those at it, never smaller than nearer ones.
     factor = np.maximum.accumulate(np.maximum(factor, SMALLEST))
     whole = np.quantile(ratio / np.interp(distance, places, factor), level)

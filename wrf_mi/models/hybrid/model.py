@@ -271,7 +271,7 @@ def _weights(
         for name, one in zip(predictions, np.eye(len(means)), strict=True)
     }
     scores["hybrid"] = sign * float(score(mixture(held.distance_m), every).mean())
-    return form, mixture, fit_intervals(mean, observed, size, held.distance_m), scores
+    return form, mixture, fit_intervals(mean, observed, size, held.distance_m, held.row), scores
 
 
 def _stated(mixture: Mixture, names: Sequence[str]) -> list[dict[str, float]]:
