@@ -53,6 +53,8 @@ ON_PAGE = {
     "stress": "numerics.md",
     "elsewhere": "numerics.md",
     "rooms": "correction.md",
+    "ingredients": "hybrid.md",
+    "intervals": "hybrid.md",
     "new-carriers": "hybrid.md",
     "new-receivers": "hybrid.md",
     "locate": "locate.md",
