@@ -127,14 +127,14 @@ def _searches(count: int) -> Row:
             shapes = of.shapes(rng.uniform(size=(3, 30, 60)).astype(np.float32) * np.array([1, 1, 0])[:, None, None])
             parts = size * rng.normal(size=(4, 3, 16))
             h, way = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
-            slope = 2 * (of.loss(h, shapes)[1].conj() * way).sum(axis=1).real
-            up, down = (of.loss(h + s * way, shapes)[0] for s in (1e-6, -1e-6))
+            slope = 2 * (of.loss_and_slope(h, shapes)[1].conj() * way).sum(axis=1).real
+            up, down = (of.loss(h + s * way, shapes) for s in (1e-6, -1e-6))
             difference = (up - down) / 2e-6
             # The last of the three spectra is dark, so its loss is constant.
             errors.append(np.abs(slope - difference) / np.maximum(np.abs(difference), 1.0))
             cases += 3
         worst.add(np.median(np.array(errors).max(axis=1)), f"signals of {size:g}")
-    dark, zero = of.loss(np.zeros((1, 16), complex), of.shapes(np.ones((1, 30, 60), np.float32)))
+    dark, zero = of.loss_and_slope(np.zeros((1, 16), complex), of.shapes(np.ones((1, 30, 60), np.float32)))
     worst.add(0.0 if np.isfinite(dark).all() and np.isfinite(zero).all() else np.nan, "no signal")
     return worst.row(
         f"loss: derivatives of that of the physics model's searches against differences, {cases} cases", EXACT

@@ -112,10 +112,11 @@ def test_intervals_beyond_all_distances_are_as_wide_as_the_widest():
     assert far.max() >= near.max()
 
 
-def test_exact_predictions_have_intervals_that_are_not_empty():
-    mean = np.ones((20, 3))
-    found = fit_intervals(mean, mean, mean, np.arange(20.0), np.arange(20))(mean, mean, np.arange(20.0))
-    assert (found.stated_std > 0).all()
+@pytest.mark.parametrize("level", [-50.0, 0.0, 1e-6])
+def test_exact_predictions_have_intervals_that_are_not_empty(level: float):
+    mean = np.full((20, 3), level, np.float32)
+    found = fit_intervals(mean, mean, np.abs(mean), np.arange(20.0), np.arange(20))(mean, np.abs(mean), np.arange(20.0))
+    assert (found.stated_std.astype(np.float32) > 0).all()
 
 
 def test_crps_equals_its_integral():

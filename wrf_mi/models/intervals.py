@@ -30,7 +30,9 @@ MOST_VALUES = 400_000
 GAPS = ("distance_m",)
 """Arrays that may hold infinity (`wrf_mi.models.model.Model.gaps`): distances to receivers without training rows."""
 SMALLEST = 1e-6
-"""Smallest standard deviation, relative to the median held-out error: intervals of zero width are never stated."""
+"""Smallest standard deviation, relative to the median held-out error, and smallest factor."""
+LEAST = float(np.finfo(np.float32).tiny) / SMALLEST**2
+"""Smallest standard deviation: factors do not make it zero in single precision, as intervals of zero width would be."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,9 @@ def fit_intervals(
     sizes, error = (np.ravel(values)[::step] for values in (size, np.abs(mean - observed)))
     distance = np.broadcast_to(_columns(distance_m, mean.ndim), mean.shape).ravel()[::step]
     level = min(LEVEL * (1 + 1 / error.size), 1.0)
-    floor = SMALLEST * max(float(np.median(error)), float(np.finfo(np.float32).tiny))
+    floor = max(
+        SMALLEST * float(np.median(error)), float(np.finfo(np.float32).eps * np.median(np.abs(observed))), LEAST
+    )
     groups = max(1, len(np.unique(row)) // GROUP_ROWS)
     knots, std = _by_group(sizes, error, min(groups, SIZES), level)
     std = np.maximum(std / inside, floor)
