@@ -15,7 +15,7 @@ from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models import MODELS
 from wrf_mi.models.interpolation.kriging import Kriging
-from wrf_mi.models.physics import spectrum_rays
+from wrf_mi.models.physics import spectrum_rays, spectrum_search
 from wrf_mi.models.physics.spectrum import SpectrumPhysics, SpectrumSettings, fit_spectrum, groups
 from wrf_mi.models.physics.spectrum_fit import (
     RESIDUALS,
@@ -169,7 +169,7 @@ def test_gain_slopes_equal_finite_differences(bare: SpectrumModel) -> None:
         assert np.abs(slope - expected[path]).max() < 3e-3 * np.abs(gain).max()
 
 
-def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> None:
+def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plate = {"plate": ("itu_metal", sheet(1, 4.6, (1.5, 3.2), (0.4, 2.2)))}
     room = begin(INSTRUMENT, open_scene(write_xml(tmp_path, {**SHOEBOX, **plate}), HZ, THICKNESS_M), *HOW)
     tx = places(80, 4)
@@ -178,6 +178,9 @@ def test_a_missing_metal_sheet_is_found(bare: SpectrumModel, tmp_path: Path) -> 
     known = KnownPaths.of(bare.table, waves.paths, bare.path_waves(waves), tx)
     search = Search(frames, INSTRUMENT, tx, shapes, known)
     (found,) = search(waves.sum @ known.wave, most=1, least_gain=30.0)
+    several = search(waves.sum @ known.wave, most=3, least_gain=10.0)
+    monkeypatch.setattr(spectrum_search, "KEPT_NUMBERS", 0)  # every plane anew in each round
+    assert Search(frames, INSTRUMENT, tx, shapes, known)(waves.sum @ known.wave, most=3, least_gain=10.0) == several
     corners = found.corners(frames)
     assert found.kind == 0
     assert np.abs(corners[:, 1] - 4.6).max() < 0.02  # a sixteenth of a wavelength

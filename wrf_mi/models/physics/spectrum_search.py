@@ -10,6 +10,7 @@ edge, and stay if the likelihood rises significantly. A sheet also attenuates ev
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from operator import itemgetter
 
 import numpy as np
@@ -37,6 +38,8 @@ SEEDS, GROWN = 40, 10
 SHEETS_PER_ROUND = 4
 STEPS = 16
 """Planes to a wavelength that are tried."""
+KEPT_NUMBERS = 1 << 25
+"""Most numbers of the changes by planes that are kept from round to round, 256 MiB; others are made anew."""
 SCANNED_ROWS = 600
 """Rows of the scan for patches: enough to rank them."""
 LEAST_M = 0.15
@@ -148,14 +151,11 @@ class Plane:
 
 @dataclass(frozen=True)
 class ConductingPlane:
-    """A conducting plane of a family at an offset: rows with a point of reflection on it [k], and these points [k, 2].
+    """A conducting plane: rows with a point of reflection on it [k], and these points [k, 2].
 
-    ``change`` [k, m] is what it changes of the rows' signals. Those of all planes are kept while a search lasts, in
-    single precision: they rank patches.
+    ``change`` [k, m] is what it changes of the rows' signals, in single precision, as it ranks patches.
     """
 
-    frame: int
-    offset_m: float
     row: IntArray
     point: FloatArray
     change: NDArray[np.complex64]
@@ -177,6 +177,14 @@ class Search:
         self._passed = slab(
             np.ones_like(KINDS[0]), KINDS[0], KINDS[1], KINDS[2], self.instrument.frequency_hz
         ).transmitted_te
+        self._kept, self._free = dict[tuple[int, float], ConductingPlane | None](), KEPT_NUMBERS
+
+    @cached_property
+    def _scanned(self) -> Search:
+        """The search with the rows of the scan for patches."""
+        part = slice(0, SCANNED_ROWS)
+        known = self.known.select(len(self.tx_pos_m[part]))
+        return Search(self.frames, self.instrument, self.tx_pos_m[part], self.shapes[part], known)
 
     def loss(self, signals: ComplexArray, row: IntArray | slice = slice(None)) -> FloatArray:
         """Loss of element signals of some rows."""
@@ -199,10 +207,9 @@ class Search:
     def _gains(self, image_m: FloatArray, normal: FloatArray, kinds: int) -> ComplexArray:
         """Gains [kinds, n] of a reflection at a plane of each kind; images [n, 3] less the receiver's position."""
         n = len(image_m)
-        kind, row = (index.ravel()[:, None] for index in np.indices((kinds, n)))
-        paths = ChainPaths(
-            row[:, 0], row[:, 0], image_m[row[:, 0]], kind, kind, np.broadcast_to(normal, (len(row), 1, 3))
-        )
+        kind, row = np.repeat(np.arange(kinds), n), np.tile(np.arange(n), kinds)
+        normals = np.broadcast_to(normal, (len(row), 1, 3))
+        paths = ChainPaths(row, row, image_m[row], kind[:, None], kind[:, None], normals)
         return gains(paths, KINDS, self.instrument.antennas, self.instrument.frequency_hz).reshape(kinds, n)
 
     def change(self, sheet: Sheet, plane: Plane | None = None) -> tuple[IntArray, ComplexArray]:
@@ -227,10 +234,10 @@ class Search:
         ``least_gain`` is the least gain of a sheet in the logarithm of the likelihood.
         """
         found: list[Sheet] = []
-        signals, tried_planes = signals.copy(), self._conducting_planes()
+        signals = signals.copy()
         while len(found) < most:
             before = self.loss(signals)
-            tried = [Growth(self, signals, before, *seed) for seed in self._seeds(signals, tried_planes)]
+            tried = [Growth(self, signals, before, *seed) for seed in self._seeds(signals)]
             tried.sort(key=lambda growth: -growth.best[0])
             taken = 0
             for gain, sheet in sorted((growth.grow() for growth in tried[:GROWN]), key=lambda pair: -pair[0]):
@@ -249,51 +256,55 @@ class Search:
                 break
         return found
 
-    def _conducting_planes(self) -> list[ConductingPlane]:
-        """Planes of all families, `STEPS` to a wavelength, and the rows that each changes.
+    def _conducting(self, frame: int, offset_m: float) -> ConductingPlane | None:
+        """A conducting plane of a family, kept for further rounds; None where too few rows are reflected.
 
         A row loses the known paths that cross the plane near its point of reflection.
         """
-        rows = min(len(self.tx_pos_m), SCANNED_ROWS)
-        known = self.known.select(rows)
-        some = Search(self.frames, self.instrument, self.tx_pos_m[:rows], self.shapes[:rows], known)
-        step, found = self.wavelength_m / STEPS, list[ConductingPlane]()
-        for index, frame in enumerate(self.frames):
-            for offset in np.arange(frame.low[2], frame.high[2] + step, step):
-                if abs(float(self._rx @ frame.axes[2]) - offset) < self.wavelength_m / 4:
-                    continue
-                plane = some.plane(index, float(offset), kinds=1)
-                use = np.flatnonzero(plane.fine)
-                if len(use) < LEAST_ROWS:
-                    continue
-                tx = known.tx[plane.path]
-                near = np.abs(plane.crossing - plane.point[tx]).max(axis=1) < PATCH_M
-                hidden = np.unique(plane.path[near & plane.fine[tx]])
-                changed = plane.wave[0]
-                np.subtract.at(changed, known.tx[hidden], known.wave[hidden])
-                found.append(
-                    ConductingPlane(index, float(offset), use, plane.point[use], changed[use].astype(np.complex64))
-                )
+        place = frame, offset_m
+        if place in self._kept:
+            return self._kept[place]
+        plane, found = self.plane(frame, offset_m, kinds=1), None
+        use = np.flatnonzero(plane.fine)
+        if len(use) >= LEAST_ROWS:
+            tx = self.known.tx[plane.path]
+            near = np.abs(plane.crossing - plane.point[tx]).max(axis=1) < PATCH_M
+            hidden = np.unique(plane.path[near & plane.fine[tx]])
+            changed = plane.wave[0]
+            np.subtract.at(changed, self.known.tx[hidden], self.known.wave[hidden])
+            found = ConductingPlane(use, plane.point[use], changed[use].astype(np.complex64))
+        size = 0 if found is None else found.change.size
+        if size <= self._free:
+            self._free -= size
+            self._kept[place] = found
         return found
 
-    def _seeds(self, signals: ComplexArray, planes: list[ConductingPlane]) -> list[tuple[int, float, FloatArray]]:
+    def _seeds(self, signals: ComplexArray) -> list[tuple[int, float, FloatArray]]:
         """Most promising patches: family, offset, centre and half size.
 
         A conducting plane is tried as a whole, row by row; the gain of a patch is the sum over the rows whose point of
         reflection lies in it, as rows are independent.
         """
-        before = self.loss(signals[:SCANNED_ROWS], slice(0, SCANNED_ROWS))
+        scanned, step = self._scanned, self.wavelength_m / STEPS
+        before = scanned.loss(signals[:SCANNED_ROWS])
         candidates: list[tuple[float, int, float, FloatArray]] = []
-        for plane in planes:
-            frame, use = self.frames[plane.frame], plane.row
-            gain = before[use] - self.loss(signals[use] + plane.change, use)
-            for half in HALF_M:
-                grid = [np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1)]
-                first, second = ((np.abs(plane.point[:, i] - grid[i][:, None]) < half).astype(float) for i in (0, 1))
-                total = (first * gain) @ second.T
-                for i, j in np.argwhere(total > LEAST_SEED):
-                    patch = np.array([grid[0][i], grid[1][j], half])
-                    candidates.append((float(total[i, j]), plane.frame, plane.offset_m, patch))
+        for index, frame in enumerate(self.frames):
+            for offset in np.arange(frame.low[2], frame.high[2] + step, step).tolist():
+                if abs(float(self._rx @ frame.axes[2]) - offset) < self.wavelength_m / 4:
+                    continue
+                plane = scanned._conducting(index, offset)
+                if plane is None:
+                    continue
+                gain = before[plane.row] - scanned.loss(signals[plane.row] + plane.change, plane.row)
+                for half in HALF_M:
+                    grid = [np.arange(frame.low[i] + half / 2, frame.high[i], half) for i in (0, 1)]
+                    first, second = (
+                        (np.abs(plane.point[:, i] - grid[i][:, None]) < half).astype(float) for i in (0, 1)
+                    )
+                    total = (first * gain) @ second.T
+                    for i, j in np.argwhere(total > LEAST_SEED):
+                        patch = np.array([grid[0][i], grid[1][j], half])
+                        candidates.append((float(total[i, j]), index, offset, patch))
         candidates.sort(key=lambda candidate: -candidate[0])
         seeds: list[tuple[int, float, FloatArray]] = []
         for _, index, offset, patch in candidates:
