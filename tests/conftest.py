@@ -18,13 +18,22 @@ from made_flat import write_flat, write_plain_flat
 
 from wrf_mi.backend import init
 
-init()  # before a test imports Dr.Jit
-
 if TYPE_CHECKING:
     from wrf_mi.core import Record
     from wrf_mi.parallel import Scheduler
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose the backend before a test imports Dr.Jit: a GPU for ``-m gpu`` alone.
+
+    All other tests compute on the CPU, where bounds of float64 and equal bits hold, and so do their child processes.
+    """
+    chosen = str(config.option.markexpr)
+    if "gpu" not in chosen or "not gpu" in chosen:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    init()
 
 
 @pytest.hookimpl(tryfirst=True)

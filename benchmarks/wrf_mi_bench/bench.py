@@ -18,6 +18,7 @@ from typing import Any
 
 import psutil
 
+from wrf_mi.backend import choose
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
@@ -70,6 +71,7 @@ class Check:
         data: data sets that it reads where they are on this machine.
         resumes: whether the function keeps its results and is called every time.
         table: ``module:function`` that makes a table of ``rows``; "": `check_table`.
+        gpu: whether it needs a GPU.
     """
 
     title: str
@@ -78,6 +80,7 @@ class Check:
     data: tuple[str, ...] = ()
     resumes: bool = False
     table: str = ""
+    gpu: bool = False
 
 
 def _here(title: str, function: str, *data: str, quick: str = "", table: str = "", **more: Any) -> Check:
@@ -133,6 +136,7 @@ _OWN: Mapping[str, Check] = {
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
+    "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "sentinels": _here(
         "figures kept",
@@ -187,6 +191,12 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
     parts = ["# Figures", f"Written by `wrf-mi bench`. {NOTE}", table(trained), CHECK_NOTE, check_table(checked)]
     write_atomically(out / "README.md", "\n\n".join(parts) + "\n")
     return rows
+
+
+def all_here() -> list[str]:
+    """All cases and checks, without those that need a GPU where none works."""
+    able = choose().name == "cuda"
+    return [*CASES, *(name for name, check in CHECKS.items() if able or not check.gpu)]
 
 
 def quick_checks(names: Sequence[str]) -> list[dict[str, Any]]:

@@ -49,7 +49,7 @@ def bench_command(a: argparse.Namespace) -> int:
         return 0
     from wrf_mi.parallel import open_scheduler
 
-    from .bench import CASES, CHECKS, REFUSED, BenchFailed, CheckRefused, bench, check_table, own_table, quick_checks
+    from .bench import CHECKS, REFUSED, BenchFailed, CheckRefused, all_here, bench, check_table, own_table, quick_checks
 
     if a.quick and not tables_only:
         if a.names:
@@ -70,7 +70,7 @@ def bench_command(a: argparse.Namespace) -> int:
             rows = tables(Path(a.out), Path(a.runs), a.quick, given, most_s)
         else:
             try:
-                rows = bench(a.names or [*CASES, *CHECKS], Path(a.out), Path(a.runs), given)
+                rows = bench(a.names or all_here(), Path(a.out), Path(a.runs), given)
             except CheckRefused:  # printed on standard error by the check
                 return REFUSED
             for row in rows if not a.json else ():

@@ -185,6 +185,23 @@ def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.Mo
     assert len(trials) == 3
 
 
+def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty list of devices hides them, none shows all."""
+    driver, tried = tmp_path / "libcuda.so.1", list[str | None]()
+    driver.touch()
+
+    def trial(*_: object) -> tuple[probe.Verdict, bool]:
+        tried.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
+        return probe.Verdict(tried[-1] != "", ""), True
+
+    monkeypatch.setattr(probe, "_run_trial", trial)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert probe.try_cuda(driver).usable
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert not probe.try_cuda(driver).usable
+    assert tried == [None, ""]
+
+
 def test_cached_failures_expire() -> None:
     cache.remember("short", {"usable": False}, seconds=-1)
     cache.remember("long", {"usable": True})

@@ -39,6 +39,7 @@ NEEDS_NO_DATA = (
     "rooms",
     "phase-error",
     "elsewhere",
+    "gpu",
     "robustness",
     "sentinels",
     "new-carriers",
@@ -187,9 +188,9 @@ def test_documents_show_the_worst_of_each_stage() -> None:
 def test_stored_results_are_complete() -> None:
     trained, checked = read_results(RESULTS)
     assert [r["case"] for r in trained] == list(CASES)
-    # What compares this code with stored figures holds for this code alone, so it may not be measured yet.
+    # What compares this code with stored figures holds for this code alone, so it may not be measured yet; a GPU is not everywhere.
     measured = {r["case"] for r in checked}
-    needed = [name for name, check in CHECKS.items() if name in measured or not check.resumes]
+    needed = [name for name, check in CHECKS.items() if name in measured or not (check.resumes or check.gpu)]
     assert [r["case"] for r in checked] == needed
     for r in [*trained, *checked]:
         assert r["command"].startswith("wrf-mi ")

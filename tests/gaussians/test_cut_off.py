@@ -16,7 +16,7 @@ from scipy.special import logit
 from wrf_mi.core.angles import pixel_directions
 from wrf_mi.gaussians import oracle
 from wrf_mi.gaussians.density import adapt
-from wrf_mi.gaussians.footprint import depth_order, project
+from wrf_mi.gaussians.footprint import depth_order, project, ranked_order
 from wrf_mi.gaussians.footprint_constants import CUTOFF
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
 from wrf_mi.training.config import DensityConfig
@@ -88,3 +88,12 @@ def _oracle(gaussians: Any, opacity: Any = None, own: Any = slice(0, COUNT)) -> 
         pixel_directions(*SIZE),
         opacity=(gaussians.opacity.numpy() if opacity is None else opacity)[own],
     )
+
+
+@given(st.integers(1, 40), st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_counted_order_is_the_sorted_one(count: int, seed: int) -> None:
+    """With ties in all keys; the GPU counts where a function is recorded."""
+    rng = np.random.default_rng(seed)
+    depth, *position = (Float64(rng.integers(0, 3, count).astype(float)) for _ in range(4))
+    np.testing.assert_array_equal(ranked_order([depth, *position]).numpy(), depth_order(depth, position).numpy())

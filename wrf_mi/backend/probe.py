@@ -88,7 +88,8 @@ def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
 def _environment(name: str) -> list[str]:
     """Packages, script, machine and devices; several machines may share a home folder."""
     versions = [f"{package} {installed_version(package) or '?'}" for package in ("drjit", "mitsuba")]
-    devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if name == "cuda" else ""
+    # Empty hides every device, unset none.
+    devices = str(os.environ.get("CUDA_VISIBLE_DEVICES")) if name == "cuda" else ""
     return [*versions, sha256(_SCRIPT.read_bytes()).hexdigest()[:12], platform.node(), devices]
 
 

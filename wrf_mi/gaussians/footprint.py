@@ -152,8 +152,46 @@ def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBa
         depth: array [n], metres.
         position: three arrays [n]; they decide ties, so storage order does not.
     """
+    keys = [dr.detach(key) for key in (depth, *position)]
+    if dr.backend_v(depth) is dr.JitBackend.CUDA and dr.flag(dr.JitFlag.FreezingScope):
+        # Dr.Jit 1.5 records its sort on CUDA, but the replay ends the process (`block_mkperm`).
+        return ranked_order(keys)
     order = dr.arange(dr.uint32_array_t(type(depth)), dr.width(depth))
     # Stable sorts from the last key to the first.
-    for key in (position[2], position[1], position[0], depth):
-        order = dr.gather(type(order), order, dr.argsort(dr.gather(type(key), dr.detach(key), order)))
+    for key in reversed(keys):
+        order = dr.gather(type(order), order, dr.argsort(dr.gather(type(key), key, order)))
     return order
+
+
+@dr.syntax
+def ranked_order(keys: list[dr.ArrayBase]) -> dr.ArrayBase:
+    """Indices in ascending order of the first key, ties by those that follow, then by index.
+
+    Every lane counts the entries before its own: one kernel of n^2 comparisons.
+
+    Args:
+        keys: arrays [n].
+    """
+    index_type: Any = dr.uint32_array_t(type(keys[0]))
+    n = dr.width(keys[0])
+    own = dr.arange(index_type, n)
+    other, rank = dr.zeros(index_type, n), dr.zeros(index_type, n)
+    while other < n:
+        rank = dr.select(_precedes(keys, other, own), rank + 1, rank)
+        other += 1
+    # Of keys that are no numbers none is before another: their places hold the first entry.
+    order = dr.zeros(index_type, n)
+    dr.scatter(order, own, rank)
+    return order
+
+
+def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, own: dr.ArrayBase) -> dr.ArrayBase:
+    """Whether the entry of index ``other`` comes before ``own``, the lanes' indices in order."""
+    mask_type: Any = dr.mask_t(keys[0])
+    before, equal = mask_type(False), mask_type(True)
+    for key in keys:
+        # Where the entries already differ nothing is read.
+        value = dr.gather(type(key), key, other, equal)
+        before |= equal & (value < key)
+        equal &= value == key
+    return before | (equal & (other < own))

@@ -1,0 +1,88 @@
+"""A GPU computes what the CPU computes: recorded functions, float64, fits and predictions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from small_fits import QUICK
+
+from wrf_mi.gaussians.footprint import depth_order
+from wrf_mi.parallel import run_module
+from wrf_mi.runs.api import train
+
+pytestmark = pytest.mark.gpu
+SCORE = 0.05
+"""Bound on the difference of the mean SSIM of fits on both: sums of gradients have no defined order on a GPU, and their
+last digits grow during a fit, as between two seeds."""
+FIELDS = ("wrf-gs", "wrf-gs+", "factorised")
+PIXEL = 1e-5
+"""Bound on the difference of images of one checkpoint, relative to the largest pixel."""
+
+
+def on_cpu(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the command in a process that sees no GPU."""
+    with monkeypatch.context() as hidden:
+        hidden.setenv("CUDA_VISIBLE_DEVICES", "")
+        assert run_module("wrf_mi.cli", arguments) == (0, "")
+
+
+def test_sorting_in_a_recording_is_replayed() -> None:
+    """Dr.Jit 1.5 records its own sort on CUDA, and its replay ends the process."""
+    double, frozen = dr.float64_array_t(mi.Float), dr.freeze(depth_order)
+    rng = np.random.default_rng(0)
+    for size in (50, 50, 3000, 3000):
+        depth = rng.integers(1, 9, size).astype(float)
+        position = rng.integers(-2, 3, (3, size)).astype(np.float32)
+        found = frozen(double(depth), [mi.Float(row) for row in position]).numpy()
+        np.testing.assert_array_equal(found, np.lexsort((*position[::-1], depth)))
+
+
+def test_division_and_roots_are_exact() -> None:
+    double = dr.float64_array_t(mi.Float)
+    values = np.random.default_rng(0).uniform(0.1, 1000, 1000)
+    x = double(values)
+    for found, expected in ((1 / x, 1 / values), (dr.sqrt(x), np.sqrt(values)), (dr.rcp(x), 1 / values)):
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("model", [*FIELDS, "kriging"])
+def test_fits_score_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = [*QUICK, "steps=60"] if model in FIELDS else []
+    here = train(folder, tmp_path / "gpu", model, settings=given).metrics["ssim"]["mean"]
+    words = [word for setting in given for word in ("--set", setting)]
+    on_cpu(["train", str(folder), "--model", model, *words, "--out", str(tmp_path / "cpu")], monkeypatch)
+    there = json.loads((tmp_path / "cpu" / "metrics.json").read_text())["ssim"]["mean"]
+    assert here == pytest.approx(there, abs=SCORE)
+
+
+@pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
+def test_a_run_predicts_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = train(folder, tmp_path / "run", model, settings=[*QUICK, "steps=20"])
+    tx = np.random.default_rng(0).uniform(-2, 2, (8, 3)).astype(np.float32)
+    np.savez(tmp_path / "tx.npz", tx_pos=tx)
+    here = run.predict(tx).mean
+    given, out = tmp_path / "tx.npz", tmp_path / "predictions.npz"
+    on_cpu(["predict", str(run.folder), "--input", str(given), "--out", str(out)], monkeypatch)
+    with np.load(out) as arrays:
+        there = arrays["prediction"]
+    assert np.abs(here - there).max() < PIXEL * there.max()
+
+
+@pytest.mark.parametrize(
+    ("model", "given"),
+    [("ray-tracing", ["--calibrate", "gain,materials"]), ("physics", []), ("wrf-gs+", ["--set", "steps=200"])],
+)
+def test_models_of_a_scene_score_alike(
+    model: str, given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Traced, physics and joint."""
+    words = ["train", "laboratory", "--scene", "laboratory", "--n-train", "24", "--seed", "1", "--model", model, *given]
+    assert run_module("wrf_mi.cli", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")
+    on_cpu([*words, "--out", str(tmp_path / "cpu")], monkeypatch)
+    here, there = (json.loads((tmp_path / name / "metrics.json").read_text())["ssim"] for name in ("gpu", "cpu"))
+    assert here["mean"] == pytest.approx(there["mean"], abs=SCORE)

@@ -1,0 +1,41 @@
+"""Times on a GPU and on the CPU: the jobs of both, and the refusal without a GPU."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from wrf_mi_bench import gpu, gpu_job
+from wrf_mi_bench.bench import all_here
+from wrf_mi_bench.check import main
+
+
+def test_without_a_gpu_it_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main("wrf_mi_bench.gpu:main", str(tmp_path / "out.json")) == 2
+    assert capsys.readouterr().err.startswith("wrf-mi: bench gpu: CUDA cannot be used")
+    assert "gpu" not in all_here()
+
+
+def test_rows_have_the_times_of_both(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Both jobs are measured on the CPU, each in its own process, as no test has a GPU."""
+    small = tmp_path / "small_job.py"
+    sizes = {"gaussians-splat": (20, 40)}
+    small.write_text(
+        "import sys\nfrom wrf_mi_bench import gpu_job\n"
+        f"gpu_job.SIZES, gpu_job.STEP_SIZES = {sizes}, (8, 16)\ngpu_job.job(sys.argv[1], 'llvm')\n"
+    )
+    monkeypatch.setattr(gpu, "JOB", "small_job")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(gpu, "choose", lambda backend: None)
+    monkeypatch.setattr(gpu, "_differences", lambda: [{"what": "d", "value": "1e-7", "asked": "at most 1e-05"}])
+    rows = gpu.main()["rows"]
+    titles = ["splatting", *(f"training step of {title}" for title in gpu_job.STEPS_OF.values())]
+    numbers = [*sizes["gaussians-splat"], *2 * (8, 16)]
+    assert [row["what"] for row in rows[:-1]] == [
+        f"{title}, {number} Gaussians" for title, number in zip(sorted(2 * titles, key=titles.index), numbers, strict=True)
+    ]
+    lines = gpu.table(json.loads(json.dumps(rows))).splitlines()
+    assert lines[2].startswith("| splatting, 20 Gaussians | ")
+    assert lines[-1] == "| d | **1e-7** | at most 1e-05 |"
