@@ -188,7 +188,8 @@ def test_documents_show_the_worst_of_each_stage() -> None:
 def test_stored_results_are_complete() -> None:
     trained, checked = read_results(RESULTS)
     assert [r["case"] for r in trained] == list(CASES)
-    # What compares this code with stored figures holds for this code alone, so it may not be measured yet; a GPU is not everywhere.
+    # What compares this code with stored figures holds for this code alone, so it may not be measured yet, nor may
+    # what needs a GPU.
     measured = {r["case"] for r in checked}
     needed = [name for name, check in CHECKS.items() if name in measured or not (check.resumes or check.gpu)]
     assert [r["case"] for r in checked] == needed

@@ -31,11 +31,11 @@ def test_rows_have_the_times_of_both(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(gpu, "choose", lambda backend: None)
     monkeypatch.setattr(gpu, "_differences", lambda: [{"what": "d", "value": "1e-7", "asked": "at most 1e-05"}])
     rows = gpu.main()["rows"]
-    titles = ["splatting", *(f"training step of {title}" for title in gpu_job.STEPS_OF.values())]
-    numbers = [*sizes["gaussians-splat"], *2 * (8, 16)]
-    assert [row["what"] for row in rows[:-1]] == [
-        f"{title}, {number} Gaussians" for title, number in zip(sorted(2 * titles, key=titles.index), numbers, strict=True)
-    ]
+    sizes |= {f"step-{model}": (8, 16) for model in gpu_job.STEPS_OF}
+    titles = {"gaussians-splat": "splatting"}
+    titles |= {f"step-{model}": f"training step of {title}" for model, title in gpu_job.STEPS_OF.items()}
+    expected = [f"{titles[name]}, {size} Gaussians" for name, each in sizes.items() for size in each]
+    assert [row["what"] for row in rows] == [*expected, "d"]
     lines = gpu.table(json.loads(json.dumps(rows))).splitlines()
     assert lines[2].startswith("| splatting, 20 Gaussians | ")
     assert lines[-1] == "| d | **1e-7** | at most 1e-05 |"
