@@ -40,7 +40,7 @@ TABLE_ROWS = (
     *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "physics", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
     *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "physics", "wrf-gs", "nerf2")),
-    *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "r2f2", "optml", "wrf-gs")),
+    *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "optml", "wrf-gs")),
     *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "physics", "wrf-gs+")),
     *(f"csi-{OFFICE}-official-{name}" for name in ("physics", "wrf-gs")),
 )
