@@ -66,8 +66,6 @@ def inside(count: int, seed: int = 0) -> np.ndarray:
 def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int) -> np.ndarray:
     """Unfolded lengths of all paths of up to ``depth`` reflections in the shoebox, sorted: the mirror images.
 
-    Paths with a segment below 1 cm are left out, as Sionna RT does.
-
     Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
     """
     found = []
@@ -78,12 +76,5 @@ def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int) -> np.ndarray:
         size = np.array([LENGTH, WIDTH, HEIGHT])
         # After |n| reflections along an axis the image is at n size + x or, for odd n, at (n + 1) size - x.
         image = np.where(n % 2 == 0, n * size + tx, (n + 1) * size - tx)
-        way = image - rx
-        walls = np.arange(-depth - 1, depth + 2)[:, None] * size  # unfolded: the box again and again
-        with np.errstate(divide="ignore"):
-            crossed = ((walls - rx) / way).ravel()
-        points = np.sort(np.append(crossed[(crossed > 0) & (crossed < 1)], [0, 1]))
-        assert len(points) == np.abs(n).sum() + 2
-        if np.diff(points).min() * np.linalg.norm(way) > 0.01:
-            found.append(np.linalg.norm(way))
+        found.append(np.linalg.norm(image - rx))
     return np.sort(found)

@@ -182,8 +182,7 @@ def test_paths_are_reciprocal(divided: Any, transmission: bool):
     back = trace_paths(
         divided, np.stack([r.position_m for r in there]), [receiver(p, f"rx{k}") for k, p in enumerate(here)], options
     )
-    assert forth.from_receivers
-    assert not back.from_receivers
+    assert forth.from_receivers == back.from_receivers
     a, b = forth.paths, back.paths
     order = np.lexsort((b.length_m, b.rx, b.tx))
     np.testing.assert_allclose(b.length_m[order], a.length_m, atol=1e-9)

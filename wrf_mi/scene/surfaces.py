@@ -86,6 +86,20 @@ def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]
 
 
+def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
+    """Edges of triangles [f, 3, 3], the same for faces whose corners coincide.
+
+    Returns:
+        Number of the edge from each corner of each face to its next, shape [3 f], and both ends' vertices [3 f, 2].
+    """
+    _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1, 3)
+    ends = np.stack([vertex, np.roll(vertex, -1, axis=1)], axis=-1).reshape(-1, 2)
+    # Numbers of both vertices in one integer: NumPy's unique rows take ten times as long.
+    both = np.sort(ends, axis=1) @ [len(ends), 1]
+    return np.unique(both, return_inverse=True)[1].reshape(-1), ends
+
+
 def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
     """Bodies of triangles [f, 3, 3] that are connected by their edges.
 
@@ -96,11 +110,8 @@ def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
     count = len(corners_m)
     if not count:
         return []
-    _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1, 3)
-    ends = np.stack([vertex, np.roll(vertex, -1, axis=1)], axis=-1).reshape(-1, 2)
-    _, edge, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    edge, face = edge.reshape(-1), np.repeat(np.arange(count), 3)
+    edge, ends = shared_edges(corners_m)
+    uses, face = np.bincount(edge), np.repeat(np.arange(count), 3)
     # Faces and edges are the nodes of one graph, so that an edge of many faces costs no more.
     incidence = coo_array((np.ones(3 * count), (face, count + edge)), shape=(count + len(uses),) * 2)
     body = connected_components(incidence, directed=False)[1][:count]

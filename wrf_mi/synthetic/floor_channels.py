@@ -39,7 +39,7 @@ PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
 PREFIX = "traced-csi-"  # of the names of the data sets
 MEASURED = "floor"  # folder beside the channels with the measured scene, the input of models
 CHUNK_SIZE = 100  # users that are traced together
-FORMAT = 3  # version of the files, to be raised when they change for equal parameters
+FORMAT = 4  # version of the files, to be raised when they change for equal parameters
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.437e9, 312.5e3, 26
 UPLINK_HZ: FloatArray = CARRIER_HZ + SPACING_HZ * np.arange(-HALF, 0, dtype=float)

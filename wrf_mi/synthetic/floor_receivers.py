@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "traced-floor-receivers"
 CHANNELS = f"{NAME}-csi"
-FORMAT = 2  # version of the files, to be raised when they change for equal parameters
+FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 CANDIDATES = 1000
 """Free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2."""
 SCANNER_M = tuple(

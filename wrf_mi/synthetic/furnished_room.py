@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "traced-room"
 MEASURED = "room"  # folder beside the spectra with the measured scene, the input of models
-FORMAT = 2  # version of the files, to be raised when they change for equal parameters
+FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 SCATTERING, DIFFRACTION = 2, 8
 """Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
 
@@ -232,9 +232,8 @@ def searched_paths(
             ends = [Receiver(str(row), position, np.array(UPRIGHT)) for row, position in enumerate(part)]
             for search in options:
                 # The array searches, so that all positions see the same patches of rough wall and the same edges.
-                # Sionna RT keeps the direction of the search where there is diffraction, so the array is the
-                # transmitter.
-                traced = trace_paths(scene, receiver.position_m, ends, search)
+                # With diffraction Sionna RT searches from transmitters, so the array is the transmitter.
+                traced = trace_paths(scene, receiver.position_m, ends, search, search_from="transmitters")
                 paths = traced.paths
                 kept = (paths.interactions == SCATTERING).any(axis=1)
                 if not search.scattering:

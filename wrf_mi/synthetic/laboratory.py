@@ -44,7 +44,7 @@ SCAN = "lidar/points.npz"
 SCANNER_M = ((2.0, 2.5, 1.5), (3.0, 5.0, 1.5), (5.5, 3.5, 1.5), (7.0, 1.8, 1.5), (7.6, 6.0, 1.6), (5.8, 1.0, 1.2))
 """Positions of the LiDAR, metres: five in the room and one in the inner room."""
 SCANNED_RAYS = 60_000
-FORMAT = 4  # version of the files, to be raised when they change for equal parameters
+FORMAT = 5  # version of the files, to be raised when they change for equal parameters
 
 RECEIVER = Receiver(
     name="gateway1",

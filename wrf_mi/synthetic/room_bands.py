@@ -39,7 +39,7 @@ from .furnished_room import (
 from .laboratory import provided
 
 NAME = "traced-room-bands"
-FORMAT = 2  # version of the files, to be raised when they change for equal parameters
+FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Checks of antenna positions: outside the scene, inside solids, near surfaces, behind outer walls."""
+"""Checks of antenna positions: outside the scene, inside solids, on surfaces and a little behind them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
 from trimesh.triangles import closest_point
 
 from ..core import InputError
@@ -16,20 +16,21 @@ from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-NEAREST_M = 0.01
-"""Shortest segment of a path that Sionna RT keeps."""
-INSIDE_M = 1e-4
-"""Distance before a wall from which an antenna is traced that lies behind the wall on which it is mounted."""
+BEHIND_M = 0.01
+"""Distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it."""
+BEFORE_M = 1e-4
+"""Least distance before a surface from which an antenna on it is traced."""
+CLEAR = 2.5e-5
+"""The same as a share of `Surfaces.scale_m`: twice as far as `wrf_mi.tracing.images.displaced` moves an antenna."""
 ON_M = 1e-6
-"""Distance from a plane within which float32 does not resolve its sides; Sionna RT then takes the right one."""
-OUTSIDE_M = 1.0
-"""Distance beyond the box around the scene from which an antenna is named: a scan may leave out what is nearer."""
+"""Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
+OUTSIDE_M = 0.02
+"""Distance beyond the box around the scene from which an antenna is named: the wall before it may let no path pass."""
 PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Refuse antennas inside a solid object; warn of those outside the scene or so close to a surface that paths are
-    lost.
+    """Refuse antennas inside a solid object; warn of those outside the scene.
 
     Args:
         surfaces: surfaces of the scene.
@@ -48,19 +49,21 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     beyond = _beyond(surfaces, positions_m)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
-        text = "%d of %d antennas lie outside the scene (first: %s, by %.1f m): check its frame and the unit, metres"
+        text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres"
         logger.warning(text, len(outside), len(positions_m), names[outside[0]], beyond[outside[0]])
-    near = np.flatnonzero(_near(surfaces, positions_m))
-    if len(near):
-        text = "%d of %d antennas stand within 1 cm of a surface (first: %s): reflections there are not traced"
-        logger.warning(text, len(near), len(positions_m), names[near[0]])
 
 
-def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
-    """Move antennas that are mounted on the scene's outer walls, but lie behind them, before the walls.
+def clear_m(surfaces: Surfaces) -> float:
+    """Distance before a surface, in metres, from which antennas that are on it are traced."""
+    return max(BEFORE_M, CLEAR * surfaces.scale_m)
 
-    Errors of a mesh, a millimetre in one from a scan, put such antennas behind their wall, where no path arrives. Only
-    walls with all of the scene on one side count.
+
+def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
+    """Move antennas that are mounted on a surface before it, so that they have a side.
+
+    Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where no
+    path arrives, or inside a cabinet. Outer walls, with all of the scene on one side, and solids have a right side, to
+    which antennas up to `BEHIND_M` behind are moved; at other sheets an antenna keeps its side.
 
     Args:
         surfaces: surfaces of the scene.
@@ -69,17 +72,40 @@ def before_walls(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     Returns:
         Corrected positions [n, 3].
     """
-    moved = positions_m.copy()
-    for point, plane in _pairs_near(surfaces, positions_m):
+    moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)
+    for point, plane in _pairs_near(surfaces, moved):
         for index in np.unique(plane):
             normal, offset = surfaces.normal[index], surfaces.offset[index]
             scene = surfaces.triangles @ normal - offset
-            side = 1.0 if scene.max() > -scene.min() else -1.0
-            if (side * scene).min() < -NEAREST_M or (side * scene).max() < NEAREST_M:
-                continue  # not an outer wall, or the only wall
-            near = point[plane == index]
-            behind = near[side * (moved[near] @ normal - offset) < -ON_M]
-            moved[behind] += (side * INSIDE_M - (moved[behind] @ normal - offset))[:, None] * normal
+            side, near = 1.0 if scene.max() > -scene.min() else -1.0, point[plane == index]
+            height = moved[near] @ normal - offset
+            outer = (side * scene).min() >= -BEHIND_M and (side * scene).max() >= BEHIND_M
+            sides = np.full(len(near), side) if outer else np.where(height < -ON_M, -1.0, 1.0)
+            low = sides * height < clear
+            moved[near[low]] += (sides * clear - height)[low, None] * normal
+    return moved
+
+
+def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
+    """Positions [n, 3], moved before the nearest face where they are on a solid, or up to `BEHIND_M` inside."""
+    moved, clear = positions_m.copy(), clear_m(surfaces)
+    for faces in surfaces.solids:
+        corners = surfaces.triangles[faces]
+        low, high = corners.min(axis=(0, 1)) - clear, corners.max(axis=(0, 1)) + clear
+        rows = np.flatnonzero(((moved >= low) & (moved <= high)).all(axis=1))
+        normal, _ = trimesh.triangles.normals(corners)
+        if not len(rows) or len(normal) < len(corners):
+            continue
+        normal *= np.sign(np.einsum("fc,fc->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))  # outwards
+        # Most positions are far from all planes of the faces, which is told faster than distances from faces.
+        height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
+        inside = winding_number(corners, moved[rows]) > 0.5
+        for row, limit in zip(rows, np.where(inside, BEHIND_M, clear), strict=True):
+            if np.abs(height[rows == row]).min() < limit:
+                closest = closest_point(corners, np.broadcast_to(moved[row], (len(corners), 3)))
+                away = np.linalg.norm(closest - moved[row], axis=1)
+                if away.min() < limit:
+                    moved[row] = closest[away.argmin()] + clear * normal[away.argmin()]
     return moved
 
 
@@ -118,24 +144,12 @@ def _beyond(surfaces: Surfaces, points: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(low - points, points - high).max(axis=1))
 
 
-def _near(surfaces: Surfaces, points: FloatArray) -> NDArray[np.bool_]:
-    """Mask of points with a surface within `NEAREST_M`; bounds of planes include doorways, their triangles do not."""
-    close = np.zeros(len(points), bool)
-    for point, plane in _pairs_near(surfaces, points):
-        for index in np.unique(plane):
-            faces = surfaces.triangles[surfaces.plane == index]
-            for row in point[plane == index]:
-                away = closest_point(faces, np.broadcast_to(points[row], (len(faces), 3))) - points[row]
-                close[row] |= np.linalg.norm(away, axis=1).min() < NEAREST_M
-    return close
-
-
 def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of points and planes within `NEAREST_M`, inside the bounds of the plane's faces, in chunks."""
+    """Pairs of points and planes within `BEHIND_M`, inside the bounds of the plane's faces, in chunks."""
     step = max(1, PAIRS_PER_CHUNK // max(len(surfaces.normal), 1))
     for start in range(0, len(points), step):
         part = points[start : start + step]
-        point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < NEAREST_M)
+        point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < BEHIND_M)
         along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
-        within = ((along > surfaces.low[plane] - NEAREST_M) & (along < surfaces.high[plane] + NEAREST_M)).all(axis=1)
+        within = ((along > surfaces.low[plane] - BEHIND_M) & (along < surfaces.high[plane] + BEHIND_M)).all(axis=1)
         yield start + point[within], plane[within]

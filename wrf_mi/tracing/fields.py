@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,12 +15,16 @@ from scipy.spatial.transform import Rotation
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
-from .buffer import Legs, to_buffer
+from .buffer import SPECULAR, TRANSMISSION, Legs, to_buffer
+from .image_method import image_sources
 from .options import TraceOptions
 from .surfaces import Surfaces
 
 PATHS_PER_CHUNK = 1 << 19
 """Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
+SHORT = 1e-4
+"""Distance to which coinciding points are moved apart, as a share of `Surfaces.scale_m`: single precision gives the
+direction from one to the other to 1e-3 rad."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,7 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
     """
     import drjit as dr
 
-    gain = np.zeros(len(legs), np.complex128)
+    gain, legs = np.zeros(len(legs), np.complex128), apart(legs, surfaces, ends)
     for start in range(0, len(legs), PATHS_PER_CHUNK):
         part = slice(start, start + PATHS_PER_CHUNK)
         buffer = to_buffer(legs.select(part), surfaces)
@@ -155,6 +159,41 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
     if not np.isfinite(gain).all():
         raise InputError("gains that are not numbers: give materials constants that single precision can hold")
     return gain
+
+
+def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
+    """Legs whose points of specular paths lie `SHORT` apart at least, so that each leg has a direction.
+
+    Sionna RT takes directions from points, which coincide where a path is reflected in an edge. Points are moved along
+    the true direction, which is that from the source's image to the leg's end.
+    """
+    count = np.count_nonzero(legs.interactions, axis=1)
+    points = np.concatenate([ends[0].position_m[legs.source, None], legs.vertices_m], axis=1)
+    points = np.pad(points, ((0, 0), (0, 1), (0, 0)))
+    points[np.arange(len(legs)), count + 1] = ends[1].position_m[legs.target]
+    used = np.arange(points.shape[1] - 1) <= count[:, None]
+    short = used & (np.linalg.norm(np.diff(points, axis=1), axis=2) < SHORT * surfaces.scale_m)
+    specular = np.isin(legs.interactions, (0, SPECULAR, TRANSMISSION)).all(axis=1)
+    row = np.flatnonzero(short.any(axis=1) & specular & (count > 0))
+    if not len(row):
+        return legs
+    reflects = legs.interactions[row] == SPECULAR
+    plane = np.where(reflects, surfaces.plane[legs.face[row]], -1)
+    image = image_sources(surfaces.normal, surfaces.offset, plane, points[row, 0])
+    direction = points[row, 1:] - image
+    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-30)
+    moved = np.zeros_like(points[row])
+    for leg in range(short.shape[1]):  # forwards from a point that stays
+        step = (moved[:, leg] + SHORT * surfaces.scale_m * direction[:, leg]) * short[row, leg, None]
+        moved[:, leg + 1] = step
+    at_target = np.arange(len(row)), count[row] + 1
+    overshoot, together = moved[at_target], np.ones(len(row), bool)
+    for leg in reversed(range(short.shape[1])):  # the target stays, too: points before it are moved backwards
+        together &= short[row, leg] | (leg > count[row])
+        moved[:, leg] -= overshoot * (together & (leg > 0) & (leg <= count[row]))[:, None]
+    vertices = legs.vertices_m.copy()
+    vertices[row] += moved[:, 1:-1]
+    return replace(legs, vertices_m=vertices)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from .buffer import Legs, join
-from .devices import before_walls, check_devices
+from .devices import before_surfaces, check_devices, clear_m
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
@@ -77,17 +77,19 @@ class Prepared:
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
             new = np.array([row for row in side if stated[row].tobytes() not in self._checked], int)
-            traced = before_walls(self.surfaces, stated[new])
-            if len(moved := new[(stated[new] != traced).any(axis=1)]):
-                text = "%d of %d antennas lie up to 1 cm behind an outer wall (first: %s): traced from 0.1 mm before it"
+            traced = before_surfaces(self.surfaces, stated[new])
+            # Those on a surface are moved, too, by less than a mesh's error.
+            far = np.linalg.norm(stated[new] - traced, axis=1) > 1.5 * clear_m(self.surfaces)
+            if len(moved := new[far]):
+                text = "%d of %d antennas lie up to 1 cm behind a surface (first: %s): traced from 0.1 mm before it"
                 logger.warning(text, len(moved), len(new), names[moved[0]])
             check_devices(self.surfaces, traced, [names[row] for row in new])
             self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
-        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.before_walls`."""
+        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.before_surfaces`."""
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
-        positions, others = np.split(before_walls(self.surfaces, stated), [len(tx_pos_m)])
+        positions, others = np.split(before_surfaces(self.surfaces, stated), [len(tx_pos_m)])
         return positions, tuple(replace(rx, position_m=here) for rx, here in zip(receivers, others, strict=True))
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
@@ -126,7 +128,7 @@ class Prepared:
         self, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
     ) -> Legs:
         """Paths from points [s, 3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
-        return specular_paths(self.scene, self.surfaces, chains, sources_m, targets_m, options)
+        return specular_paths(self.surfaces, chains, sources_m, targets_m, options)
 
 
 def trace_paths(
@@ -140,14 +142,14 @@ def trace_paths(
     tx_antenna: Antenna = ANTENNA,
     check: bool = True,
     gains: bool = True,
+    search_from: Literal["receivers", "transmitters"] = "receivers",
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
-    Rays search from the side with fewer devices: by reciprocity a path and its gain are the same both ways. (With
-    diffraction transmitters search: Sionna RT's diffraction at lossy wedges is a heuristic that is not reciprocal.)
     Sequences of reflecting planes that the rays of one source find are tried for every position of the other side, so
     that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.visibility`), and
-    Sionna RT's field calculator gives their gains.
+    Sionna RT's field calculator gives their gains. The paths of a pair are the same alone and among others, as long as
+    the number of rays is not ``"auto"``.
 
     Memory grows with the paths found, about 1 kB for each at six interactions (measured), and not with the positions
     tried: chunks are bounded by `wrf_mi.tracing.images.CANDIDATES_PER_CHUNK` and
@@ -159,12 +161,14 @@ def trace_paths(
         receivers: one or several.
         options: kinds of path, depth, rays.
         progress: show a progress bar on standard error.
-        prepared: shared state of the scene for repeated traces to the same receivers: rays then always leave from
-            the receivers, and only the first time.
+        prepared: shared state of the scene for repeated traces to the same receivers: rays leave only the first time.
         first_row: number of the first transmitter in error messages, from 0.
         tx_antenna: antenna of the transmitters; receivers hold their antennas.
         check: refuse antennas inside solids, warn of those near surfaces.
         gains: evaluate the gains of the paths; otherwise they are NaN, for callers that need geometry alone.
+        search_from: side from which rays leave, a second for each position; a path and its gain are the same both ways,
+            but rays miss some that take small surfaces, others from each side. Transmitters always search with
+            diffraction, as Sionna RT's heuristic at lossy wedges is not reciprocal.
 
     Returns:
         The paths, reproducible for a seed whatever the chunks. Lengths and directions are float64: a float32 length
@@ -184,7 +188,7 @@ def trace_paths(
     if check:
         shared.check(positions, devices, first_row)
     positions, devices = shared.placed(positions, devices)
-    swap = (prepared is not None or len(devices) <= len(positions)) and not options.diffraction
+    swap = search_from == "receivers" and not options.diffraction
     transmitters, rx_devices = device_ends(positions, devices, tx_antenna)
     ends = (rx_devices, transmitters) if swap else (transmitters, rx_devices)
     sources, targets = ends[0].position_m, ends[1].position_m
@@ -194,9 +198,25 @@ def trace_paths(
         unknown = np.full(len(legs), np.nan, np.complex128)
         gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
     paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
+    if check:
+        _warn_of_silence(paths, positions, devices, first_row)
     primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)
     hz, arrays = float(scene.frequency[0]), (primitives, legs.probability, legs.wedge)
     return TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
+
+
+def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Receiver], first_row: int) -> None:
+    """Warn of transmitters and of receivers without any path: behind a wall, or of too few interactions."""
+    sides = [
+        ("transmitters", paths.tx, [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))], tx_pos_m)
+    ]
+    sides += [("receivers", paths.rx, [rx.name for rx in receivers], np.stack([rx.position_m for rx in receivers]))]
+    for what, reached, names, positions in sides:
+        silent = np.setdiff1d(np.arange(len(names)), reached)
+        if len(silent):
+            at = ", ".join(f"{x:.2f}" for x in positions[silent[0]])
+            text = "%d of %d %s have no path (first: %s at (%s) m): check that they are inside, and the kinds of path"
+            logger.warning(text, len(silent), len(names), what, names[silent[0]], at)
 
 
 def _search(

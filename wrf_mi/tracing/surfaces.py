@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 import trimesh
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from ..core.angles import FloatArray
 from ..core.digest import content_digest
 from ..core.types import IntArray
 from ..scene.surfaces import bodies
+from .screens import ENLARGED, scale_m, screens
 
 COPLANAR_M = 2e-5
 """Largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m."""
@@ -82,6 +84,37 @@ class Surfaces:
         from ..backend.device import to_uint
 
         return to_uint(self.first_by_shape), to_uint(self.plane)
+
+    @cached_property
+    def centre_m(self) -> FloatArray:
+        """Middle of the box around the scene [3], from which single precision is finest; the origin without faces."""
+        corners = self.triangles.reshape(-1, 3)
+        return (corners.min(axis=0) + corners.max(axis=0)) / 2 if len(corners) else np.zeros(3)
+
+    @cached_property
+    def scale_m(self) -> float:
+        """Length by which distances that single precision does not resolve grow, see `wrf_mi.tracing.screens`."""
+        return scale_m(self.triangles - self.centre_m)
+
+    @cached_property
+    def screens(self) -> Any:
+        """Mitsuba scene of the faces about `centre_m`, closed at their seams, see `wrf_mi.tracing.screens.screens`."""
+        return screens(self.triangles - self.centre_m)
+
+    @cached_property
+    def boxes(self) -> tuple[shapely.STRtree, FloatArray]:
+        """Boxes around the enlarged faces of each plane [q, 2, 3], and a tree of their extents in x and y."""
+        count, slack = len(self.normal), ENLARGED * self.scale_m
+        low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+        np.minimum.at(low, self.plane, self.triangles.min(axis=1) - slack)
+        np.maximum.at(high, self.plane, self.triangles.max(axis=1) + slack)
+        return shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T)), np.stack([low, high], axis=1)
+
+    @cached_property
+    def faces_by_plane(self) -> tuple[IntArray, IntArray]:
+        """Faces sorted by their plane, and the first of each plane among them [q + 1]."""
+        order = np.argsort(self.plane, kind="stable")
+        return order, np.searchsorted(self.plane[order], np.arange(len(self.normal) + 1))
 
     @cached_property
     def planes_on_device(self) -> tuple[Any, ...]:

@@ -34,7 +34,7 @@ from ..gaussians.recurrence import times
 from ..receivers.spreads import PathStatistics
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
-from .devices import NEAREST_M
+from .devices import BEHIND_M
 from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
 from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters, pattern_name
 from .material_parameters import MaterialGrouping
@@ -401,5 +401,5 @@ def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: fl
 
 
 def _placed_as(stated_m: FloatArray, traced_m: FloatArray) -> bool:
-    """Whether positions of a trace [n, 3] are those of stated antennas, which `before_walls` may have moved by 1 cm."""
-    return stated_m.shape == traced_m.shape and np.allclose(stated_m, traced_m, rtol=0, atol=2 * NEAREST_M)
+    """Whether positions of a trace [n, 3] are those of stated antennas, which the trace may have moved by 1 cm."""
+    return stated_m.shape == traced_m.shape and np.allclose(stated_m, traced_m, rtol=0, atol=2 * BEHIND_M)

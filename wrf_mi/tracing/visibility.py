@@ -2,122 +2,123 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .buffer import SPECULAR, TRANSMISSION
+from .seams import UNKNOWN_FACE, Met, with_crossings
 from .surfaces import Surfaces
 
-END_M = 1e-4
-"""Distance from the end of a leg within which a surface does not obstruct it."""
+STEP = 5e-7
+"""Length that a ray skips behind each face that it meets, as a share of `wrf_mi.tracing.screens.scale_m`: eight times
+the rounding of a coordinate in single precision, as distances of rays are no more exact."""
+CLUSTER = 1e-6
+"""Largest distance of consecutive points of reflection, as a share of the same, that rays cannot tell apart: the leg to
+the first then ends at whichever plane its ray meets."""
+WINDOW = 2 * CLUSTER
+"""Distance from a point of reflection within which rays cannot tell sides, as a share of the same:
+`wrf_mi.tracing.seams` finds what is crossed there."""
+MOST_CLUSTERED = 3
+"""Reflections in a cluster: three planes meet in a corner."""
 NO_PLANE = 0xFFFFFFFF
 """Plane of the end of the last leg, the target."""
 REFLECTS = 1 << 31
 """Bit of a face's number that tells a reflection from a transmission."""
 
 
-class Met(NamedTuple):
-    """Paths and what they meet.
-
-    Attributes:
-        candidate: indices of the candidates that are paths [k].
-        interactions: ``InteractionType`` of each interaction from the source on [k, depth], 0 beyond the last.
-        face: faces [k, depth], -1 beyond the last.
-        points_m: points in single precision [k, depth, 3], metres, NaN beyond the last.
-    """
-
-    candidate: IntArray
-    interactions: NDArray[np.uint8]
-    face: IntArray
-    points_m: FloatArray
-
-
-def unobstructed(
-    scene: Any, surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool
-) -> Met:
+def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool) -> Met:
     """Candidates that are paths.
 
-    A ray follows each leg to the next vertex. The plane that reflects there has to be the first surface at the end of
-    the leg; surfaces before are passed, or obstruct the path. Interactions that are not farther apart than Sionna RT's
-    ``MIN_SEGMENT_LENGTH`` end a path, as they do in its image method.
+    A ray follows each leg to the next vertex. The plane that reflects there has to be met at the end of the leg;
+    surfaces before are passed, or obstruct the path. Faces are closed (`wrf_mi.tracing.screens`): a ray that meets an
+    edge is obstructed by what ends there. So is a reflection at the foot of a wall that stands between both legs
+    (`wrf_mi.tracing.seams`).
 
     Mitsuba's surface interaction takes a call of each shape, which to trace and compile takes longer than the rays:
     points are computed from distances here.
 
     Args:
-        scene: ``sionna.rt.Scene``.
-        surfaces: its surfaces.
+        surfaces: surfaces of the scene.
         vertices_m: source, points of reflection and target of each candidate [n, b + 2, 3], metres; vertices beyond the
-            target are not read.
+            target are not read. No vertex but those of reflection may lie on a surface.
         plane: plane of each reflection from the source on [n, b], -1 beyond the last.
         depth: largest number of interactions.
         transmission: whether waves pass surfaces.
     """
     import drjit as dr
     import mitsuba as mi
-    from sionna.rt.constants import MIN_SEGMENT_LENGTH
 
     from ..backend.device import to_uint, to_vectors
 
     size, legs = len(plane), plane.shape[1] + 1
     if not size or not len(surfaces.triangles):
-        kept = np.flatnonzero(np.linalg.norm(vertices_m[:, 1] - vertices_m[:, 0], axis=1) > MIN_SEGMENT_LENGTH)
-        nothing = np.zeros((len(kept), depth), np.uint8)
-        return Met(kept, nothing, nothing.astype(np.int64) - 1, np.full((*nothing.shape, 3), np.nan))
+        nothing = np.zeros((size, depth), np.uint8)
+        return Met(np.arange(size), nothing, nothing.astype(np.int64) - 1, np.full((*nothing.shape, 3), np.nan))
+    scene, plane_of = surfaces.screens, surfaces.faces_on_device[1]
     lane = dr.arange(mi.UInt32, size)
-    vertices = to_vectors(vertices_m.reshape(-1, 3), mi.Point3f)
-    planes = to_uint(np.pad(np.where(plane < 0, NO_PLANE, plane), ((0, 0), (0, 1)), constant_values=NO_PLANE))
-    first_face, plane_of = surfaces.faces_on_device
+    vertices = to_vectors(vertices_m.reshape(-1, 3) - surfaces.centre_m, mi.Point3f)
+    # Beyond the last leg, the planes of further reflections of a cluster are read.
+    stride = legs + MOST_CLUSTERED - 1
+    ends_at = np.pad(plane, ((0, 0), (0, MOST_CLUSTERED)), constant_values=-1)
+    planes = to_uint(np.where(ends_at < 0, NO_PLANE, ends_at))
+    together = to_uint(clusters(vertices_m, plane, CLUSTER * surfaces.scale_m))
     # As data, not as code: the same kernel serves all depths.
-    slots, most = dr.opaque(mi.UInt32, depth), dr.opaque(mi.UInt32, 2 * (depth + legs))
+    slots, most = dr.opaque(mi.UInt32, depth), dr.opaque(mi.UInt32, 4 * (depth + legs))
     through = dr.opaque(mi.Bool, transmission)
-    codes = dr.zeros(mi.UInt32, size * depth)
+    skip, window = (dr.opaque(mi.Float, share * surfaces.scale_m) for share in (STEP, WINDOW))
+    codes = dr.full(mi.UInt32, REFLECTS | UNKNOWN_FACE, size * depth)
     points = dr.zeros(mi.Point3f, size * depth)
 
-    def body(active: Any, reached: Any, leg: Any, step: Any, count: Any, way: Any, before: Any, last: Any) -> Any:
+    def body(active: Any, reached: Any, leg: Any, step: Any, count: Any, way: Any, last: Any) -> Any:
         start = dr.gather(mi.Point3f, vertices, lane * (legs + 1) + leg, active)
         end = dr.gather(mi.Point3f, vertices, lane * (legs + 1) + leg + 1, active)
         length = dr.norm(end - start)
         direction: Any = (end - start) / length
-        expected = dr.gather(mi.UInt32, planes, lane * legs + leg, active)
+        expected = [dr.gather(mi.UInt32, planes, lane * stride + leg + k, active) for k in range(MOST_CLUSTERED)]
+        cluster = dr.gather(mi.UInt32, together, lane * legs + leg, active)  # reflections at the end of the leg
         origin = start + direction * way
-        hit = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
         there = active & hit.is_valid()
         met: Any = origin + direction * hit.t
-        shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
-        face = dr.gather(mi.UInt32, first_face, shape, there) + hit.prim_index
-        here = dr.gather(mi.UInt32, plane_of, face, there)
+        at = way + hit.t
+        here = dr.gather(mi.UInt32, plane_of, hit.prim_index, there)
 
-        reflects = there & (here == expected)
-        ends = active & ~reflects & (~there | (way + hit.t >= length - END_M))
-        meets = reflects | (there & ~ends & (here != before))  # a straight line meets a plane once
-        arrives = ends & (expected == NO_PLANE)
-        apart = dr.norm(dr.select(arrives, end, met) - last) > MIN_SEGMENT_LENGTH
-        taken = meets & (reflects | through) & (count < slots) & apart
-        code = face + dr.select(reflects, mi.UInt32(REFLECTS), mi.UInt32(0))
-        dr.scatter(codes, code, lane * slots + count, taken)
-        dr.scatter(points, met, lane * slots + count, taken)
-        # As far as Mitsuba moves the origin of a ray: by an error of rounding that grows with the coordinates.
-        beyond = way + hit.t + (1 + dr.max(dr.abs(met))) * mi.math.RayEpsilon
+        arriving: Any = expected[0] == NO_PLANE
+        place = mi.UInt32(MOST_CLUSTERED)  # of the plane in the cluster, whose other faces are found afterwards
+        for k in reversed(range(MOST_CLUSTERED)):
+            place = dr.select(there & (here == expected[k]) & (k < cluster), mi.UInt32(k), place)
+        reflects: Any = (place < MOST_CLUSTERED) & (count + cluster <= slots)
+        # A plane beyond the end is not met: the target is reached, or the plane that reflects has no face there.
+        ends = active & ~reflects & (~there | (at >= length + dr.select(arriving, -skip, window)))
+        again: Any = (here == last[0]) | (here == last[1]) | (here == last[2])  # a straight line meets a plane once
+        beside: Any = (at < dr.select(leg == 0, 0, window)) | (at > length - dr.select(arriving, 0, window))
+        crosses = there & ~reflects & ~ends & ~again & ~beside
+        passes = crosses & through & (count < slots)
+        slot = lane * slots + count + dr.select(reflects, place, mi.UInt32(0))
+        dr.scatter(
+            codes, hit.prim_index + dr.select(reflects, mi.UInt32(REFLECTS), mi.UInt32(0)), slot, reflects | passes
+        )
+        dr.scatter(points, met, slot, reflects | passes)
+        none, zero = mi.UInt32(NO_PLANE), mi.UInt32(0)
+        # The next leg begins on the planes of the cluster.
+        turned = [dr.select(k < cluster, expected[k], none) for k in range(MOST_CLUSTERED)]
+        straight = [here, last[0], last[1]]
         return (
-            there & ~ends & (taken | ~meets) & (step < most),
-            reached | (arrives & apart),
-            leg + dr.select(reflects, mi.UInt32(1), mi.UInt32(0)),
+            there & ~ends & (reflects | passes | again | beside) & (step < most),
+            reached | (ends & arriving),
+            leg + dr.select(reflects, cluster, zero),
             step + 1,
-            count + dr.select(taken, mi.UInt32(1), mi.UInt32(0)),
-            dr.select(reflects, mi.Float(0), beyond),
-            dr.select(there, here, before),
-            mi.Point3f(dr.select(taken, met, last)),
+            count + dr.select(reflects, cluster, dr.select(passes, mi.UInt32(1), zero)),
+            dr.select(reflects, mi.Float(0), at + skip),
+            [dr.select(reflects, t, dr.select(crosses, m, b)) for t, m, b in zip(turned, straight, last, strict=True)],
         )
 
     none = dr.zeros(mi.UInt32, size)
-    source = dr.gather(mi.Point3f, vertices, lane * (legs + 1))
     begin = dr.full(mi.Bool, True, size), dr.full(mi.Bool, False, size), none, none, none, dr.zeros(mi.Float, size)
-    state = (*begin, dr.full(mi.UInt32, NO_PLANE, size), source)
+    state = (*begin, [dr.full(mi.UInt32, NO_PLANE, size) for _ in range(MOST_CLUSTERED)])
     reached, count = dr.while_loop(state, lambda active, *_: active, body)[1:5:3]
     dr.eval(reached, count, codes, points)
     kept = np.flatnonzero(reached.numpy())
@@ -125,9 +126,29 @@ def unobstructed(
     found = np.arange(depth) < count.numpy()[kept, None]
     kinds = np.where(code >= REFLECTS, SPECULAR, TRANSMISSION)
     points_m = np.moveaxis(points.numpy().reshape(3, size, depth), 0, -1)[kept].astype(float)
-    return Met(
+    met = Met(
         kept,
         np.where(found, kinds, 0).astype(np.uint8),
         np.where(found, code % REFLECTS, -1),
-        np.where(found[..., None], points_m, np.nan),
+        np.where(found[..., None], points_m + surfaces.centre_m, np.nan),
     )
+    return with_crossings(surfaces, vertices_m[kept], plane[kept], met, transmission)
+
+
+def clusters(vertices_m: FloatArray, plane: IntArray, apart_m: float) -> IntArray:
+    """Number of reflections at the end of each leg that no distance tells apart, `MOST_CLUSTERED` at most.
+
+    Args:
+        vertices_m: see `unobstructed`, [n, b + 2, 3].
+        plane: plane of each reflection [n, b], -1 beyond the last.
+        apart_m: distance above which rays tell points of reflection apart, metres.
+
+    Returns:
+        Shape [n, b + 1]; 0 for the leg that ends at the target.
+    """
+    number = (plane >= 0).astype(np.int64)
+    for level in reversed(range(plane.shape[1] - 1)):
+        gap = np.linalg.norm(vertices_m[:, level + 2] - vertices_m[:, level + 1], axis=1)
+        joined = (plane[:, level + 1] >= 0) & (gap < apart_m)
+        number[:, level] += np.where(joined, np.minimum(number[:, level + 1], MOST_CLUSTERED - 1), 0)
+    return np.pad(number, ((0, 0), (0, 1)))

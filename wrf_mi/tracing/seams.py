@@ -1,0 +1,207 @@
+"""Surfaces that paths cross at their points of reflection, such as a wall at whose foot the floor reflects.
+
+Rays in single precision cannot tell on which side of such a wall a reflection is. In float64, heights above the wall's
+plane can: a path crosses it where the heights of consecutive vertices have opposite signs, once and on one leg.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from trimesh.triangles import closest_point
+
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from .buffer import SPECULAR, TRANSMISSION
+from .screens import ENLARGED
+from .surfaces import Surfaces
+
+NEAR = 1e-5
+"""Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
+times that within which rays do not count them (`wrf_mi.tracing.visibility.WINDOW`)."""
+PAIRS_TOGETHER = 1 << 20
+"""Pairs of points and planes, or faces, in a chunk."""
+UNKNOWN_FACE = (1 << 31) - 1
+"""Face of a reflection that no ray told from another one at the same point."""
+
+
+class Met(NamedTuple):
+    """Paths and what they meet.
+
+    Attributes:
+        candidate: indices of the candidates that are paths [k].
+        interactions: ``InteractionType`` of each interaction from the source on [k, depth], 0 beyond the last.
+        face: faces [k, depth], -1 beyond the last.
+        points_m: points in single precision [k, depth, 3], metres, NaN beyond the last.
+    """
+
+    candidate: IntArray
+    interactions: NDArray[np.uint8]
+    face: IntArray
+    points_m: FloatArray
+
+    def select(self, which: NDArray[Any]) -> Met:
+        """The paths of a mask or of indices."""
+        return Met(*(array[which] for array in self))
+
+
+class _Crossings(NamedTuple):
+    """Crossings [n]: paths, legs, faces, and whether each is at the start of the leg."""
+
+    path: IntArray
+    leg: IntArray
+    face: IntArray
+    at_start: NDArray[np.bool_]
+
+
+def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
+    """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
+
+    Args:
+        surfaces: surfaces of the scene.
+        vertices_m: source, points of reflection and target of each path [k, b + 2, 3], metres, float64.
+        plane: plane of each reflection from the source on [k, b], -1 beyond the last.
+        met: the paths, with what rays met away from the points of reflection, and with `UNKNOWN_FACE`.
+        transmission: whether waves pass surfaces.
+    """
+    met, faces = _with_faces(surfaces, vertices_m, plane, met)
+    vertices_m, plane = vertices_m[faces], plane[faces]
+    crossings = _crossings(surfaces, vertices_m, plane)
+    if not len(crossings.path):
+        return met
+    # Few paths have any: the others stay as they are.
+    few, path = np.unique(crossings.path, return_inverse=True)
+    part = met.select(few)
+    new = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
+    if transmission:
+        part, valid = _inserted(part, new, vertices_m[few[new.path], new.leg + ~new.at_start])
+    else:
+        valid = ~np.isin(np.arange(len(few)), new.path)
+    met.interactions[few], met.face[few], met.points_m[few] = part.interactions, part.face, part.points_m
+    kept = np.ones(len(plane), bool)
+    kept[few[~valid]] = False
+    return met if valid.all() else met.select(kept)
+
+
+def _inserted(met: Met, new: _Crossings, points_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
+    """Paths [k] with further transmissions at points [n, 3], and the mask of those that are not too deep."""
+    path, slot = np.nonzero(met.interactions)
+    mirrors = met.interactions[path, slot] == SPECULAR
+    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot] - mirrors
+    # On each leg crossings at its start, those that rays met, crossings at its end, and the reflection there.
+    place = np.concatenate([np.where(mirrors, 3, 1), np.where(new.at_start, 0, 2)])
+    paths, legs = np.concatenate([path, new.path]), np.concatenate([leg, new.leg])
+    order = np.lexsort((np.concatenate([slot, np.zeros_like(new.leg)]), place, legs, paths))
+    kinds = np.concatenate([met.interactions[path, slot], np.full(len(new.path), TRANSMISSION, np.uint8)])[order]
+    faces = np.concatenate([met.face[path, slot], new.face])[order]
+    points = np.concatenate([met.points_m[path, slot], points_m])[order]
+    paths = paths[order]
+    slots = np.arange(len(paths)) - np.searchsorted(paths, paths)
+    within = slots < met.face.shape[1]
+    longer = Met(met.candidate, np.zeros_like(met.interactions), np.full_like(met.face, -1), met.points_m * np.nan)
+    for array, values in ((longer.interactions, kinds), (longer.face, faces), (longer.points_m, points)):
+        array[paths[within], slots[within]] = values[within]
+    return longer, np.bincount(paths, minlength=len(met.face)) <= met.face.shape[1]
+
+
+def _with_faces(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met) -> tuple[Met, NDArray[np.bool_]]:
+    """Paths with a face for each `UNKNOWN_FACE`, and the mask of those that have one at each point."""
+    path, slot = np.nonzero(met.face == UNKNOWN_FACE)
+    every = np.ones(len(plane), bool)
+    if not len(path):
+        return met, every
+    level = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot] - 1
+    points = vertices_m[path, level + 1]
+    nearest, away_m = nearest_faces(surfaces, plane[path, level], points)
+    face, points_m = met.face.copy(), met.points_m.copy()
+    face[path, slot], points_m[path, slot] = nearest, points
+    every[path[away_m > ENLARGED * surfaces.scale_m]] = False
+    return met._replace(face=face, points_m=points_m).select(every), every
+
+
+def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Nearest face [n] of each plane [n] to points [n, 3], and its distance [n] in metres."""
+    face, away_m = np.full(len(plane), -1), np.full(len(plane), np.inf)
+    ordered, first = surfaces.faces_by_plane
+    for index, rows in _by_value(plane):
+        faces = ordered[first[index] : first[index + 1]]
+        for part in np.array_split(rows, -(-len(rows) * len(faces) // PAIRS_TOGETHER)):
+            row, own = np.repeat(part, len(faces)), np.tile(faces, len(part))
+            away = np.linalg.norm(closest_point(surfaces.triangles[own], points_m[row]) - points_m[row], axis=1)
+            away = away.reshape(len(part), len(faces))
+            face[part], away_m[part] = faces[away.argmin(axis=1)], away.min(axis=1)
+    return face, away_m
+
+
+def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray) -> _Crossings:
+    """All crossings of faces within `NEAR` of a point of reflection, each leg and plane once."""
+    path, level = np.nonzero(plane >= 0)
+    points, near_m = vertices_m[path, level + 1], NEAR * surfaces.scale_m
+    point, crossed = _near_planes(surfaces, plane[path, level], points, near_m)
+    normal, offset = surfaces.normal[crossed], surfaces.offset[crossed]
+    ends_on = np.pad(plane, ((0, 0), (1, 1)), constant_values=-1)
+    parts = []
+    for at_start in (False, True):
+        row, leg = path[point], level[point] + at_start
+        start, end = vertices_m[row, leg], vertices_m[row, leg + 1]
+        before, after = ((ends * normal).sum(axis=1) - offset for ends in (start, end))
+        # The planes on which the leg begins and ends have heights of zero, whose signs are rounding.
+        crosses = (before * after < 0) & (crossed != ends_on[row, leg]) & (crossed != ends_on[row, leg + 1])
+        index = np.flatnonzero(crosses)
+        share = before[index] / (before[index] - after[index])
+        where = start[index] + (end[index] - start[index]) * share[:, None]
+        near = np.linalg.norm(where - points[point[index]], axis=1) < near_m
+        index, where = index[near], where[near]
+        face, away_m = nearest_faces(surfaces, crossed[index], where)
+        closed = away_m < ENLARGED * surfaces.scale_m
+        index, face = index[closed], face[closed]
+        parts.append((row[index], leg[index], face, np.full(len(index), at_start), crossed[index]))
+    row, leg, face, starts, crossed = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    # Where both ends of a leg are near the crossing, it is listed twice.
+    _, once = np.unique(np.stack([row, leg, crossed]), axis=1, return_index=True)
+    return _Crossings(row[once], leg[once], face[once], starts[once])
+
+
+def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray, near_m: float) -> tuple[IntArray, IntArray]:
+    """Pairs of points [n, 3] on planes [n] and other planes within a distance, whose faces touch those of the first."""
+    tree, boxes = surfaces.boxes
+    groups = list(_by_value(plane))
+    mirrors = np.array([mirror for mirror, _ in groups], np.int64)
+    query, touching = tree.query(tree.geometries[mirrors])
+    above = boxes[touching, 0, 2] <= boxes[mirrors[query], 1, 2]
+    above &= boxes[touching, 1, 2] >= boxes[mirrors[query], 0, 2]
+    above &= touching != mirrors[query]
+    query, touching = query[above], touching[above]
+    first = np.searchsorted(query, np.arange(len(mirrors) + 1))
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+    for number, (_, rows) in enumerate(groups):
+        others = touching[first[number] : first[number + 1]]
+        for part in np.array_split(rows, -(-len(rows) * max(len(others), 1) // PAIRS_TOGETHER)):
+            height = points_m[part] @ surfaces.normal[others].T - surfaces.offset[others]
+            row, other = np.nonzero(np.abs(height) < near_m)
+            parts.append((part[row], others[other]))
+    point, other = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return point, other
+
+
+def _by_value(values: IntArray) -> Iterator[tuple[int, IntArray]]:
+    """Distinct values in ascending order, and the indices at which each stands."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    for rows in np.split(order, np.flatnonzero(np.diff(ordered)) + 1) if len(values) else ():
+        yield int(values[rows[0]]), rows
+
+
+def _unrecorded(surfaces: Surfaces, legs: int, met: Met, crossings: _Crossings) -> _Crossings:
+    """Crossings that rays have not met on the same of a path's legs."""
+    path, slot = np.nonzero(met.interactions == TRANSMISSION)
+    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot]
+    columns = [(path, leg, surfaces.plane[met.face[path, slot]])]
+    columns += [(crossings.path, crossings.leg, surfaces.plane[crossings.face])]
+    known, new = ((row * legs + at) * len(surfaces.normal) + crossed for row, at, crossed in columns)
+    unknown = ~np.isin(new, known)
+    path, leg, face, at_start = crossings
+    return _Crossings(path[unknown], leg[unknown], face[unknown], at_start[unknown])
