@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from wrf_mi_scenes.mitsuba_xml import COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
+from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically
 from ..core.types import IntArray
 from ..tracing.corrected_scene import check_materials
-from ..tracing.materials import conductivity_exponent, in_itu_range, set_frequency
+from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
 from ..tracing.scenes import load_scene
 from ..tracing.surfaces import scene_surfaces
 from .format import ExportOptions
@@ -68,7 +68,8 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     lists the constants at the carrier, and exponents of conductivities.
 
     Raises:
-        InputError: a carrier that is not known, a material that is no slab or not known there, or a folder that exists.
+        InputError: a carrier that is not known, a material that is neither slab nor absorber or not known there, or a
+            folder that exists.
     """
     frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
     if frequency_hz is None:
@@ -82,6 +83,9 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     listed: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(part.material for part in parts):
         material = scene.radio_materials[name]
+        if absorbs(material):
+            renamed[name], listed[ABSORBER] = ABSORBER, {"absorbs": True}
+            continue
         numbers = (material.relative_permittivity, material.conductivity, material.thickness)
         values = dict(zip(PERFECT_CONSTANTS, (float(np.ravel(number)[0]) for number in numbers), strict=True))
         itu = getattr(material, "itu_type", None)

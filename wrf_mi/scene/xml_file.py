@@ -16,7 +16,7 @@ from ..core.files import inside, one_line
 
 PLUGINS = {
     "shape": "ply obj serialized rectangle cube sphere disk cylinder shapegroup instance merge",
-    "bsdf": "radio-material itu-radio-material twosided diffuse roughplastic plastic "
+    "bsdf": "radio-material itu-radio-material absorber-radio-material twosided diffuse roughplastic plastic "
     "principled conductor roughconductor dielectric roughdielectric thindielectric mask bumpmap normalmap blendbsdf "
     "null",
     "texture": "bitmap checkerboard uniform mesh_attribute volume",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
+from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -29,7 +29,7 @@ from .material_parameters import (
     read_materials,
     slabs_of_faces,
 )
-from .materials import in_itu_range
+from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
@@ -105,11 +105,11 @@ def check_materials(scene: Any) -> None:
     """Refuse a scene that `write_corrected_scene` cannot write.
 
     Raises:
-        InputError: a material that is not a slab.
+        InputError: a material that is neither a slab nor an absorber.
     """
     slabs = read_materials(scene).names
     for name, thing in scene.objects.items():
-        if (material := thing.radio_material.name) not in slabs:
+        if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
 
 
@@ -162,7 +162,8 @@ def write_corrected_scene(
         The folder.
 
     Raises:
-        InputError: a material that is not a slab, no surface is left, or a folder that exists or cannot be written.
+        InputError: a material that is neither a slab nor an absorber, no surface is left, or a folder that exists or
+            cannot be written.
         ValueError: see `moved_triangles`.
     """
     check_materials(scene)
@@ -183,7 +184,9 @@ def write_corrected_scene(
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
             material = scene.objects[name].radio_material.name
-            if changed[slab] or material not in THICKNESS_M:
+            if slab < 0:
+                material = ABSORBER
+            elif changed[slab] or material not in THICKNESS_M:
                 material = f"fitted_{(part if grouping == 'surface' else material).replace('-', '_')}"
                 law = {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
                 constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True)) | law
