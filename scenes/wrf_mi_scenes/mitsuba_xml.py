@@ -78,7 +78,7 @@ PERFECT_CONSTANTS = {
 def scene_xml(
     materials: Mapping[str, str],
     constants: Constants = MappingProxyType({}),
-    thickness_m: Mapping[str, float] = MappingProxyType({}),
+    slabs: Mapping[str, tuple[str, float]] = MappingProxyType({}),
     looks: bool = False,
 ) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
@@ -90,8 +90,8 @@ def scene_xml(
     Args:
         materials: radio material (``itu_*``, `PERFECT`, `ABSORBER` or a key of ``constants``) of each part by name.
         constants: constants of further materials.
-        thickness_m: slab thickness of ITU materials (``itu_*``); those with one are radio materials of Sionna RT with
-            that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
+        slabs: ITU material (without ``itu_``) and thickness in metres of materials; those with one are radio materials
+            of Sionna RT with that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
         looks: write the colours of all materials and no radio material, for pictures by Mitsuba alone.
     """
     known = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
@@ -111,11 +111,12 @@ def scene_xml(
                 "    </bsdf>",
             ]
             continue
-        if material in thickness_m:
+        if material in slabs and not looks:
+            itu, thickness_m = slabs[material]
             lines += [
                 f'    <bsdf type="itu-radio-material" id="mat-{material}">',
-                f'        <string name="type" value="{material.removeprefix("itu_")}"/>',
-                f'        <float name="thickness" value="{thickness_m[material]:.9g}"/>',
+                f'        <string name="type" value="{itu}"/>',
+                f'        <float name="thickness" value="{thickness_m:.9g}"/>',
                 f'        <rgb name="color" value="{colour}"/>',
                 "    </bsdf>",
             ]

@@ -86,7 +86,7 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
             if plugin in MESHES:
                 content = _mesh_content(shape)
             elif (mesh := _unit_shape(plugin)) is not None:
-                content = _placed_content(mesh, shape, f"{path}: {name}")
+                content = _placed_content(mesh, shape, root.get("version", ""), f"{path}: {name}")
             else:
                 continue
         except InputError as error:
@@ -169,12 +169,12 @@ def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> 
     return all(np.array_equal(*(part[np.lexsort(part.T)][:, k] for part in rows)) for k in range(3))
 
 
-def _placed_content(mesh: trimesh.Trimesh, shape: Element, where: str) -> bytes:
+def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: str) -> bytes:
     """PLY of a unit shape's mesh in the scene's frame; the shape loses its parameters."""
     import mitsuba as mi
 
     # Mitsuba reads the parameters: its to_world then holds centre, radius and ends, too, and it names unknown ones.
-    alone = Element("scene", version="3.0.0")
+    alone = Element("scene", version=version)  # older versions have other names of parameters
     stated = SubElement(alone, "shape", type=shape.get("type", ""))
     stated.extend([child for child in shape if child.tag in VALUES])
     for child in stated:
