@@ -26,6 +26,7 @@ from ..core.angles import FloatArray
 from ..core.files import one_line
 from ..scene.surfaces import mesh_parts
 from ..scene.xml_file import FILES, named_shapes
+from .materials import CONSTANTS
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +40,8 @@ REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)
 """Errors of Mitsuba and Sionna RT about a scene file."""
 PLACE = re.compile(r"^\[[\w.]+:\d+\] (((Error while|While) loading|At) string \(line \d+, col \d+\): )?")
 """Begin of Mitsuba's messages: its source line, and a place in a text that is not the file."""
+PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")
+"""Properties of a radio material in a scene file."""
 VALUES = ("float", "integer", "boolean", "string", "point", "vector", "transform")
 """Elements that are parameters of a shape without a file."""
 
@@ -260,4 +263,6 @@ def reason(error: Exception) -> str:
     """Reason of Mitsuba's or Sionna RT's refusal: its message's last line, without places in a text made by us."""
     # The message holds the traceback of Sionna RT's error, or a list of unknown properties.
     lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    if lines[-1].endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
+        return f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
     return one_line(PLACE.sub("", re.sub(r"^\s*- ", "unknown property ", lines[-1])))
