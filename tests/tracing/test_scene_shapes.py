@@ -103,13 +103,13 @@ def test_rectangle_is_traced_like_its_mesh(tmp_path: Path) -> None:
     place = '<transform name="to_world"><scale x="2" y="1" z="1"/><translate x="3" y="3" z="1.5"/></transform>'
     plate = f'<shape type="rectangle" id="plate">{place}<ref id="mat-itu_brick" name="bsdf"/></shape></scene>'
     as_shape.write_text(as_shape.read_text().replace("</scene>", plate))
-    found = []
+    traced = []
     for path in (as_mesh, as_shape):
         scene = open_scene(path, FREQUENCY_HZ, THICKNESS_M)
         assert list(scene.objects) == [*SHOEBOX, "plate"]
-        found.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions(max_depth=2)).paths)
-    np.testing.assert_allclose(found[1].length_m, found[0].length_m, atol=1e-9)
-    np.testing.assert_allclose(found[1].gain, found[0].gain, atol=1e-6 * np.abs(found[0].gain).max())
+        traced.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions(max_depth=2)).paths)
+    np.testing.assert_allclose(traced[1].length_m, traced[0].length_m, atol=1e-9)
+    np.testing.assert_allclose(traced[1].gain, traced[0].gain, atol=1e-6 * np.abs(traced[0].gain).max())
 
 
 def test_curved_shapes_are_logged_with_their_deviation(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -175,6 +175,7 @@ def shape_of(plugin: str, content: str, more: str = 'id="a"') -> str:
     ("shape", "words"),
     [
         (shape_of("rectangle", f'<float name="radus" value="2"/>{USED}'), "'a': .*unknown property .*radus"),
+        (shape_of("disk", f'<transform name="toWorld"/>{USED}'), "'a': .*unknown property transform \"toWorld\""),
         (shape_of("sphere", f'<float name="radius" value="x"/>{USED}'), "'a': .*floating point value \"x\""),
         (shape_of("sphere", f'<float name="radius" value="0"/>{USED}'), "'a': has no area; give a radius"),
         (shape_of("sphere", f'<float name="radius" value="nan"/>{USED}'), "'a': has no area; give"),
@@ -186,6 +187,10 @@ def shape_of(plugin: str, content: str, more: str = 'id="a"') -> str:
         (shape_of("shapegroup", shape_of("cube", USED, "")), "'a': Sionna RT has no shapegroup; write the shapes"),
         (shape_of("cube", '<bsdf type="diffuse"/>'), r"'a': its <bsdf> \(diffuse\) has no id; give it"),
         (shape_of("cube", '<bsdf type="diffuse" id="b"/>'), "'a': .*which is not a radio material"),
+        (
+            shape_of("cube", '<bsdf type="radio-material" id="b"><float name="depth" value="1"/></bsdf>'),
+            "'a': .*radio material has an unknown property; known are relative_permittivity",
+        ),
         (shape_of("cube", ""), "'a': .*which is not a radio material"),
         (shape_of("cube", '<ref id="none"/>', ""), r"2 \(cube, no id\): .*unresolved reference to \"none\""),
     ],

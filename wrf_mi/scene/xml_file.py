@@ -59,6 +59,10 @@ def read_scene_xml(path: Path) -> Element:
         raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
     named = {id(shape): f"{path}: {name}" for name, shape in named_shapes(root)}
     _check(root, str(path), named, path.parent, 0)
+    if root.tag != "scene" or not root.get("version"):
+        raise InputError(
+            f'{path}: begins with <{root.tag}>, not with a scene and its version; write <scene version="3.0.0">'
+        )
     return root
 
 

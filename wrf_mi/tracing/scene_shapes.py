@@ -93,7 +93,7 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
             else:
                 continue
         except InputError as error:
-            raise InputError(f"{path}: {name}: {error}") from None
+            raise InputError(f"{path}: {name}: {one_line(error)}") from None
         if content is None:
             continue
         # Mitsuba describes a shape by the name of its file, by which messages name the object.
@@ -260,9 +260,12 @@ def _load(root: Element, file: Path) -> Any:
 
 
 def reason(error: Exception) -> str:
-    """Reason of Mitsuba's or Sionna RT's refusal: its message's last line, without places in a text made by us."""
-    # The message holds the traceback of Sionna RT's error, or a list of unknown properties.
-    lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-    if lines[-1].endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
-        return f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
-    return one_line(PLACE.sub("", re.sub(r"^\s*- ", "unknown property ", lines[-1])))
+    """Mitsuba's or Sionna RT's reason for a refusal, without places in source code and in a text made by us."""
+    text = str(error).strip() or type(error).__name__
+    if "Traceback" in text:  # of Sionna RT's error, which Mitsuba repeats
+        text = re.sub(r"^\w+: ", "", text.splitlines()[-1])
+        if text.endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
+            text = f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
+    elif unknown := re.findall(r'^\s*- (\w+ "[^"]*")', text, re.MULTILINE):
+        text = f"unknown property {', '.join(unknown)}"
+    return one_line(PLACE.sub("", text))
