@@ -185,7 +185,7 @@ def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: 
     try:
         with _quiet_mitsuba():
             loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
-        to_world = np.asarray(mi.traverse(loaded.shapes()[0])["to_world"].matrix, float).reshape(4, 4)
+        to_world = mi.traverse(loaded.shapes()[0])["to_world"].matrix.numpy().reshape(4, 4).astype(float)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"cannot be opened ({reason(error)}); correct the shape") from None
     placed = mesh.copy()
