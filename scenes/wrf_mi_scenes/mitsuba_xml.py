@@ -61,6 +61,8 @@ field."""
 PERFECT_CONDUCTIVITY = 1e13
 """Siemens per metre: so high that the reflection coefficients are -1 and +1 to single precision."""
 PERFECT_THICKNESS_M = 0.1
+ABSORBER = "perfect_absorber"
+"""Name of Sionna RT's absorber, which neither reflects nor transmits and has no constants."""
 
 
 Constants = Mapping[str, Mapping[str, float]]
@@ -76,20 +78,20 @@ PERFECT_CONSTANTS = {
 def scene_xml(
     materials: Mapping[str, str],
     constants: Constants = MappingProxyType({}),
-    thickness_m: Mapping[str, float] = MappingProxyType({}),
+    slabs: Mapping[str, tuple[str, float]] = MappingProxyType({}),
     looks: bool = False,
 ) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
 
     Sionna RT replaces the BSDFs ``mat-itu_*`` by its ITU radio materials; Mitsuba uses plain two-sided diffuse BSDFs.
-    `PERFECT` and materials with constants are not of ITU-R P.2040, so they are BSDFs of Sionna RT, which Mitsuba knows
-    after ``import sionna.rt``.
+    `PERFECT`, `ABSORBER` and materials with constants are not of ITU-R P.2040, so they are BSDFs of Sionna RT, which
+    Mitsuba knows after ``import sionna.rt``.
 
     Args:
-        materials: radio material (``itu_*``, `PERFECT` or a key of ``constants``) of each part, by the part's name.
+        materials: radio material (``itu_*``, `PERFECT`, `ABSORBER` or a key of ``constants``) of each part by name.
         constants: constants of further materials.
-        thickness_m: slab thickness of ITU materials (``itu_*``); those with one are radio materials of Sionna RT with
-            that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
+        slabs: ITU material (without ``itu_``) and thickness in metres of materials; those with one are radio materials
+            of Sionna RT with that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
         looks: write the colours of all materials and no radio material, for pictures by Mitsuba alone.
     """
     known = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
@@ -102,11 +104,19 @@ def scene_xml(
             lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in stated]
             lines.append("    </bsdf>")
             continue
-        if material in thickness_m:
+        if material == ABSORBER and not looks:
+            lines += [
+                f'    <bsdf type="absorber-radio-material" id="mat-{material}">',
+                f'        <rgb name="color" value="{colour}"/>',
+                "    </bsdf>",
+            ]
+            continue
+        if material in slabs and not looks:
+            itu, thickness_m = slabs[material]
             lines += [
                 f'    <bsdf type="itu-radio-material" id="mat-{material}">',
-                f'        <string name="type" value="{material.removeprefix("itu_")}"/>',
-                f'        <float name="thickness" value="{thickness_m[material]:.9g}"/>',
+                f'        <string name="type" value="{itu}"/>',
+                f'        <float name="thickness" value="{thickness_m:.9g}"/>',
                 f'        <rgb name="color" value="{colour}"/>',
                 "    </bsdf>",
             ]

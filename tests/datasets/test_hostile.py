@@ -76,6 +76,7 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
         ('<scene><include filename="x.xml"/></scene>', "element <include> does not belong into a scene"),
         ('<scene><shape type="../evil"/></scene>', "plugin '../evil' of <shape>"),
         ('<scene><shape type="ply"><string name="filename" value="../x.ply"/></shape></scene>', "outside its folder"),
+        ("<scene/>", 'not with a scene and its version; write <scene version="3.0.0">'),
         ("<scene>" + "<transform>" * 80 + "</transform>" * 80 + "</scene>", "more than 64 levels"),
     ],
 )

@@ -185,3 +185,31 @@ def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, capsys
     refused(["export", "no-such", "--format", "glb", "--out", f"{out}.glb"], "no such file or name", capsys)
     with pytest.raises(InputError, match="unknown; choose from 3dgs"):
         export(mesh, "obj", out)
+
+
+@pytest.mark.parametrize("frequency_hz", [2.4e9, 0.9e9])
+def test_names_of_other_scenes_are_written_as_names_of_files(frequency_hz: float, tmp_path: Path) -> None:
+    """ITU materials by names of the scene's own, two of one kind; folders and quotes in the ids of shapes."""
+    thickness_m = {"wall.001": 0.2, "wall 001": 0.31, "my-metal": 0.05}
+    kinds = dict(zip(thickness_m, ("concrete", "concrete", "metal"), strict=True))
+    bsdfs = [
+        f'<bsdf type="itu-radio-material" id="mat-{name}"><string name="type" value="{kinds[name]}"/>'
+        f'<float name="thickness" value="{depth}"/></bsdf>'
+        for name, depth in thickness_m.items()
+    ]
+    ids = dict(zip(["mesh-../../up", "mesh-a b", "mesh-a&quot;b", "mesh-a_b"], [*thickness_m, "my-metal"], strict=True))
+    shapes = [
+        f'<shape type="rectangle" id="{shape}"><ref id="mat-{name}"/><transform name="to_world">'
+        f'<translate z="{number}"/></transform></shape>'
+        for number, (shape, name) in enumerate(ids.items())
+    ]
+    path = tmp_path / "scene.xml"
+    path.write_text("\n".join(['<scene version="3.0.0">', *bsdfs, *shapes, "</scene>"]))
+    stated = open_scene(path, frequency_hz)
+    export(path, "sionna", tmp_path / "for-sionna", ExportOptions(frequency_hz=frequency_hz))
+    write_corrected_scene(tmp_path / "corrected", stated, {})
+    for written in (tmp_path / "for-sionna" / "scene.xml", tmp_path / "corrected"):
+        again = open_scene(written, frequency_hz)
+        assert list(again.objects) == [".._.._up", "a_b", "a_b_2", "a_b_3"]
+        np.testing.assert_allclose([*constants(again).values()], [*constants(stated).values()], rtol=1e-4)
+    assert not (tmp_path.parent / "up.ply").exists()

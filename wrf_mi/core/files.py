@@ -75,7 +75,7 @@ MOST_NAME = 1024
 """Characters of a name that another file states; systems take 4096 of a whole path."""
 
 
-def inside(folder: Path, name: object, source: Path) -> Path:
+def inside(folder: Path, name: object, source: str | Path) -> Path:
     """The path of a file that another file names, below its folder.
 
     Args:

@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from wrf_mi_scenes.mitsuba_xml import COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
+from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically
 from ..core.types import IntArray
-from ..tracing.corrected_scene import check_materials
-from ..tracing.materials import conductivity_exponent, in_itu_range, set_frequency
+from ..scene.folder import plain_name
+from ..tracing.corrected_scene import ODD_IN_FILES, check_materials
+from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
 from ..tracing.scenes import load_scene
 from ..tracing.surfaces import scene_surfaces
 from .format import ExportOptions
@@ -68,7 +69,8 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     lists the constants at the carrier, and exponents of conductivities.
 
     Raises:
-        InputError: a carrier that is not known, a material that is no slab or not known there, or a folder that exists.
+        InputError: a carrier that is not known, a material that is neither slab nor absorber or not known there, or a
+            folder that exists.
     """
     frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
     if frequency_hz is None:
@@ -78,31 +80,38 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     check_materials(scene)
     parts, renamed = _parts(scene), dict[str, str]()
     constants: dict[str, dict[str, float]] = {}
-    thickness_m: dict[str, float] = {}
+    slabs: dict[str, tuple[str, float]] = {}
     listed: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(part.material for part in parts):
         material = scene.radio_materials[name]
+        if absorbs(material):
+            renamed[name], listed[ABSORBER] = ABSORBER, {"absorbs": True}
+            continue
         numbers = (material.relative_permittivity, material.conductivity, material.thickness)
         values = dict(zip(PERFECT_CONSTANTS, (float(np.ravel(number)[0]) for number in numbers), strict=True))
         itu = getattr(material, "itu_type", None)
         if itu is not None and in_itu_range(itu, frequency_hz):
-            renamed[name] = name
-            thickness_m[renamed[name]] = values["thickness"]
+            renamed[name] = plain_name(name, ODD_IN_FILES, renamed.values())
+            slabs[renamed[name]] = itu, values["thickness"]
         else:
-            renamed[name] = name if itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
+            new_name = name if itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
+            renamed[name] = plain_name(new_name, ODD_IN_FILES, renamed.values())
             constants[renamed[name]] = values
         listed[renamed[name]] = {
             **values,
             "conductivity_exponent": conductivity_exponent(material, frequency_hz),
-            "follows_frequency": renamed[name] in thickness_m,
+            "follows_frequency": renamed[name] in slabs,
         }
-    materials = {part.name: renamed[part.material] for part in parts}
+    files = dict[str, Part]()
+    for part in parts:
+        files[plain_name(part.name, ODD_IN_FILES, files)] = part
+    materials = {name: renamed[part.material] for name, part in files.items()}
     with atomic_folder(out, options.replace) as folder:
         (folder / "meshes").mkdir()
-        for part in parts:
+        for name, part in files.items():
             mesh = trimesh.Trimesh(part.vertices_m, part.faces, process=False)
-            mesh.export(folder / "meshes" / f"{part.name}.ply", vertex_normal=False)
-        write_atomically(folder / XML, scene_xml(materials, constants, thickness_m))
+            mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
+        write_atomically(folder / XML, scene_xml(materials, constants, slabs))
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
         facts = {"frequency_hz": frequency_hz, "materials": listed}
         write_atomically(folder / FACTS, json.dumps(facts, indent=1) + "\n")

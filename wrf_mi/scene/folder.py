@@ -7,9 +7,11 @@ frame and counts, and ``preview.png`` is a picture.
 from __future__ import annotations
 
 import logging
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +117,12 @@ def write_scene(
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
     return folder
+
+
+def plain_name(name: str, odd: str, taken: Collection[str]) -> str:
+    """A name without the characters of a pattern, which become ``_``, and numbered where it is taken."""
+    plain = re.sub(odd, "_", name)
+    return next(free for free in chain([plain], (f"{plain}_{number}" for number in count(2))) if free not in taken)
 
 
 def read_scene_folder(folder: str | Path) -> SceneFolder:

@@ -1,7 +1,7 @@
 """Radio materials of surfaces, in a file that users may edit.
 
 Rules give each kind of surface a material of ITU-R P.2040, and single surfaces may depart from them; ``perfect`` is a
-perfect conductor:
+perfect conductor, ``perfect_absorber`` neither reflects nor transmits:
 
     rules: {floor: itu_concrete, ceiling: itu_ceiling_board, wall: itu_plasterboard, other: itu_wood}
     surfaces: {floor: floor, wall_01: wall, wall_02: itu_glass}
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, PERFECT_THICKNESS_M, Constants
+from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT, PERFECT_CONSTANTS, PERFECT_THICKNESS_M, Constants
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 
 from ..core import InputError
@@ -42,7 +42,9 @@ NAME = re.compile(r"\w+", re.ASCII)
 SURFACE_NAME = re.compile(r"[\w.-]+")
 THICKEST_M = 1e3
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
-"""Default slab thickness of every material, metres."""
+"""Default slab thickness of every slab, metres."""
+KNOWN = (*THICKNESS_M, ABSORBER)
+"""Materials without constants of the scene's own."""
 RULES: Mapping[str, str] = {
     "floor": "itu_concrete",
     "ceiling": "itu_ceiling_board",
@@ -57,7 +59,7 @@ class Materials:
     """Radio materials of a scene.
 
     Attributes:
-        rules: material ``itu_*`` or ``perfect`` of each kind of surface; by default those of `RULES`.
+        rules: material of `KNOWN` of each kind of surface; by default those of `RULES`.
         surfaces: kind, or material, of each surface by its name.
         thickness_m: slab thickness of each material of `THICKNESS_M` in metres; by default the one there.
         constants: materials of the scene's own.
@@ -71,7 +73,7 @@ class Materials:
     def of(self, name: str, kind: str) -> str:
         """Material of a surface, by its entry or else by its kind's rule."""
         entry = self.surfaces.get(name, kind)
-        return entry if entry in THICKNESS_M or entry in self.constants else {**RULES, **self.rules}[entry]
+        return entry if entry in KNOWN or entry in self.constants else {**RULES, **self.rules}[entry]
 
     def by_surface(self) -> dict[str, str]:
         """Material of each listed surface by its name."""
@@ -91,7 +93,7 @@ class Materials:
         entries = {name: self.surfaces.get(name, kind) for name, kind in kinds.items()}
         full = replace(self, rules={**RULES, **self.rules}, surfaces=entries)
         used = dict.fromkeys([*full.rules.values(), *(full.of(name, "other") for name in entries)])
-        stated = {m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used if m not in self.constants}
+        stated = {m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used if m in THICKNESS_M}
         return replace(full, thickness_m=stated)
 
 
@@ -116,8 +118,8 @@ def read_materials(path: str | Path) -> Materials:
     own = tuple(parts["constants"])
 
     def check(material: Any, where: str, also: Sequence[str] = own) -> None:
-        if material not in (*also, *THICKNESS_M):
-            known = ", ".join([*also, *THICKNESS_M])
+        if material not in (*also, *KNOWN):
+            known = ", ".join([*also, *KNOWN])
             raise InputError(f"{file}: {where}: unknown material {shown(material)}; known are {known}")
 
     for kind, material in parts["rules"].items():
@@ -153,7 +155,7 @@ def _is_number(value: Any) -> bool:
 
 def _check_constants(file: Path, name: Any, values: Any) -> None:
     where = f"{file}: constants: {name}"
-    if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*THICKNESS_M, *KINDS) or name[:3] == "itu":
+    if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*KNOWN, *KINDS) or name[:3] == "itu":
         raise InputError(f"{where}: choose a name of letters, digits and _ that is no kind and does not begin with itu")
     needed = set(PERFECT_CONSTANTS)
     if not isinstance(values, dict) or set(values) not in (needed, needed | {EXPONENT, CARRIER}):
@@ -170,9 +172,10 @@ def _check_constants(file: Path, name: Any, values: Any) -> None:
 def materials_text(materials: Materials) -> str:
     """The text of a ``materials.yml``."""
     head = (
-        "# Radio materials of this scene (of ITU-R P.2040, or perfect). rules: of each kind of surface; surfaces: the\n"
-        "# kind of each, or a material of its own; constants: relative permittivity, conductivity (S/m) and thickness\n"
-        "# (m) of further materials. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# Radio materials of this scene (of ITU-R P.2040, perfect, or perfect_absorber). rules: of each kind of\n"
+        "# surface; surfaces: the kind of each, or a material of its own; constants: relative permittivity,\n"
+        "# conductivity (S/m) and thickness (m) of further materials. Edit, then open the scene with wrf-mi:\n"
+        "# scene.xml follows.\n"
     )
     facts = {key: dict(part) for key, part in vars(materials).items() if part or key != "constants"}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

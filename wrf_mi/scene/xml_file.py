@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 from xml.etree import ElementTree
@@ -15,8 +16,9 @@ from ..core.files import inside, one_line
 
 PLUGINS = {
     "shape": "ply obj serialized rectangle cube sphere disk cylinder shapegroup instance merge",
-    "bsdf": "radio-material itu-radio-material twosided diffuse roughplastic plastic principled conductor "
-    "roughconductor dielectric roughdielectric thindielectric mask bumpmap normalmap blendbsdf null",
+    "bsdf": "radio-material itu-radio-material absorber-radio-material twosided diffuse roughplastic plastic "
+    "principled conductor roughconductor dielectric roughdielectric thindielectric mask bumpmap normalmap blendbsdf "
+    "null",
     "texture": "bitmap checkerboard uniform mesh_attribute volume",
     "emitter": "area point constant envmap directional spot",
     "sensor": "perspective thinlens orthographic",
@@ -32,8 +34,6 @@ VALUES = (
     *("transform", "translate", "rotate", "scale", "matrix", "lookat"),
 )
 """Elements without a plugin. ``include``, ``path`` and ``alias`` are not among them: they reach other files."""
-MESHES = ("ply", "obj")
-"""Shapes that are files of vertices and faces."""
 FILES = ("filename",)
 """Names of texts that are files."""
 DEEPEST = 64
@@ -57,29 +57,37 @@ def read_scene_xml(path: Path) -> Element:
         raise InputError(f"{path}: has a document type or entities; remove them") from None
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
         raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
-    _check(root, path, 0)
+    named = {id(shape): f"{path}: {name}" for name, shape in named_shapes(root)}
+    _check(root, str(path), named, path.parent, 0)
+    if root.tag != "scene" or not root.get("version"):
+        raise InputError(
+            f'{path}: begins with <{root.tag}>, not with a scene and its version; write <scene version="3.0.0">'
+        )
     return root
 
 
-def mesh_files(root: Element, folder: Path) -> list[Path]:
-    """Meshes that the shapes of a scene in a folder name."""
-    texts = [text for shape in root.iter("shape") if shape.get("type") in MESHES for text in shape.iter("string")]
-    named = dict.fromkeys(text.get("value", "") for text in texts if text.get("name") in FILES)
-    return [folder / name for name in named]
+def named_shapes(root: Element) -> list[tuple[str, Element]]:
+    """Shapes of a scene, those within shapes included, each after its name in messages: its id, or else its number."""
+
+    def name(number: int, shape: Element) -> str:
+        return f"shape {shape.get('id', '')!r}" if shape.get("id") else f"shape {number} ({shape.get('type')}, no id)"
+
+    return [(name(number, shape), shape) for number, shape in enumerate(root.iter("shape"), start=1)]
 
 
-def _check(element: Element, path: Path, depth: int) -> None:
+def _check(element: Element, where: str, named: Mapping[int, str], folder: Path, depth: int) -> None:
+    where = named.get(id(element), where)
     if depth > DEEPEST:
-        raise InputError(f"{path}: elements within elements to more than {DEEPEST} levels; correct the scene")
+        raise InputError(f"{where}: elements within elements to more than {DEEPEST} levels; correct the scene")
     tag, plugin = element.tag, element.get("type", "")
     known = PLUGINS.get(tag, "").split()
     if plugin not in known if plugin else tag not in VALUES:
         what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
         remedy = f"known are {', '.join(known or [*VALUES, *PLUGINS])}"
-        raise InputError(f"{path}: {one_line(what)} does not belong into a scene; {remedy}")
+        raise InputError(f"{where}: {one_line(what)} does not belong into a scene; {remedy}")
     if tag in ("string", "default") and "$" in element.get("value", ""):
-        raise InputError(f"{path}: a value with a parameter ($); write the value in its place")
+        raise InputError(f"{where}: a value with a parameter ($); write the value in its place")
     if tag == "string" and element.get("name") in FILES:
-        inside(path.parent, element.get("value", ""), path)
+        inside(folder, element.get("value", ""), where)
     for child in element:
-        _check(child, path, depth + 1)
+        _check(child, where, named, folder, depth + 1)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from wrf_mi_scenes.mitsuba_xml import PERFECT_CONSTANTS
+from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..scene.folder import write_scene
+from ..scene.folder import plain_name, write_scene
 from ..scene.materials import CARRIER, THICKNESS_M, Materials
 from ..scene.materials import EXPONENT as LAW
 from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
@@ -29,7 +29,7 @@ from .material_parameters import (
     read_materials,
     slabs_of_faces,
 )
-from .materials import in_itu_range
+from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
 from .walls import moved_planes, plane_centres
@@ -39,6 +39,8 @@ FLAT = 0.2
 may lie far from it."""
 UNCHANGED = 1e-4
 """Relative change of a constant below which a material keeps its name: less than any measurement supports."""
+ODD_IN_FILES, ODD_IN_MATERIALS = r"[^\w.-]", r"[^A-Za-z0-9_]"
+"""Characters of other scenes' names that those of surfaces and materials of a scene folder do not have."""
 QUANTITIES = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
 """Trainable constants of a slab, and the least value of each (`wrf_mi.tracing.material_parameters`)."""
 
@@ -105,11 +107,11 @@ def check_materials(scene: Any) -> None:
     """Refuse a scene that `write_corrected_scene` cannot write.
 
     Raises:
-        InputError: a material that is not a slab.
+        InputError: a material that is neither a slab nor an absorber.
     """
     slabs = read_materials(scene).names
     for name, thing in scene.objects.items():
-        if (material := thing.radio_material.name) not in slabs:
+        if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
 
 
@@ -162,7 +164,8 @@ def write_corrected_scene(
         The folder.
 
     Raises:
-        InputError: a material that is not a slab, no surface is left, or a folder that exists or cannot be written.
+        InputError: a material that is neither a slab nor an absorber, no surface is left, or a folder that exists or
+            cannot be written.
         ValueError: see `moved_triangles`.
     """
     check_materials(scene)
@@ -173,18 +176,25 @@ def write_corrected_scene(
     exponent = material_exponents(slabs, parameters)
     changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
     carrier_hz = float(scene.frequency[0])
-    parts, entries, constants, thickness = [], {}, {}, {}
+    parts, thickness = list[Surface](), dict[str, float]()
+    entries, constants = dict[str, str](), dict[str, dict[str, float]]()
+    fitted_names = dict[str, str]()
     for index, name in enumerate(surfaces.names):
         faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])
         present = [slab for slab in np.unique(slab_of_face[faces]) if slab not in absent]
         for number, slab in enumerate(present):
-            part = name if len(present) == 1 else f"{name}_{number + 1:02d}"
+            part = plain_name(name if len(present) == 1 else f"{name}_{number + 1:02d}", ODD_IN_FILES, entries)
             corners = triangles[faces[slab_of_face[faces] == slab]].reshape(-1, 3)
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
             material = scene.objects[name].radio_material.name
-            if changed[slab] or material not in THICKNESS_M:
-                material = f"fitted_{(part if grouping == 'surface' else material).replace('-', '_')}"
+            if slab < 0:
+                material = ABSORBER
+            elif changed[slab] or material not in THICKNESS_M:
+                owner = part if grouping == "surface" else material
+                if owner not in fitted_names:
+                    fitted_names[owner] = plain_name(f"fitted_{owner}", ODD_IN_MATERIALS, constants)
+                material = fitted_names[owner]
                 law = {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
                 constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True)) | law
             elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):

@@ -54,6 +54,13 @@ def perfect_reflector() -> Any:
     )
 
 
+def absorbs(material: Any) -> bool:
+    """Whether a radio material neither reflects nor transmits, and so has no constants."""
+    from sionna.rt.radio_materials import AbsorberRadioMaterial
+
+    return isinstance(material, AbsorberRadioMaterial)
+
+
 CONSTANTS = ("relative_permittivity", "conductivity", "thickness")
 """Constants of a radio material that differ between materials."""
 
@@ -104,6 +111,10 @@ def set_frequency(
             frequency_hz / 1e6,
             ", ".join(sorted(constant)),
         )
+    for material in scene.radio_materials.values():
+        if absorbs(material):
+            # Sionna RT 2.2 calls this of every material when the frequency is set, and absorbers lack it.
+            material.frequency_update = lambda: None
     scene.frequency = frequency_hz
     _share_kernels(scene, frequency_hz)
 

@@ -18,6 +18,7 @@ from ..core.paths import read_paths_file, save_paths
 from ..core.types import IntArray
 from .buffer import Legs
 from .fields import Devices, Ends, path_gains, scattering_materials
+from .materials import absorbs
 from .options import TraceOptions
 from .surfaces import Surfaces, scene_surfaces
 
@@ -59,6 +60,14 @@ class TraceResult:
         wedge = {name: values[which] for name, values in self.wedge.items()}
         kept = self.primitives[which], self.probability[which]
         return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
+
+    def unabsorbed(self, scene: Any) -> TraceResult:
+        """The paths that meet no absorber of the ``sionna.rt.Scene``; others have no gain."""
+        names = self.paths.object_names
+        absorbing = [number for number, name in enumerate(names) if absorbs(scene.objects[name].radio_material)]
+        if not absorbing:
+            return self
+        return self.select(np.flatnonzero(~np.isin(self.paths.objects, absorbing).any(axis=1)))
 
     def of_transmitters(self, which: IntArray) -> TraceResult:
         """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""

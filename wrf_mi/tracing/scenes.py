@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,16 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
 from .. import backend
 from ..core import InputError
-from ..core.files import one_line
 from ..core.yaml_files import read_yaml
 from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.materials import thicknesses
 from ..scene.surfaces import mesh_parts
-from ..scene.xml_file import mesh_files, read_scene_xml
+from ..scene.xml_file import read_scene_xml
 from .materials import perfect_reflector, set_frequency
+from .scene_shapes import check_materials, load_checked, replace_shapes
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
-CHECKED_FILES = 4096
-"""Files whose checks are remembered: a scene is opened once for each carrier and fold."""
 HIGHEST_M = 500.0
 """Height above which a scene counts as one in millimetres."""
 
@@ -110,30 +107,11 @@ def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float
 
 
 def _from_xml(path: Path) -> Any:
-    from sionna import rt
-
-    for file in mesh_files(read_scene_xml(path), path.parent):
-        stat = file.stat() if file.exists() else None
-        _check_mesh(file, stat and (stat.st_ino, stat.st_size, stat.st_mtime_ns))
-    try:
-        # Merged shapes, and with them the paths, have a random order.
-        return rt.load_scene(str(path), merge_shapes=False)
-    except (RuntimeError, ValueError, SyntaxError, TypeError) as error:
-        # Mitsuba's message holds the traceback of Sionna RT's error; its last line is the reason.
-        lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        if "ITU material" in str(error):
-            known = ", ".join(THICKNESS_M)
-            raise InputError(f"{path}: {one_line(lines[-1])}; known are {known}, and constants of your own") from None
-        raise InputError(f"{path}: cannot be opened ({one_line(lines[-1])}); correct the scene") from None
-
-
-@lru_cache(CHECKED_FILES)
-def _check_mesh(file: Path, state: tuple[int, int, int] | None) -> None:
-    """Refuse a mesh with a face of a vertex that is not there: Mitsuba follows it, and ends the process.
-
-    A file is read again if its state (inode, bytes, time of change) is another one.
-    """
-    mesh_parts(file)
+    root = read_scene_xml(path)
+    check_materials(root, path)
+    with tempfile.TemporaryDirectory() as folder:
+        replace_shapes(root, path, Path(folder))
+        return load_checked(root, path, Path(folder))
 
 
 def _from_mesh(path: Path, material: str) -> Any:

@@ -23,8 +23,12 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tracing.image_method import image_sources, meeting_point
 from ...tracing.material_parameters import read_materials
+from ...tracing.materials import absorbs
 from ...tracing.surfaces import Surfaces, find_planes, scene_surfaces
 
+ABSORBING = 1.001, 1e-6, 1e8
+"""Constants of a slab in an absorber's place: nearly air, so that it reflects less than 3 % of the amplitude 6 degrees
+above grazing, and so thick that no wave passes."""
 MARGIN_M = 1e-3
 """Slack of a plane's bounds, and greatest distance of a leg's end from the mesh at a reflection."""
 NEAR_M = 5e-4
@@ -59,8 +63,12 @@ class Room:
         if scene is None:
             return cls((), (), np.zeros((3, 0)))
         surfaces, known = scene_surfaces(scene), read_materials(scene)
-        index = [known.names.index(scene.objects[name].radio_material.name) for name in surfaces.names]
-        slabs = np.stack([known.permittivity, known.conductivity, known.thickness_m])[:, index]
+        constants = np.stack([known.permittivity, known.conductivity, known.thickness_m], axis=1)
+        of_material = dict(zip(known.names, constants, strict=True))
+        slabs = np.empty((3, len(surfaces.names)))
+        for index, name in enumerate(surfaces.names):
+            material = scene.objects[name].radio_material
+            slabs[:, index] = ABSORBING if absorbs(material) else of_material[material.name]
         return cls(surfaces.names, tuple(surfaces.triangles[a:b] for a, b in pairwise(surfaces.first_face)), slabs)
 
     def with_sheets(self, sheets: FloatArray, slabs: FloatArray) -> Room:
