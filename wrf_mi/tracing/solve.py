@@ -198,11 +198,13 @@ def trace_paths(
         unknown = np.full(len(legs), np.nan, np.complex128)
         gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
     paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
-    if check:
-        _warn_of_silence(paths, positions, devices, first_row)
     primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)
     hz, arrays = float(scene.frequency[0]), (primitives, legs.probability, legs.wedge)
-    return TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
+    traced = TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
+    traced = traced.unabsorbed(scene)
+    if check:
+        _warn_of_silence(traced.paths, positions, devices, first_row)
+    return traced
 
 
 def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Receiver], first_row: int) -> None:

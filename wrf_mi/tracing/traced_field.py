@@ -327,7 +327,6 @@ class TracedField:
 
     def _take(self, traced: TraceResult, here_m: FloatArray) -> None:
         """Lay out paths on the device, with as many entries for each transmitter as the largest number of paths."""
-        traced = traced.unabsorbed(self.scene)
         surfaces, types, tx = self.surfaces, traced.paths.interactions, traced.paths.tx
         legs = traced.legs(surfaces)
         face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
