@@ -29,7 +29,7 @@ def sheet(axis: int, at: float, first: Span, second: Span) -> Mesh:
     ``first`` and ``second`` are its extents along the other two axes in ascending order.
     """
     others = [a for a in range(3) if a != axis]
-    corners = np.full((4, 3), at)
+    corners = np.full((4, 3), float(at))
     corners[:, others[0]] = [first[0], first[1], first[1], first[0]]
     corners[:, others[1]] = [second[0], second[0], second[1], second[1]]
     return Mesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)

@@ -17,9 +17,12 @@ from ..scene.surfaces import shared_edges
 ENLARGED = 4e-5
 """Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are
 displaced (`wrf_mi.tracing.images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
+OVERLAP = 5e-7
+"""The same at edges at which a face goes on in another: eight times the rounding of a coordinate in single precision, by
+which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
-"""Cosine of the bend of two faces up to which their common edge is not enlarged: facets of curved furniture would
-otherwise overlap, and waves that pass such a body would meet two facets in place of one."""
+"""Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
+overlap, and waves that pass such a body would meet two facets in place of one."""
 MOST_AT_CORNER = 8.0
 """Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
 infinity."""
@@ -41,14 +44,14 @@ def screens(triangles: FloatArray) -> Any:
     parameters["vertex_positions"] = on_device(enlarged(triangles), mi.Float)
     parameters["faces"] = on_device(np.arange(3 * len(triangles)), mi.UInt32)
     parameters.update()
-    # Embree's robust mode finds rays that meet the diagonal of a rectangle; OptiX is watertight as it is.
+    # Embree's robust mode loses fewer rays at edges; OptiX is watertight as it is.
     return mi.load_dict({"type": "scene", "mesh": mesh, "embree_use_robust_intersections": True})
 
 
 def enlarged(triangles: FloatArray) -> FloatArray:
     """Triangles [f, 3, 3] enlarged in their planes by `ENLARGED` at edges that are free, sharp or of three faces.
 
-    Degenerate triangles stay as they are.
+    At other edges they overlap by rounding. Degenerate triangles stay as they are.
     """
     if not len(triangles):
         return triangles
@@ -57,7 +60,7 @@ def enlarged(triangles: FloatArray) -> FloatArray:
     along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
     incoming = np.roll(along, 1, axis=1)
     sine = np.linalg.norm(np.cross(incoming, along), axis=2, keepdims=True)
-    margin = np.where(_smooth(triangles), 0.0, ENLARGED * scale_m(triangles))[..., None]
+    margin = np.where(_smooth(triangles), OVERLAP, ENLARGED)[..., None] * scale_m(triangles)
     # Both edges at a corner are shifted outwards by their margins: the corner moves to where the shifted lines meet.
     moved = np.roll(margin, 1, axis=1) * -along + margin * incoming
     moved = np.divide(moved, sine, out=np.zeros_like(moved), where=sine > 0)
