@@ -89,7 +89,7 @@ def test_wrong_scenes_are_refused(tmp_path: Path):
     refused("as if in millimetres", tmp_path / "mm.stl", material="concrete")
     mesh = sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0))
     mesh.vertices[0] = np.nan
-    refused("invalid vertex position", write_xml(tmp_path / "nan", {"floor": ("itu_concrete", mesh)}))
+    refused("vertex 1 of mesh is not finite", write_xml(tmp_path / "nan", {"floor": ("itu_concrete", mesh)}))
 
 
 def test_faces_without_their_vertices_are_refused_before_mitsuba_reads_them(tmp_path: Path):

@@ -16,6 +16,7 @@ from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .plan_sources import PlanGrid, Row0, read_layout, read_plan
 from .points import check_extent, lidar_package, read_points
+from .polygon_files import FACES, LONGEST_HEADER, ply_header
 from .surfaces import Surface, moved
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
@@ -184,5 +185,8 @@ def has_faces(file: Path) -> bool:
     if suffix != ".ply" or not file.is_file():
         return suffix in SUFFIXES and file.is_file()
     with file.open("rb") as stream:
-        head = stream.read(1 << 16).split(b"end_header")[0].split()
-    return b"face" in head and head[head.index(b"face") + 1] != b"0"
+        try:
+            elements, _, _ = ply_header(stream.read(LONGEST_HEADER))
+        except ValueError:
+            return False  # the reader of points raises
+    return any(element.name in FACES and element.count for element in elements)

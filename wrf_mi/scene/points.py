@@ -17,6 +17,7 @@ from ..core.array_files import stored_array, stored_arrays
 from ..core.files import one_line
 from ..core.memory import require_memory
 from ..parallel import run_module
+from .polygon_files import read_obj, read_ply
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -183,5 +184,9 @@ def _read(file: Path) -> Any:
                 commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
             columns, delimiter = (0, 1, 2), "," if commas else None
             return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
+        case ".ply":
+            return read_ply(file).vertices
+        case ".obj":
+            return read_obj(file).vertices
     with file.open("rb") as stream:  # without a name no other file is looked for
         return getattr(trimesh.load(stream, file_type=file.suffix.lower().removeprefix(".")), "vertices", [])
