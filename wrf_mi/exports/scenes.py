@@ -15,6 +15,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically
 from ..core.types import IntArray
+from ..scene.coordinates import Y_UP
 from ..tracing.corrected_scene import check_materials
 from ..tracing.materials import conductivity_exponent, in_itu_range, set_frequency
 from ..tracing.scenes import load_scene
@@ -24,8 +25,6 @@ from .ply import table, write_ply
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From z up to y up, as glTF has it."""
 RGB = tuple(enumerate(("red", "green", "blue")))
 
 

@@ -10,6 +10,7 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..scene.coordinates import require_near
 from ..scene.surfaces import mesh_parts
 from .grid import LARGEST
 
@@ -49,6 +50,7 @@ def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
     if not parts:
         raise InputError(f"{mesh}: no faces; give a mesh with triangles")
     triangles = np.concatenate(parts)
+    require_near(triangles.reshape(-1, 3), mesh)
     if step_m is not None:
         if not (np.isfinite(step_m) and step_m > 0):
             raise InputError(f"step {step_m:g} m: give a positive number of metres")

@@ -15,6 +15,7 @@ import trimesh
 from ..core import InputError
 from ..core.angles import FloatArray
 from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
+from .coordinates import Up, require_precise
 from .planes import THICKEST_M, Plane, with_axes
 from .points import FORMATS, UNITS_M, check_extent, source_file
 from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names, part_names
@@ -65,7 +66,7 @@ class _Facet:
     body: int
 
 
-def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
+def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[Surface]:
     """The surfaces of a mesh file, each of kind "other": a surface per body that the file names.
 
     Degenerate faces and second copies of a face, which would count each path twice, are dropped (logged). Inverted
@@ -74,16 +75,18 @@ def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
     Args:
         path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
         units: unit of its coordinates, a key of `wrf_mi.scene.points.UNITS_M`.
+        up: axis that is up in it, see `wrf_mi.scene.surfaces.mesh_parts`.
 
     Raises:
         InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
-            finite, or units that look like others.
+            finite or were rounded far from the origin, or units that look like others.
     """
     file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    parts = mesh_parts(file)
+    parts = mesh_parts(file, up)
     if not parts:
         remedy = "make a scene of points with wrf-mi mesh" if file.suffix.lower() == ".ply" else POINTS_ELSEWHERE
         raise InputError(f"{file}: has no faces, so no surface; {remedy}")
+    require_precise(np.concatenate([part.vertices for part in parts]), UNITS_M[units], file)
     surfaces = []
     for name, part in zip(part_names(len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * UNITS_M[units]

@@ -17,6 +17,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import one_line
 from ..core.types import IntArray
+from .coordinates import Up, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
 from .triangulation import triangles_of
 
@@ -53,14 +54,15 @@ class Surface:
         return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
 
 
-def mesh_parts(path: str | Path) -> list[trimesh.Trimesh]:
-    """The parts of a mesh file that have faces, in the file's unit.
+def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
+    """The parts of a mesh file that have faces, with z up, in the file's unit.
 
     Polygons of OBJ and PLY are cut into triangles, concave ones too. Faces of one material of an OBJ are one part, in
     other files those of a node or solid.
 
     Args:
         path: PLY, OBJ, STL, GLB, or another format that trimesh reads.
+        up: axis that is up in the file; None: y in GLB and glTF, as they specify, else z.
 
     Raises:
         InputError: a file that cannot be read as a mesh, is cut off, or has a face that crosses itself or names a
@@ -85,6 +87,7 @@ def mesh_parts(path: str | Path) -> list[trimesh.Trimesh]:
                 raise ValueError(f"a face names a vertex that is not among its {count}")
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
                 raise InputError(f"{path}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
+            part.vertices = turned(np.asarray(part.vertices, float), up_of(file, up))
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
@@ -139,6 +142,12 @@ def number_names(kinds: Sequence[Kind]) -> list[str]:
 def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     """Surfaces moved by a matrix [4, 4]."""
     return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]
+
+
+def sampled(triangles: FloatArray, count: int = 20_000) -> FloatArray:
+    """Points [count, 3] spread evenly over triangles [f, 3, 3]."""
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
 
 
 def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
