@@ -136,6 +136,16 @@ def test_glb_has_named_surfaces_and_materials(scene: Path, tmp_path: Path) -> No
         np.testing.assert_array_equal(corners(theirs), corners(ours))
 
 
+def test_glb_is_the_scene_again(scene: Path, tmp_path: Path) -> None:
+    """In its place and upright, as a bare mesh and as a scene folder."""
+    export(scene, "glb", tmp_path / "scene.glb")
+    known = corners(scene_surfaces(open_scene(scene, 2.4e9)).triangles)
+    bare = open_scene(tmp_path / "scene.glb", 2.4e9, material="concrete")
+    np.testing.assert_array_equal(corners(scene_surfaces(bare).triangles), known)
+    again = open_scene(make_scene(tmp_path / "scene.glb", tmp_path / "again").folder, 2.4e9)
+    np.testing.assert_array_equal(corners(scene_surfaces(again).triangles), known)
+
+
 def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: Path) -> None:
     facts = export(scene, "ply", tmp_path / "scene.ply")
     assert facts == {"surfaces": 6, "faces": 12, "materials": 4}

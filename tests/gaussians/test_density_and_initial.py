@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -17,10 +17,12 @@ from scipy.special import logit
 from scipy.stats import kstest
 
 from wrf_mi.backend.device import to_float
-from wrf_mi.core import InputError, Receiver, azimuth_elevation, rotation_matrix
+from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
 from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, reset_opacity
 from wrf_mi.scene.points import read_points
+from wrf_mi.training.config import InitialConfig
+from wrf_mi.training.initial import initial_gaussians
 from wrf_mi.training.state import FitState
 
 SPLIT_RAD = np.radians(5.0)
@@ -361,6 +363,15 @@ def test_points_are_read(name: str, tmp_path: Path) -> None:
     points = read_points(tmp_path / name)
     assert points.dtype == np.float64
     np.testing.assert_allclose(points, POINTS, rtol=FLOAT32_EPS)
+
+
+def test_points_far_from_the_origin_are_no_start(tmp_path: Path) -> None:
+    """Their Gaussians would lie on steps of half a metre."""
+    np.savez(tmp_path / "utm.npz", points=POINTS + np.array([701_362.56, 4_485_513.72, 0.0]))
+    config = InitialConfig(points=str(tmp_path / "utm.npz"))
+    record = cast(Record, None)  # points need none
+    with pytest.raises(InputError, match=r"utm.npz: coordinates up to 4485518 m"):
+        initial_gaussians(config, record, np.arange(1), np.random.default_rng(0))
 
 
 def test_mesh_vertices_are_read_as_points(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import trimesh
 
 from wrf_mi.core import InputError
 from wrf_mi.maps.surface import surface_of
+from wrf_mi.scene.coordinates import Y_UP
 
 ROUNDING_M = 1e-5
 """Of coordinates in the float32 of a file."""
@@ -18,7 +19,7 @@ ROUNDING_M = 1e-5
 @pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])
 def test_positions_are_the_centres_of_the_faces(suffix: str, tmp_path: Path) -> None:
     mesh = trimesh.creation.box((2.0, 1.0, 0.5))
-    mesh.export(tmp_path / f"box.{suffix}")
+    mesh.copy().apply_transform(Y_UP if suffix == "glb" else np.eye(4)).export(tmp_path / f"box.{suffix}")
     found = surface_of(tmp_path / f"box.{suffix}")
     expected = mesh.triangles_center[np.lexsort(mesh.triangles_center.round(4).T)]
     positions = found.positions_m[np.lexsort(found.positions_m.round(4).T)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from typing import Any
 
 from .options import Arguments, add_command
@@ -16,6 +17,9 @@ def add_parser(commands: Any) -> None:
     add("points", metavar="POINTS", help="scan (PLY, LAS, LAZ, XYZ, NPZ), plan (NPZ, PNG, ROS map YAML, CSV) or mesh")
     add("--out", required=True, metavar="DIR", help="scene folder to make")
     add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
+    add("--up", choices=("y", "z"), help="axis that is up in a scan or mesh (default: y in GLB, else z)")
+    text = "point of the source, metres, z up, that becomes the origin, such as 701300,4485500,0"
+    add("--origin", type=_point, metavar="X,Y,Z", help=text)
     add("--height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
     add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
     add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
@@ -39,6 +43,8 @@ def mesh_command(a: Arguments) -> int:
         a.points,
         a.out,
         units=a.units,
+        up=a.up,
+        origin_m=a.origin,
         materials=a.materials,
         height_m=a.height,
         floor_m=a.floor,
@@ -52,8 +58,22 @@ def mesh_command(a: Arguments) -> int:
     kinds = list(scene.materials.surfaces.values())
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     if a.json:
-        print_json({"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts})
+        facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
+        print_json({**facts, "origin_m": a.origin})
     else:
         print(", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}")
+        if a.origin is not None:
+            point = ", ".join(f"{value:.12g}" for value in a.origin)
+            print(f"origin: {point}; subtract it from the positions of the measurements, too")
         print(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
     return 0
+
+
+def _point(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(value) for value in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is no point; give X,Y,Z in metres")
+    return values

@@ -15,6 +15,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically
 from ..core.types import IntArray
+from ..scene.coordinates import Y_UP
 from ..scene.folder import plain_name
 from ..tracing.corrected_scene import ODD_IN_FILES, check_materials
 from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
@@ -25,8 +26,6 @@ from .ply import table, write_ply
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From z up to y up, as glTF has it."""
 RGB = tuple(enumerate(("red", "green", "blue")))
 
 

@@ -10,6 +10,7 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..scene.coordinates import require_near
 from ..scene.surfaces import mesh_parts
 from .grid import LARGEST
 
@@ -37,7 +38,7 @@ def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
     """Triangles of a mesh file, halved until no edge is longer than a step.
 
     Args:
-        mesh: any format that trimesh reads, in metres and the frame of the data.
+        mesh: a format of `wrf_mi.scene.surfaces.mesh_parts`, in metres and the frame of the data.
         step_m: longest edge of a triangle, metres; None: the faces as they are.
 
     Raises:
@@ -49,8 +50,7 @@ def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
     if not parts:
         raise InputError(f"{mesh}: no faces; give a mesh with triangles")
     triangles = np.concatenate(parts)
-    if not np.isfinite(triangles).all():
-        raise InputError(f"{mesh}: a vertex is not finite; correct the mesh")
+    require_near(triangles.reshape(-1, 3), mesh)
     if step_m is not None:
         if not (np.isfinite(step_m) and step_m > 0):
             raise InputError(f"step {step_m:g} m: give a positive number of metres")

@@ -25,6 +25,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 from ..core import InputError
 from ..core.files import atomic_folder, inside, one_line, write_atomically
 from ..core.yaml_files import read_yaml
+from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .surfaces import Surface
@@ -55,6 +56,7 @@ def write_scene(
     source: str,
     materials: Materials | None = None,
     registration: ArrayLike | None = None,
+    origin_m: Sequence[float] | None = None,
     description: str = "",
     points_m: ArrayLike | None = None,
     counts: Mapping[str, int] | None = None,
@@ -69,6 +71,7 @@ def write_scene(
         source: file that the surfaces were made from.
         materials: rules and exceptions; None takes the default rules.
         registration: 4 x 4 matrix from the source's frame to the scene's that has been applied already, or None.
+        origin_m: point [3] of the source that has become the origin already, before the registration, or None.
         description: one line.
         points_m: a sample of the scan [n, 3] or [n, 2] in the scene's frame for the preview.
         counts: further numbers for ``scene.yml``.
@@ -78,8 +81,8 @@ def write_scene(
         The folder.
 
     Raises:
-        InputError: the folder exists or cannot be written, there is no surface, or ``materials`` names an unknown
-            surface.
+        InputError: the folder exists or cannot be written, there is no surface, one is too far from the origin, or
+            ``materials`` names an unknown surface.
     """
     from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
 
@@ -92,6 +95,7 @@ def write_scene(
     given = materials or Materials()
     if unknown := [name for name in given.surfaces if name not in names]:
         raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
+    require_near(np.concatenate([surface.vertices_m for surface in surfaces]), source)
     full = given.complete({surface.name: surface.kind for surface in surfaces})
     matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
@@ -100,6 +104,7 @@ def write_scene(
         "units": "m",
         "xml": XML_FILE,
         "source": source,
+        "origin_m": None if origin_m is None else [float(value) for value in origin_m],
         "registration": None if matrix is None else matrix.tolist(),
         "counts": {
             "surfaces": len(surfaces),

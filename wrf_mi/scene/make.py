@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -12,11 +14,13 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
+from .coordinates import Up, require_fine, require_near, up_of, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .plan_sources import PlanGrid, Row0, read_layout, read_plan
 from .points import check_extent, lidar_package, read_points
-from .surfaces import Surface, moved
+from .polygon_files import FACES, LONGEST_HEADER, ply_header
+from .surfaces import Surface, moved, sampled
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -29,6 +33,8 @@ def make_scene(
     out: str | Path,
     *,
     units: str = "m",
+    up: Up | None = None,
+    origin_m: Sequence[float] | None = None,
     materials: str | Path | Materials | None = None,
     height_m: float | None = None,
     floor_m: float = 0.0,
@@ -42,11 +48,15 @@ def make_scene(
     r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
-        points_file: a 3D scan, z upwards (`wrf_mi.scene.points.read_points`); a plan in two dimensions
-            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, whose
-            triangles are used as they are.
+        points_file: a 3D scan (`wrf_mi.scene.points.read_points`); a plan in two dimensions
+            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
+            are cut into triangles and else used as they are.
         out: path of the folder.
         units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
+        up: axis of a scan or mesh that is up, y or z; None: y in GLB, as glTF specifies, else z, with a warning if the
+            coordinates look otherwise.
+        origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
+            as in a national grid, single precision would move walls. Positions of measurements have to be less by it.
         materials: rules and exceptions, or a ``materials.yml`` (or scene folder) to read them from.
         height_m: height from floor to ceiling, required for a plan and refused otherwise.
         floor_m: z of a plan's floor.
@@ -63,7 +73,8 @@ def make_scene(
         The content of the folder.
 
     Raises:
-        InputError: an unusable file, a missing package, options that do not fit the source, or an existing folder.
+        InputError: an unusable file, a missing package, options that do not fit the source, coordinates too far from
+            the origin, or an existing folder.
 
     A room of 6 m x 5 m from the walls of a plan, and the same without its ceiling:
 
@@ -95,16 +106,26 @@ def make_scene(
             raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     for name in ("shapely", "mapbox_earcut"):
         lidar_package(name)
+    if origin_m is not None and (len(origin_m) != 3 or not np.isfinite(origin_m).all()):
+        raise InputError(f"{file}: origin {tuple(origin_m)}: give three finite numbers of metres, x, y and z")
+    if up not in (None, "y", "z"):
+        raise InputError(f"{file}: {up!r} is up: give y or z")
+    from .cloud import surfaces_from_points
     from .plan import layout_walls
     from .positions import check_positions, read_positions, reflections
     from .register import register_walls, wall_points
 
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
-    surfaces, points, grid = _surfaces(file, units, height_m, floor_m, resolution_m, row_0)
+    surfaces, points, grid = _read(file, units, up, height_m, floor_m, resolution_m, row_0)
+    shift = np.eye(4) if origin_m is None else trimesh.transformations.translation_matrix(-np.asarray(origin_m, float))
+    if points is not None:
+        if matrix is None and known_walls is None:
+            require_near(trimesh.transform_points(points, shift), file)  # before minutes are spent on its planes
+        surfaces = surfaces_from_points(points)
     if known_walls is not None:
-        matrix = register_walls(wall_points(surfaces), known_walls, str(file)).matrix
-    motion = np.eye(4) if matrix is None else matrix
+        matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file)).matrix
+    motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
     sample, counts = None, {}
     if points is not None:
@@ -112,12 +133,15 @@ def make_scene(
         chosen = np.random.default_rng(1).integers(len(points), size=min(PREVIEW_POINTS, len(points)))
         sample, counts = trimesh.transform_points(points[chosen], motion), {"points": len(points)}
     if measured is not None:
-        mirrored = reflections(surfaces, file, grid, matrix, known_walls)
+        mirrored = reflections(surfaces, file, grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
     write_scene(
         out,
         placed,
-        frame=f"that of {file.name}, z upwards" + ("" if matrix is None else ", moved by the registration"),
+        frame=f"that of {file.name}, z upwards"
+        + ("" if origin_m is None else f", less the origin {', '.join(f'{value:.12g}' for value in origin_m)}")
+        + ("" if matrix is None else ", moved by the registration"),
+        origin_m=origin_m,
         source=str(file),
         materials=materials,
         registration=matrix,
@@ -128,34 +152,46 @@ def make_scene(
     return read_scene_folder(out)
 
 
-def _surfaces(
+def _read(
     file: Path,
     units: str,
+    up: Up | None,
     height_m: float | None,
     floor_m: float,
     resolution_m: float | None,
     row_0: Row0 | None,
 ) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
-    """The surfaces of a source, the points of a scan, and the cells of an occupancy grid."""
-    from .cloud import surfaces_from_points
+    """The surfaces of a plan or mesh, the points of a scan, and the cells of an occupancy grid."""
     from .mesh import planes_of_mesh, read_mesh
     from .plan import plan_surfaces
 
     if is_plan(file):
+        if file.suffix.lower() == ".csv" and _has_heights(file):
+            text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
+            raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
         if height_m is None:
             raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
         if units != "m":
             raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
+        if up is not None:
+            raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
         plan = read_plan(file, resolution_m, row_0)
         walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
         return walls, None, plan if isinstance(plan, PlanGrid) else None
     if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if has_faces(file):
-        return planes_of_mesh(read_mesh(file, units)), None, None
-    points = read_points(file, units)
+        surfaces = read_mesh(file, units, up)
+        if up is None:
+            triangles_m = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+            warn_of_up(sampled(triangles_m), file, up_of(file, up))
+        return planes_of_mesh(surfaces), None, None
+    points = read_points(file, units, up)
     check_extent(points, file)
-    return surfaces_from_points(points), points, None
+    require_fine(points, file)
+    if up is None:
+        warn_of_up(points, file, up_of(file, up))
+    return [], points, None
 
 
 def is_plan(path: str | Path) -> bool:
@@ -176,6 +212,21 @@ def is_plan(path: str | Path) -> bool:
     return False
 
 
+def _has_heights(file: Path) -> bool:
+    """Whether the first row of a table has three numbers or names x, y and z."""
+    try:
+        with file.open(encoding="utf-8-sig") as stream:
+            row = re.split(r"[,;\s]+", stream.readline().strip().lower())[:3]
+    except (OSError, ValueError):
+        return False  # the reader of plans raises
+    if row == ["x", "y", "z"]:
+        return True
+    try:
+        return len([float(cell) for cell in row]) == 3
+    except ValueError:
+        return False
+
+
 def has_faces(file: Path) -> bool:
     """Whether a file is a mesh and not a cloud; PLY may be either."""
     from .mesh import SUFFIXES
@@ -184,5 +235,8 @@ def has_faces(file: Path) -> bool:
     if suffix != ".ply" or not file.is_file():
         return suffix in SUFFIXES and file.is_file()
     with file.open("rb") as stream:
-        head = stream.read(1 << 16).split(b"end_header")[0].split()
-    return b"face" in head and head[head.index(b"face") + 1] != b"0"
+        try:
+            elements, _, _ = ply_header(stream.read(LONGEST_HEADER))
+        except ValueError:
+            return False  # the reader of points raises
+    return any(element.name in FACES and element.count for element in elements)

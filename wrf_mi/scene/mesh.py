@@ -15,14 +15,17 @@ import trimesh
 from ..core import InputError
 from ..core.angles import FloatArray
 from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
+from .coordinates import Up, require_precise
 from .planes import THICKEST_M, Plane, with_axes
-from .points import UNITS_M, check_extent, source_file
-from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names
+from .points import FORMATS, UNITS_M, check_extent, source_file
+from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names, part_names
 from .surfaces import bodies as connected_bodies
 
 logger = logging.getLogger(__name__)
 
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
+POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
+"""Remedy for a mesh of a format that is not read as points."""
 SMALLEST_FACE_M2 = 1e-10
 """Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
 FLAT_M = 0.01
@@ -63,31 +66,30 @@ class _Facet:
     body: int
 
 
-def read_mesh(path: str | Path, units: str = "m") -> list[Surface]:
+def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[Surface]:
     """The surfaces of a mesh file, each of kind "other": a surface per body that the file names.
 
     Degenerate faces and second copies of a face, which would count each path twice, are dropped (logged). Inverted
     normals stay, because radio materials act on both sides; so do edges with one, three or more faces.
 
     Args:
-        path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with triangles.
+        path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
         units: unit of its coordinates, a key of `wrf_mi.scene.points.UNITS_M`.
+        up: axis that is up in it, see `wrf_mi.scene.surfaces.mesh_parts`.
 
     Raises:
         InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
-            finite, or units that look like others.
+            finite or were rounded far from the origin, or units that look like others.
     """
     file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    parts = mesh_parts(file)
+    parts = mesh_parts(file, up)
     if not parts:
-        raise InputError(f"{file}: has no faces, so no surface; make a scene of points with wrf-mi mesh")
+        remedy = "make a scene of points with wrf-mi mesh" if file.suffix.lower() == ".ply" else POINTS_ELSEWHERE
+        raise InputError(f"{file}: has no faces, so no surface; {remedy}")
+    require_precise(np.concatenate([part.vertices for part in parts]), UNITS_M[units], file)
     surfaces = []
-    for index, part in enumerate(parts):
-        name = "mesh" if len(parts) == 1 else f"mesh_{index + 1:02d}"
+    for name, part in zip(part_names(len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * UNITS_M[units]
-        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-        if len(bad):
-            raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
         faces = np.asarray(part.faces, np.int64)
         solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
         # Copies may have other vertices: STL has no shared vertices.

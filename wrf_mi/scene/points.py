@@ -17,6 +17,8 @@ from ..core.array_files import stored_array, stored_arrays
 from ..core.files import one_line
 from ..core.memory import require_memory
 from ..parallel import run_module
+from .coordinates import Up, extent, require_precise, turned, up_of
+from .polygon_files import read_obj, read_ply
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -33,8 +35,6 @@ LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
 """Places of the numbers (32 bits) of variable-length records in the header, and the least bytes of a record."""
 LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads LAZ beside its points, and the time that it has."""
-CORE = (0.005, 0.995)
-"""Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
 VOXEL_M = 0.03
 """Edge of the cells: a desk's side still has several."""
 MOST_VOXELS = 600_000
@@ -73,16 +73,18 @@ def source_file(path: str | Path, units: str, wanted: str) -> Path:
     return Path(path)
 
 
-def read_points(path: str | Path, units: str = "m") -> FloatArray:
-    """Points [m, 3] in metres of a point cloud, or the vertices of a mesh.
+def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> FloatArray:
+    """Points [m, 3] in metres, z up, of a point cloud, or the vertices of a mesh.
 
     Args:
         path: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las`` or ``.laz``; ``.xyz`` or ``.txt`` with
             three or more columns, separated by spaces or commas; or any format that trimesh reads (PLY, OBJ, STL).
         units: unit of the file's coordinates, a key of `UNITS_M`.
+        up: axis that is up in it, see `wrf_mi.scene.surfaces.mesh_parts`.
 
     Raises:
-        InputError: missing file, unknown units, no points, or a point that is not finite.
+        InputError: missing file, unknown units, no points, a point that is not finite, or coordinates that were
+            rounded far from the origin.
     """
     file = source_file(path, units, f"a point cloud ({FORMATS})")
     if file.suffix.lower() in (".las", ".laz"):
@@ -100,13 +102,13 @@ def read_points(path: str | Path, units: str = "m") -> FloatArray:
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(f"{file}, point {bad[0] + 1}: not finite; remove that point")
-    return points if UNITS_M[units] == 1 else points * UNITS_M[units]
+    require_precise(points, UNITS_M[units], file)
+    return turned(points if UNITS_M[units] == 1 else points * UNITS_M[units], up_of(file, up))
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:
     """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building."""
-    low, high = np.quantile(points_m, CORE, axis=0)
-    size = high - low
+    size = np.ptp(extent(points_m), axis=0)
     text = f"{name}: extent {' x '.join(f'{side:.4g}' for side in size)} m"
     if size.max() > LARGEST_M:
         raise InputError(f"{text} looks like millimetres; give --units mm (or cut out one building)")
@@ -183,5 +185,9 @@ def _read(file: Path) -> Any:
                 commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
             columns, delimiter = (0, 1, 2), "," if commas else None
             return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
+        case ".ply":
+            return read_ply(file).vertices
+        case ".obj":
+            return read_obj(file).vertices
     with file.open("rb") as stream:  # without a name no other file is looked for
         return getattr(trimesh.load(stream, file_type=file.suffix.lower().removeprefix(".")), "vertices", [])

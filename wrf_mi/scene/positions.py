@@ -133,12 +133,12 @@ def reflections(
     surfaces: Sequence[Surface],
     file: Path,
     grid: PlanGrid | None,
-    matrix: FloatArray | None,
+    motion: FloatArray,
     known_walls_m: FloatArray | None,
 ) -> list[tuple[str, list[Surface]]]:
     """The scenes of a source with its y or its x reversed.
 
-    ``grid`` are the cells of an occupancy grid, ``matrix`` is the registration of the source [4, 4], and each
+    ``grid`` are the cells of an occupancy grid, ``motion`` moves the source to the scene's frame [4, 4], and each
     reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any. Returns the remedy and the surfaces of each
     reflection.
     """
@@ -162,8 +162,8 @@ def reflections(
         flip = np.eye(4)
         flip[axis, axis], flip[axis, 3] = -1, total
         mirrored = moved(surfaces, flip)
-        motion = best_motion(wall_points(mirrored), known_walls_m) if known_walls_m is not None else matrix
-        found.append((remedy, mirrored if motion is None else moved(mirrored, motion)))
+        placing = motion if known_walls_m is None else best_motion(wall_points(mirrored), known_walls_m)
+        found.append((remedy, mirrored if placing is None else moved(mirrored, placing)))
     return found
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
@@ -14,10 +15,11 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 from .. import backend
 from ..core import InputError
 from ..core.yaml_files import read_yaml
+from ..scene.coordinates import require_near, up_of, warn_of_up
 from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.materials import thicknesses
-from ..scene.surfaces import mesh_parts
+from ..scene.surfaces import mesh_parts, sampled
 from ..scene.xml_file import read_scene_xml
 from .materials import perfect_reflector, set_frequency
 from .scene_shapes import check_materials, load_checked, replace_shapes
@@ -37,7 +39,7 @@ def open_scene(
 
     Args:
         source: name of a scene that comes with the package, a scene folder, a Mitsuba XML whose BSDFs are radio
-            materials (``mat-itu_*``), or a mesh (``.stl``, ``.ply``, ``.obj``, ``.glb``).
+            materials (``mat-itu_*``), or a mesh (``.stl``, ``.ply``, ``.obj``, ``.glb``) in metres, z up (GLB: y up).
         frequency_hz: carrier frequency; below a material's range see `set_frequency`.
         thickness_m: slab thickness of materials by name, metres, in place of the scene's.
         material: radio material of a mesh, a name of ITU-R P.2040 (``concrete`` or ``itu_concrete``) or ``perfect``.
@@ -46,8 +48,8 @@ def open_scene(
         A ``sionna.rt.Scene``.
 
     Raises:
-        InputError: an unknown name, a file that cannot be opened, no surface, coordinates in millimetres, or a
-            material that is missing, unknown or superfluous.
+        InputError: an unknown name, a file that cannot be opened, no surface, coordinates in millimetres or too
+            far from the origin, or a material that is missing, unknown or superfluous.
     """
     scene, stated_m, laws = load_scene(source, material)
     set_frequency(scene, frequency_hz, {**stated_m, **(thickness_m or {})}, laws)
@@ -88,9 +90,11 @@ def load_scene(
     if not scene.objects:
         raise InputError(f"{source}: holds no surface; give a scene with triangles")
     bounds = scene.mi_scene.bbox()
+    corners_m = np.array([bounds.min, bounds.max], float).reshape(2, 3)
     if (height := float(bounds.max.z - bounds.min.z)) > HIGHEST_M:
         text = f"{height:.0f} m high, as if in millimetres"
         raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
+    require_near(corners_m, source)
     return scene, stated_m, laws
 
 
@@ -127,6 +131,9 @@ def _from_mesh(path: Path, material: str) -> Any:
         kind = name.removeprefix("itu_")
         radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
     parts, scene = mesh_parts(path), rt.load_scene()
+    if parts:
+        triangles = np.concatenate([np.asarray(part.triangles) for part in parts])
+        warn_of_up(sampled(triangles), path, up_of(path, None))
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):

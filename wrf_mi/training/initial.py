@@ -20,6 +20,7 @@ from ..core import InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_gaussians
+from ..scene.coordinates import require_near
 from ..scene.points import read_points
 from ..tracing import open_scene, trace_paths
 from ..tracing.scenes import MESHES
@@ -210,7 +211,9 @@ def initial_gaussians(
         triangles = scene_surfaces(scene).triangles
         return gaussians_from_mesh(triangles, config.gaussians, rng, config.opacity, config.signal)
     if config.points:
-        start = gaussians_from_points(read_points(config.points), config.gaussians, rng)
+        points_m = read_points(config.points)
+        require_near(points_m, config.points)
+        start = gaussians_from_points(points_m, config.gaussians, rng)
         return replace(start, opacity=config.opacity, signal=config.signal)
     distance = (config.nearest_m, config.farthest_m)
     return random_gaussians(

@@ -11,6 +11,7 @@ import trimesh
 
 from ..core import InputError
 from ..runs.scene_view import surfaces_of
+from ..scene.coordinates import require_near
 from ..scene.preview import ceiling_faces, free_edges
 from ..scene.surfaces import Surface, mesh_parts
 from ..tracing import open_scene
@@ -46,6 +47,7 @@ def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Su
     names = [path.stem] if len(parts) == 1 else [f"{path.stem}_{index}" for index in range(len(parts))]
     surfaces = []
     for name, part in zip(names, parts, strict=True):
+        require_near(np.asarray(part.vertices), source)
         part.merge_vertices()
         surfaces.append(Surface(name, "other", np.asarray(part.vertices, float), np.asarray(part.faces)))
     return surfaces, dict.fromkeys(names, NO_MATERIAL)

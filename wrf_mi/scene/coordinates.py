@@ -1,0 +1,160 @@
+"""Coordinates of meshes and scans: which axis is up, how far from the origin they are, how finely they are stored."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..core import InputError
+from ..core.angles import FloatArray
+
+logger = logging.getLogger(__name__)
+
+Up = Literal["y", "z"]
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From z up to y up: x, y, z become x, z, -y."""
+Y_UP_SUFFIXES = (".glb", ".gltf")
+"""Files whose specification has y up (glTF 2.0, section 3.4)."""
+FARTHEST_M = 2.0**14
+"""Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
+LOST_M = 0.005
+"""Steps of single precision in a file from which it is refused: nothing brings back what it has rounded."""
+COARSE_M, COARSEST_M = 0.03, 0.06
+"""Steps of a scan's coordinates that blur its planes, and that hide them: one and two of the cells it is thinned to."""
+STEP_TOLERANCE = 0.01
+"""Largest deviation from a multiple of a step, in steps: rounding of single precision near the origin."""
+MOST_POINTS = 100_000
+"""Points of a scan by which its axes and steps are judged."""
+ROOM_HEIGHT_M = 1.9, 3.5
+"""Usual heights of rooms."""
+CORRIDOR, CORRIDOR_M = 4.0, 4.5
+"""Least length of a corridor in its widths, and the largest height of one."""
+SHAFT, SHAFT_HEIGHT = 2.0, 2.0
+"""Largest length of a shaft or stairwell in its widths, and its least height in its lengths."""
+TALL = 1.4
+"""Least ratio of the extents along z and y of data that look as if y were up."""
+BROAD = 1.2
+"""Least ratio of the areas seen along y and z of such data; corridors with a tall end have less."""
+FLOOR_M = 0.05
+"""Largest height of a floor that counts as zero."""
+CELLS = 40
+"""Cells along the longest side, in which areas are seen."""
+CORE = (0.005, 0.995)
+"""Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
+
+
+def up_of(path: str | Path, up: Up | None) -> Up:
+    """The axis that is up in a file: the one that is stated, else that of its format."""
+    return up or ("y" if Path(path).suffix.lower() in Y_UP_SUFFIXES else "z")
+
+
+def turned(points: FloatArray, up: Up) -> FloatArray:
+    """Points [n, 3] with an axis up as points with z up."""
+    return points @ Y_UP[:3, :3] if up == "y" else points
+
+
+def extent(points_m: FloatArray) -> FloatArray:
+    """Lowest and highest coordinates [2, 3] of points [n, 3] but for strays."""
+    return np.quantile(points_m, CORE, axis=0)
+
+
+def looks_y_up(points_m: FloatArray) -> bool:
+    """Whether points [n, 3] on the surfaces of a room or building look as if y were up and not z.
+
+    They do if they are a room's height along y, and more than that along z, where more area is seen along y than along
+    z; or if they begin at zero along y and end at zero along z, as after a change of axes. Corridors and shafts, whose
+    walls are larger than their floor, are no such rooms.
+    """
+    points_m = points_m[:: len(points_m) // MOST_POINTS + 1]
+    low, high = extent(points_m)
+    length, along_y, along_z = high - low
+    least, most = ROOM_HEIGHT_M
+    if along_y < least or along_z <= most:
+        return False
+    if abs(low[1]) <= FLOOR_M and abs(high[2]) <= FLOOR_M:
+        return True
+    corridor = length >= CORRIDOR * along_y and along_z <= CORRIDOR_M
+    shaft = length <= SHAFT * along_y and along_z >= SHAFT_HEIGHT * length
+    if along_y > most or along_z < TALL * along_y or corridor or shaft:
+        return False
+    cell = ((points_m - low) / ((high - low).max() / CELLS)).astype(int)
+    seen_along_y, seen_along_z = (len(np.unique(cell[:, axes], axis=0)) for axes in ([0, 2], [0, 1]))
+    return seen_along_y > BROAD * seen_along_z
+
+
+def warn_of_up(points_m: FloatArray, name: str | Path, up: Up) -> None:
+    """Log that points [n, 3], z up, of a file that was read with an axis up look as if it were the other one."""
+    if looks_y_up(points_m):
+        _, along_y, along_z = np.ptp(extent(points_m), axis=0)
+        other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
+        text = f"{name}: looks as if {other} were up ({sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file)"
+        logger.warning("%s, and is read with %s up; state it by wrf-mi mesh --up %s, or --up %s", text, up, other, up)
+
+
+def require_near(points_m: FloatArray, name: str | Path) -> None:
+    """Refuse points [n, 3] so far from the origin that single precision would move them by a millimetre.
+
+    Raises:
+        InputError: with an origin to subtract.
+    """
+    if not len(points_m) or (far := float(np.abs(points_m).max())) < FARTHEST_M:
+        return
+    low = points_m.min(axis=0)
+    origin = np.where(np.abs(low) < 1000, 0, np.floor(low / 100) * 100)
+    text = ",".join(f"{value:.0f}" for value in origin)
+    apart = f"where numbers of single precision, which scenes have, are {np.spacing(np.float32(far)):.2g} m apart"
+    remedy = f"subtract {text} (wrf-mi mesh --origin {text}), and from the positions of the measurements, too"
+    raise InputError(f"{name}: coordinates up to {far:.0f} m, {apart}; {remedy}")
+
+
+def require_precise(points: FloatArray, unit_m: float, name: str | Path) -> None:
+    """Refuse points [n, 3] of a file, in its unit, that were rounded to single precision far from the origin.
+
+    Raises:
+        InputError: with the steps that are left.
+    """
+    if not len(points):
+        return
+    farthest = np.abs(points).max(axis=0)
+    axis = int(np.argmax(farthest))
+    values, step = points[:, axis], float(np.spacing(np.float32(farthest[axis])))
+    if step * unit_m < LOST_M or (values != values.astype(np.float32)).any():
+        return
+    # Whole and half metres of a design are exact in single precision, too; other axes then have no more digits.
+    digits = np.log10(step)
+    if _on_grid(values, 10.0 ** np.ceil(digits)) or _on_grid(np.delete(points, axis, axis=1), 10.0 ** np.floor(digits)):
+        return
+    text = f"has been rounded to steps of {step * unit_m:.2g} m, by single precision far from zero"
+    remedy = "export it with a local origin or in double precision"
+    raise InputError(f"{name}: {'xyz'[axis]} {text}; {remedy}")
+
+
+def _on_grid(values: FloatArray, spacing: float) -> bool:
+    return np.allclose(values / spacing, np.round(values / spacing), rtol=0, atol=1e-6)
+
+
+def require_fine(points_m: FloatArray, name: str | Path) -> None:
+    """Refuse a scan [n, 3] whose coordinates are stored in coarse steps; log steps that blur its planes.
+
+    Raises:
+        InputError: with the steps.
+    """
+    # Steps are those of two axes: on a third all points may lie on floor and ceiling.
+    step = sorted(_step(values) for values in points_m[:: len(points_m) // MOST_POINTS + 1].T)[1]
+    text = f"{name}: coordinates are in steps of {step:.2g} m (the scale of a LAS, or digits of a text)"
+    if step > COARSEST_M:
+        raise InputError(f"{text}, too coarse for planes; export it with steps of 1 cm or less")
+    if step > COARSE_M:
+        logger.warning("%s, which blurs planes; export it with steps of 1 cm or less", text)
+
+
+def _step(values: FloatArray) -> float:
+    """Step of which all differences of values [n] are multiples; 0 where there is none."""
+    gaps = np.diff(np.unique(np.round(values - values[0], 6)))
+    if not len(gaps):
+        return 0.0
+    ratio = gaps / gaps.min()
+    return float(gaps.min()) if np.abs(ratio - np.round(ratio)).max() < STEP_TOLERANCE else 0.0
