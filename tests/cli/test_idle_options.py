@@ -93,6 +93,13 @@ def test_settings_of_ray_tracing_without_effect_are_named(
     assert all(one.startswith(start) for one, start in zip(found, warned, strict=True)), found
 
 
+def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: Any) -> None:
+    plan_run(flat_folder)
+    assert caplog.text == ""
+    plan_run(flat_folder, settings=["traced.depth=5", "traced.rays=64"])
+    assert "traced.depth, traced.rays: no effect without a scene" in caplog.text
+
+
 def test_hybrid_of_strengths_traces_without_a_phase_error(flat_folder: Path, room: Path) -> None:
     assert INGREDIENTS["ray-tracing"].of_spectra
     problem = Problem(flat_folder, None, scene=str(room))
@@ -114,6 +121,8 @@ def test_other_commands_refuse_or_name_options_without_effect(
     correct = ["correct", room, flat_folder, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
     refused(correct, "--shift-sd: of planes and frame, which --fit materials,gain leaves", capsys)
     refused(["edit", room, "--replace"], "--out", capsys)
+    view = ["view", run, "--material", "concrete", "--out", tmp_path / "view.html"]
+    refused(view, "material concrete: of a bare mesh, and no source is one", capsys)
     paths = ["export", room, "--format", "paths", "--tx", "1,1,1", "--rx", "2,1,1", "--frequency", "1e9"]
     paths += ["--out", tmp_path / "paths.csv"]
     for more, option in (

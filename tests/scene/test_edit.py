@@ -165,6 +165,8 @@ def test_parts_that_leave_the_room_or_stand_in_others_are_named_with_the_distanc
 ) -> None:
     scene = write_scene(tmp_path / "room", ROOM, frame="the room's", source="test")
     edit_scene(scene, tmp_path / "edited", [move])
+    with pytest.raises(InputError, match=r"move wall_1: moved out of the scene, 5\.00 m beyond it"):
+        edit_scene(scene, tmp_path / "far", [Move(("wall_1",), (5, 0, 0))])
     assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == warned
 
 

@@ -28,7 +28,7 @@ def check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[
         names: names of the parts that were moved.
 
     Raises:
-        InputError: a part other than floor, ceiling and walls lies wholly outside, with the distance.
+        InputError: a part lies wholly outside, with the distance; floor, ceiling and walls by more than its size.
     """
     moved, others = ([one for one in after if (one.name in names) == chosen] for chosen in (True, False))
     if not moved or not others:
@@ -39,9 +39,9 @@ def check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[
     for part in moved:
         first, last = part.vertices_m.min(axis=0), part.vertices_m.max(axis=0)
         outside_m = float(np.maximum(low - first, last - high).max())
-        # An outer wall may be moved outwards, which enlarges the room.
-        if part.kind == "other" and ((last < low) | (first > high)).any():
-            gap_m = float(np.maximum(low - last, first - high).max())
+        gap_m = float(np.maximum(low - last, first - high).max())
+        # An outer wall may be moved outwards, which enlarges the room, but not farther than the room is large.
+        if gap_m > (0 if part.kind == "other" else (high - low).max()):
             text = f"moved out of the scene, {gap_m:.2f} m beyond it; give a smaller displacement, or --remove"
             raise InputError(f"move {part.name}: {text}")
         if outside_m > TOUCH_M:
