@@ -1,17 +1,23 @@
 """Test of wheel and source distribution: built, and each used in an empty environment outside the checkout.
 
 In each environment: all names of the package, ``py.typed``, ``wrf-mi doctor``, kriging and a field of Gaussians trained
-for moments through the command, and a prediction. The network is used for the dependencies alone.
+for moments through the command, and a prediction. Each extra is then installed alone beside the wheel's dependencies
+and used; without it, its commands end in one line that names it. The network is used for the dependencies alone.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
+import tomllib
 import venv
+from dataclasses import dataclass
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -50,6 +56,74 @@ COMMANDS = (
     "wrf-mi compare kriging field --out compare",
 )
 
+SCAN = """
+import laspy
+import numpy as np
+
+rng = np.random.default_rng(0)
+faces = [np.insert(rng.random((8000, 2)), axis, side, axis=1) for axis in range(3) for side in (0, 1)]
+points = np.concatenate(faces) * [5, 4, 2.7]
+np.savetxt("scan.xyz", points, fmt="%.4f")
+cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+cloud.header.scales = np.full(3, 1e-3)
+cloud.x, cloud.y, cloud.z = points.T
+cloud.write("scan.laz")
+"""
+CAPTURE = """
+import h5py
+import numpy as np
+
+samples = np.random.default_rng(0).integers(-9, 9, (4, 2, 3 * 224, 2)).astype(np.int16)
+with h5py.File("capture.hdf5", "w") as file:
+    file["Pilot_Samples"] = samples
+    file.attrs.update(num_mob_ant=3, samples_per_user=224)
+"""
+SCENARIO = """
+import deepmimo
+import numpy as np
+import wrf_mi
+from wrf_mi.datasets import write_ble_folder
+
+receiver = wrf_mi.Receiver("anchor1", np.array([1.0, 1.0, 1.5]), np.array([0.0, 0, 0, 1]))
+positions_m = np.random.default_rng(0).uniform([2, 1, 1], [4, 3, 2], (9, 3))
+known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(6), np.arange(6, 9))}
+write_ble_folder("inside", wrf_mi.Record("inside", "rssi", positions_m, (receiver,), np.full((1, 9), -50.0), **known))
+wrf_mi.train("inside", "traced", "ray-tracing", scene="xyz", settings=["max_depth=1", "rays=1024"])
+wrf_mi.tracing.write_deepmimo("scenario", wrf_mi.tracing.load_trace("traced/paths.npz"))
+deepmimo.config.set("scenarios_folder", str(Path.cwd()))
+assert len(deepmimo.load("scenario").compute_channels())
+"""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra, and how it is used.
+
+    Attributes:
+        name: name of the extra.
+        commands: arguments of ``wrf-mi`` that need it, and are refused without it.
+        script: Python code that is run before them where the extra is installed.
+        programs: other programs' modules and arguments, where it is installed.
+    """
+
+    name: str
+    commands: tuple[str, ...] = ()
+    script: str = ""
+    programs: tuple[str, ...] = ()
+
+
+EXTRAS = (
+    Extra("maps", tuple(f"map kriging --step 1 --out map.{suffix}" for suffix in ("nc", "zarr"))),
+    Extra("view", ("view kriging --out run.html", "view map.nc --out nc.html", "view map.zarr --out zarr.html")),
+    Extra("cluster", ("predict field --tx positions.csv --out spread.csv --scheduler local:1",)),
+    Extra("argos", ("data info capture.hdf5",), CAPTURE),
+    Extra("lidar", tuple(f"mesh scan.{suffix} --out {suffix} --replace" for suffix in ("xyz", "laz")), SCAN),
+    Extra("deepmimo", script=SCENARIO),
+    Extra("docs", programs=(f"sphinx -q -b html -D execute_notebooks=0 {CHECKOUT / 'docs'} site",)),
+    Extra("tests", programs=(f"pytest -q -p no:cacheprovider {CHECKOUT / 'tests' / 'core' / 'test_antenna.py'}",)),
+)
+"""All extras but dev, whose environment runs this program, in the order in which the files that they need are made."""
+
 
 class Steps:
     """Numbered steps with the time so far and, from the second on, the time left at the same pace."""
@@ -65,39 +139,78 @@ class Steps:
         print(f"package-test: {self.done} of {self.count}, {what} ({passed:.0f} s so far{left})", file=sys.stderr)
 
 
-def run(*command: str | Path, folder: Path) -> None:
-    """Run a program in a folder without the caller's variables about Python; print its output on failure."""
+def run(*command: str | Path, folder: Path, refusal: str = "") -> None:
+    """Run a program in a folder without the caller's variables about Python; print its output if it fails.
+
+    ``refusal`` is the end of the line with which it has to refuse what it is asked, instead of succeeding.
+    """
     variables = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.exit(
-            f"package-test: {' '.join(map(str, command))} ended with {done.returncode}\n{done.stdout}{done.stderr}"
+    refused = done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.rstrip().endswith(refusal)
+    if not refused if refusal else done.returncode:
+        text = f"{' '.join(map(str, command))} ended with {done.returncode}"
+        sys.exit(f"package-test: {text}{f', not with {refusal}' if refusal else ''}\n{done.stdout}{done.stderr}")
+
+
+def environment(place: Path, package: str, beside: Path | None = None) -> Path:
+    """An environment with a package installed in it; the Python of it.
+
+    ``beside`` is an environment whose packages it sees, so that they are not installed again.
+    """
+    venv.create(place / "venv", with_pip=True)
+    python = place / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    if beside is not None:
+        packages, its_own = (
+            Path(sysconfig.get_path("purelib", "venv", {"base": str(each.parents[1])})) for each in (beside, python)
         )
+        (its_own / "beside.pth").write_text(f"{packages}\n")
+    run(python, "-m", "pip", "install", "-q", package, folder=place)
+    return python
+
+
+def use_extra(extra: Extra, package: Path, beside: Path, folder: Path) -> None:
+    """Check that the commands of an extra are refused without it, then use it where it is installed alone."""
+    for line in extra.commands:
+        run(beside, "-m", "wrf_mi.cli", *shlex.split(line), folder=folder, refusal=f"'wrf-mi[{extra.name}]'")
+    place = folder / f"extra-{extra.name}"
+    place.mkdir()
+    python = environment(place, f"wrf-mi[{extra.name}] @ {package.as_uri()}", beside)
+    run(python, "-c", f"from pathlib import Path\n{extra.script}", folder=folder)
+    for line in extra.commands:
+        run(python, "-m", "wrf_mi.cli", *shlex.split(line), folder=folder)
+    for line in extra.programs:
+        run(python, "-m", *shlex.split(line), folder=folder)
+    shutil.rmtree(place)  # some take a gigabyte
 
 
 def main() -> None:
-    """Build and test both packages."""
-    steps = Steps(7)
+    """Build and test both packages, and use every extra."""
+    stated = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {extra.name for extra in EXTRAS} == set(stated) - {"dev"}, "an extra is not used here"
+    steps = Steps(5 + len(EXTRAS))
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         steps.next("source distribution, and a wheel from it")
         run(sys.executable, "-m", "build", "--outdir", folder / "dist", CHECKOUT, folder=folder)
-        for kind, pattern in (("wheel", "*.whl"), ("source distribution", "*.tar.gz")):
+        for kind, pattern in (("source distribution", "*.tar.gz"), ("wheel", "*.whl")):
             (package,) = (folder / "dist").glob(pattern)
             place = folder / pattern[2:]
             place.mkdir()
-            steps.next(f"environment for the {kind}")
-            venv.create(place / "venv", with_pip=True)
-            binaries = place / "venv" / ("Scripts" if os.name == "nt" else "bin")
-            steps.next(f"installing the {kind} and its dependencies")
-            run(binaries / "python", "-m", "pip", "install", "-q", package, folder=place)
+            steps.next(f"environment of the {kind} and its dependencies")
+            python = environment(place, str(package))
             steps.next(f"using the {kind}")
-            run(binaries / "python", "-c", USE, folder=place)
+            run(python, "-c", USE, folder=place)
             for line in COMMANDS:
                 program, *arguments = line.split()
-                run(binaries / program, *arguments, folder=place)
+                run(python.parent / program, *arguments, folder=place)
             assert (place / "powers.csv").read_text().startswith("x,y,z,anchor1_dbm")
             print(f"package-test: {package.name} works", file=sys.stderr)
+            if kind != "wheel":
+                shutil.rmtree(place)
+        (place / "capture.hdf5").touch()  # for the command that is refused before the file is read
+        for extra in EXTRAS:
+            steps.next(f"using the extra {extra.name}")
+            use_extra(extra, package, python, place)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,50 @@ def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, 
     assert "power_std_db" not in found
 
 
+def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
+    room: tuple[Path, Record], law: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene, record = room
+    given: dict[str, Any] = {"scene": scene, "settings": ["max_depth=0"]}
+    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
+    low, high = (
+        float(end.z)
+        for end in (run.problem.opened_scene.mi_scene.bbox().min, run.problem.opened_scene.mi_scene.bbox().max)
+    )
+    for height in (high + 2, low - 0.5, high + 0.01):
+        with pytest.raises(InputError, match=rf"height {height:g} m: outside of the scene, which spans z = 0.00 to"):
+            radio_map(run, step_m=1.0, height_m=height)
+    inside = radio_map(run, step_m=0.7, height_m=high - 0.1)
+    box = run.problem.opened_scene.mi_scene.bbox()
+    for axis in "xy":
+        assert float(getattr(box.min, axis)) < inside[axis].min()
+        assert inside[axis].max() < float(getattr(box.max, axis))
+    trimesh.creation.box((1.0, 1.0, 1.0), transform=trimesh.transformations.translation_matrix([1, 1, high])).export(
+        tmp_path / "box.ply"
+    )
+    caplog.clear()
+    radio_map(run, surface=tmp_path / "box.ply")
+    assert "of the surface lie outside of the scene" in caplog.text
+    caplog.clear()
+    radio_map(law, step_m=1.0, height_m=1.5)
+    assert caplog.text == ""
+    radio_map(law, step_m=1.0, height_m=5.0)
+    assert "height 5 m: the data's transmitters were at 1.30 to 1.30 m, so values are extrapolated" in caplog.text
+
+
+def test_map_above_a_scene_without_a_ceiling_is_told(
+    room: tuple[Path, Record], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _, record = room
+    parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
+    assert len(parts) < len(SHOEBOX)
+    (tmp_path / "open").mkdir()
+    given: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["max_depth=0"]}
+    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
+    radio_map(run, step_m=2.0, height_m=20.0)
+    assert "height 20 m: outside of the scene" in caplog.text
+
+
 def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
     traced = wrf_mi.train(record, tmp_path / "traced", "ray-tracing", scene=scene, settings=["rays=1024"])
@@ -251,9 +296,13 @@ def test_bad_input_is_one_line(law: Run, tmp_path: Path, capsys: pytest.CaptureF
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_package_is_named(mapped: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(InputError, match=r"need zarr: pip install 'wrf-mi\[maps\]'"):
-        write_map(mapped, tmp_path / "map.zarr")
+@pytest.mark.parametrize(
+    ("suffix", "package"),
+    [(".nc", "xarray"), (".nc", "h5netcdf"), (".nc", "h5py"), (".zarr", "zarr"), (".csv", "pandas")],
+)
+def test_missing_package_is_named(
+    suffix: str, package: str, mapped: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"need {package}: pip install 'wrf-mi\[maps\]'"):
+        write_map(mapped, tmp_path / f"map{suffix}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import os
@@ -10,16 +11,20 @@ import signal
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 import pytest
 from calling import SET, call, refused
 
+from wrf_mi.cli.main import build_parser, main
+from wrf_mi.cli.sweep import training_names
+from wrf_mi.cli.train import TRACING, training_arguments
 from wrf_mi.core import InputError
 from wrf_mi.runs import sweep as module
 from wrf_mi.runs.results import read_run
-from wrf_mi.runs.sweep import check_failures, plan_sweep, run_sweep, sweep_table
+from wrf_mi.runs.sweep import FLAGS, OPTIONS, Sweep, check_failures, plan_sweep, run_sweep, sweep_table
 
 SECONDS = 60
 """For a worker to begin its part, on a busy machine."""
@@ -52,11 +57,68 @@ def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) ->
         (["steps=1"], "steps is given already"),
         (["model=physics"], "model is given already"),
         (["scene=a/b,a b"], "two runs would be named scene=a-b"),
+        (["intervals=true,maybe"], "intervals is on or off; give true, false"),
+        (["deterministic=true,false"], "deterministic is given already"),
     ],
 )
 def test_bad_plans_are_refused(vary: list[str], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
-        plan_sweep(tmp_path, vary, {"dataset": "x", "model": "wrf-gs"}, ["steps=3"])
+        plan_sweep(tmp_path, vary, {"dataset": "x", "model": "wrf-gs"}, ["steps=3"], ["--deterministic"])
+
+
+def test_every_option_of_train_may_vary(tmp_path: Path) -> None:
+    assert set(training_names()) == {*OPTIONS, *FLAGS, "set"}
+    plan = plan_sweep(tmp_path, ["intervals=true,false", "phase-error=0,1"], {"dataset": "x"})
+    assert [" ".join(run.arguments) for run in plan.runs] == [
+        f"train x --phase-error {error}{flag}" for flag in (" --intervals", "") for error in (0, 1)
+    ]
+
+
+def option_value(action: argparse.Action) -> list[str]:
+    """A value of an option that is not its default, in words."""
+    known = {"model": "ray-tracing", "calibrate": "gain", "n_train": "7", "rays": "64", "paths": "line-of-sight"}
+    known |= {"phase_error": "0.5", "preset": "quick", "set": "batch=3"}
+    if action.nargs == 0:
+        return []
+    return [known[action.dest] if action.dest in known else str(list(action.choices)[-1]) if action.choices else "9"]
+
+
+ACTIONS = [
+    action
+    for action in build_parser()._subparsers._group_actions[0].choices["sweep"]._actions  # type: ignore[union-attr]
+    if action.option_strings and action.dest not in ("help", "json", "vary", "out", "scheduler")
+]
+"""Options of sweep that each run has."""
+
+
+@pytest.mark.parametrize("action", ACTIONS, ids=lambda action: action.dest)
+def test_each_run_has_every_option_of_the_sweep(
+    action: argparse.Action, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options that a sweep shares with train are those of its runs, alone and varied."""
+    planned: list[Sweep] = []
+
+    def stop(dataset: str, arguments: dict[str, object]) -> None:
+        raise InputError("planned")
+
+    def plan(*arguments: Any) -> Sweep:
+        planned.append(plan_sweep(*arguments))
+        return planned[-1]
+
+    monkeypatch.setattr(module, "plan_sweep", plan)
+    monkeypatch.setattr(module, "check_run", stop)
+    # The tracer's options belong to its model.
+    model = ["--model", "ray-tracing"] if action.dest in TRACING else []
+    option = [action.option_strings[0], *option_value(action)]
+    other = "loss.ssim_weight" if action.dest == "seed" else "seed"
+    common = ["sweep", "data", *model, "--vary", f"{other}=0,1", "--out", str(tmp_path / "sweep")]
+    parser = build_parser()
+    for arguments in (common, [*common, *option]):
+        assert main(arguments) == 2
+    plain, optioned = (parser.parse_args(sweep.runs[0].arguments) for sweep in planned)
+    assert vars(plain) | {action.dest: getattr(optioned, action.dest)} == vars(optioned)
+    assert getattr(optioned, action.dest) == getattr(parser.parse_args(["train", *option]), action.dest)
+    assert training_arguments(plain) != training_arguments(optioned)
 
 
 def test_bad_input_is_refused_before_anything_starts(

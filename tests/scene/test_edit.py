@@ -18,7 +18,7 @@ from wrf_mi.receivers.instruments import ChannelInstrument
 from wrf_mi.scene.edit import Move, box_of, edit_scene, parts_within, read_surfaces
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.materials import Materials
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.surfaces import Kind, Surface
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -107,6 +107,10 @@ def test_parts_within_a_box(scene: Path) -> None:
         (["--remove", "*"], "at least one"),
         (["--move", "piece_05:nan,0,0"], "finite"),
         ([], "nothing to change"),
+        (["--move", "piece_05:0,0,0,360"], "changes nothing"),
+        (["--move", "piece_0*:0,0.1,0", "--remove", "piece_05"], "move piece_0*: piece_05 is also removed"),
+        (["--move", "piece_05:500,0,0"], "move piece_05: moved out of the scene, 49"),
+        (["--move", "piece_05:0,0,-4"], "move piece_05: moved out of the scene"),
     ],
 )
 def test_edits_that_cannot_be_made_are_refused(
@@ -117,6 +121,60 @@ def test_edits_that_cannot_be_made_are_refused(
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "edited").exists()
+
+
+def box(name: str, low: tuple[float, ...], high: tuple[float, ...], kind: Kind = "other") -> Surface:
+    """A box, or with a size of 0 along an axis a sheet, of the given corners."""
+    mesh = trimesh.creation.box(bounds=[low, high])
+    return Surface(name, kind, np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+ROOM = [
+    box("floor", (0, 0, 0), (4, 3, 0), "floor"),
+    *(box(f"wall_{k}", (x, 0, 0), (x, 3, 2.5), "wall") for k, x in enumerate((0, 4))),
+    box("pole", (3, 1.45, 0), (3.05, 1.5, 2.5)),
+    box("cabinet", (1, 1, 0), (2, 2, 1.5)),
+    box("table", (1, 0.1, 0.7), (1.8, 0.8, 0.7)),
+]
+
+
+@pytest.mark.parametrize(
+    ("move", "warned"),
+    [
+        (Move(("cabinet",), (-1, 0, 0)), []),  # stands at the wall
+        (Move(("cabinet",), (-0.3, 0.5, 0), 90), []),
+        (Move(("cabinet",), (0, 0, 0.3)), []),
+        (
+            Move(("cabinet",), (-1.25, 0, 0)),
+            ["move cabinet: reaches 0.25 m out of the scene", "move cabinet: reaches 0.25 m through wall_0"],
+        ),
+        (
+            Move(("cabinet",), (0, 0, -0.2)),
+            ["move cabinet: reaches 0.20 m out of the scene", "move cabinet: reaches 0.20 m through floor"],
+        ),
+        (Move(("cabinet",), (0, 1.4, 0)), ["move cabinet: reaches 0.40 m out of the scene"]),
+        (Move(("cabinet",), (0, -0.6, 0)), ["move cabinet: reaches 0.30 m through table"]),
+        # The pole is in the cabinet: each of its edges is cut at the top.
+        (Move(("cabinet",), (1.2, 0, 0)), ["move cabinet: reaches 1.00 m through pole"]),
+        (Move(("wall_1",), (0.5, 0, 0)), ["move wall_1: reaches 0.50 m out of the scene"]),
+        (Move(("*",), (9, 9, 9)), []),
+    ],
+)
+def test_parts_that_leave_the_room_or_stand_in_others_are_named_with_the_distance(
+    move: Move, warned: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = write_scene(tmp_path / "room", ROOM, frame="the room's", source="test")
+    edit_scene(scene, tmp_path / "edited", [move])
+    with pytest.raises(InputError, match=r"move wall_1: moved out of the scene, 5\.00 m beyond it"):
+        edit_scene(scene, tmp_path / "far", [Move(("wall_1",), (5, 0, 0))])
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == warned
+
+
+def test_parts_that_stood_in_others_before_are_not_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scan = [*ROOM, box("shelf", (2, 2.5, -0.3), (3, 3, 2))]  # as scans of uneven floors have them
+    scene = write_scene(tmp_path / "room", scan, frame="the room's", source="test")
+    edit_scene(scene, tmp_path / "edited", [Move(("shelf",), (-0.5, 0, 0))])
+    assert caplog.text == ""
 
 
 def test_command_lists_moves_and_needs_a_folder(

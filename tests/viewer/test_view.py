@@ -278,8 +278,10 @@ def test_command_refuses_in_one_line(
     assert not out.exists()
     with pytest.raises(InputError, match="nothing to show"):
         wrf_mi.view()
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    refused(["view", tmp_path / "bad.nc", "--out", out], "maps need xarray; install it: pip install", capsys)
+    (tmp_path / "bad.zarr").mkdir()
+    for file, package in (("bad.nc", "h5py"), ("bad.zarr", "zarr"), ("bad.nc", "xarray")):
+        monkeypatch.setitem(sys.modules, package, None)
+        refused(["view", tmp_path / file, "--out", out], rf"need {package}: pip install 'wrf-mi\[view\]'", capsys)
 
 
 def test_options_have_the_documented_defaults() -> None:

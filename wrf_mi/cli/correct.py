@@ -37,6 +37,7 @@ def correct_command(a: Arguments) -> int:
     from ..core import InputError
     from ..core.settings import with_settings
     from ..correction import correct_scene, default_options, write_page
+    from ..correction.options import FRAME, PLANES
     from ..datasets import make_splits
     from ..synthetic import load_record
 
@@ -49,6 +50,8 @@ def correct_command(a: Arguments) -> int:
     names = ("depth", "reflections", "rows", "rays")
     given = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
     options = with_settings(options, [f"{key}={value}" for key, value in given.items() if value is not None])
+    if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
+        raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
     splits = make_splits(record, a.split, a.seed, a.n_train)
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")

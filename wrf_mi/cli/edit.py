@@ -37,7 +37,7 @@ def edit_command(a: Arguments) -> int:
         else:
             print(f"scene: {folder}\npicture: {folder / 'preview.png'}")
         return 0
-    if a.move or a.remove:
+    if a.move or a.remove or a.replace:
         raise InputError("edit: give the folder of the edited scene (--out)")
     surfaces, materials = read_surfaces(a.scene)
     rows = [

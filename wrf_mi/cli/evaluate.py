@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command, add_operator
+from .options import Arguments, add_command, add_operator, check_operator
 from .output import show_metrics
 
 
@@ -31,6 +31,7 @@ def evaluate_command(a: Arguments) -> int:
         raise InputError("evaluate: --reliability is of the run's own test rows; omit --split")
     if a.reliability is not None and Path(a.reliability).suffix.lower() != ".png":
         raise InputError(f"{a.reliability}: the picture is written as .png; give such a name")
+    check_operator(a)
     metrics = evaluate_run(a.run, a.split, not a.no_operator)
     if a.reliability is not None:
         metrics["coverage"] = _reliability(Path(a.run), Path(a.reliability))

@@ -66,13 +66,13 @@ def map_command(a: Arguments) -> int:
         )
     write_map(dataset, out)
     picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))
+    if "power_std_db" not in dataset:
+        print("no coverage: the model states no standard deviation; train with --intervals", file=sys.stderr)
     sizes = {str(name): int(dataset.sizes[name]) for name in ("receiver", "y", "x", "point") if name in dataset.sizes}
     if a.json:
         names = [str(name) for name in dataset.data_vars]
         print_json({"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names})
         return 0
-    if "power_std_db" not in dataset:
-        print("no coverage: the model states no standard deviation; train with --intervals", file=sys.stderr)
     shape = " x ".join(str(count) for name, count in sizes.items() if name != "receiver")
     print(f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}")
     return 0

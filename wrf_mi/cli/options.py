@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from typing import Any, NoReturn, get_args
 
+from ..core import InputError
 from ..core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from ..graph.settings import EvaluationName
 from ..models import MODELS
@@ -101,6 +102,23 @@ def add_operator(parser: argparse.ArgumentParser) -> None:
     """Add ``--no-operator``."""
     text = "splat each spectrum, also where geometry is static and one linear operator would do (docs/speed.md)"
     parser.add_argument("--no-operator", action="store_true", help=text)
+
+
+def check_operator(a: Arguments) -> None:
+    """Refuse ``--no-operator`` for a run that predicts without one.
+
+    Raises:
+        InputError: the run's model is no learned field, or the folder is no run.
+    """
+    if not a.no_operator:
+        return
+    from ..gaussians import FIELDS
+    from ..runs.run import open_run
+
+    config = open_run(a.run).config
+    if config.model not in FIELDS or config.task != "spectrum":
+        text = f"--no-operator belongs to learned fields of spectra, not to {config.model} on {config.task}"
+        raise InputError(f"{a.run}: {text}; omit it")
 
 
 def _number(text: str) -> int | float:

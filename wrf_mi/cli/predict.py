@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .options import Arguments, add_command, add_operator, add_scheduler
+from .options import Arguments, add_command, add_operator, add_scheduler, check_operator
 from .output import print_json
 
 
@@ -29,6 +29,7 @@ def predict_command(a: Arguments) -> int:
     from ..runs.api import predict_to_file
     from ..runs.prediction_file import read_inputs
 
+    check_operator(a)
     inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
         positions = (inputs.tx_pos_m, a.out, inputs.tx_heading_rad)

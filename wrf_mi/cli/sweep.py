@@ -21,14 +21,24 @@ def add_parser(commands: Any) -> None:
     add_scheduler(parser)
 
 
+def training_names() -> list[str]:
+    """Names of the options that sweep shares with train, and ``dataset``."""
+    parser = Parser(add_help=False)
+    add_training(parser)
+    return [action.dest.replace("_", "-") for action in parser._actions]
+
+
 def sweep_command(a: Arguments) -> int:
     """Run ``train`` for each combination."""
     from ..parallel import open_scheduler
-    from ..runs.sweep import OPTIONS, check_failures, check_run, plan_sweep, run_sweep, sweep_table
+    from ..runs.sweep import check_failures, check_run, plan_sweep, run_sweep, sweep_table
 
-    given = {key: getattr(a, key.replace("-", "_")) for key in OPTIONS}
-    options = {key: str(value) for key, value in given.items() if value is not None}
-    sweep = plan_sweep(a.out, a.vary, options, a.set, ["--deterministic"] if a.deterministic else [])
+    # Read off the parser, so that no option of train is left out.
+    given = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
+    settings = given.pop("set")
+    options = {name: str(value) for name, value in given.items() if value is not None and not isinstance(value, bool)}
+    flags = [f"--{name}" for name, value in given.items() if value is True]
+    sweep = plan_sweep(a.out, a.vary, options, settings, flags)
     parser = Parser(prog="wrf-mi")
     train.add_parser(parser.add_subparsers())
     for run in sweep.runs:

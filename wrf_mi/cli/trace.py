@@ -36,6 +36,8 @@ def trace_command(a: Arguments) -> int:
     from ..parallel import open_scheduler
 
     training_arguments(a)  # refused before workers start
+    if a.calibrate is not None and a.scheduler is not None:
+        raise InputError("trace: --calibrate trains in one process; omit --scheduler")
     if a.deepmimo is not None:
         _check_deepmimo(a)
     with open_scheduler(a.scheduler) as scheduler:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,12 @@ from ..core.antenna import UPRIGHT
 from ..core.files import atomic_file
 from ..datasets.folder_files import CsvTable, read_csv, write_csv
 from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
+from ..tracing.effects import without_effect
 from ..tracing.options import stated_kinds
 from .format import ExportOptions
 from .source import Source
+
+logger = logging.getLogger(__name__)
 
 LETTERS = {1: "R", 2: "S", 4: "T", 8: "D"}
 """Letters of the kinds of interaction: reflection, scattering, transmission, diffraction."""
@@ -70,9 +74,13 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
     assert options.frequency_hz is not None
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"max_depth": options.depth}
+    trace_options = TraceOptions(**chosen)
+    for name, reason in without_effect(trace_options).items():
+        option = "--depth" if name == "max_depth" else f"--paths {name}"
+        logger.warning("%s has no effect: %s", option, reason)
     scene = open_scene(source.name, options.frequency_hz, material=options.material)
     receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
-    return trace_paths(scene, options.tx_pos_m, receivers, TraceOptions(**chosen), options.progress)
+    return trace_paths(scene, options.tx_pos_m, receivers, trace_options, options.progress)
 
 
 def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:

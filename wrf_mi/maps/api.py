@@ -38,8 +38,9 @@ from ..core.receivers import receiver_index
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
-from .dataset import map_dataset, maps_package
-from .grid import Grid, area_of, grid_over, usual_height
+from .dataset import map_dataset
+from .grid import Grid, area_of, check_height, grid_over, usual_height, warn_of_points_outside
+from .packages import maps_package
 from .surface import SurfaceMesh, surface_of
 from .values import HEADINGS, Conditions, map_values
 
@@ -148,10 +149,13 @@ def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
 
 
 def _places(run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None) -> Grid | SurfaceMesh:
-    if surface is not None:
-        return surface_of(surface, step_m)
     known = run.problem.record.tx_pos_m
+    if surface is not None:
+        mesh = surface_of(surface, step_m)
+        warn_of_points_outside(run, mesh.positions_m, known)
+        return mesh
     height = usual_height(run, known) if height_m is None else height_m
+    check_height(run, height, known)
     return grid_over(*area_of(run, known), STEP_M if step_m is None else step_m, height)
 
 

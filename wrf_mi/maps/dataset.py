@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Receiver
 from ..core.files import atomic_file, atomic_folder, os_failure
 from .grid import Grid
+from .packages import CSV, NETCDF, PACKAGES, ZARR, maps_package, require_packages
 from .surface import SurfaceMesh
 from .variables import BEST, LEVELS, POWER, VARIABLES
 
@@ -20,18 +20,7 @@ if TYPE_CHECKING:
     import xarray
 
 CONVENTIONS = "CF-1.11"
-NETCDF, ZARR, CSV = ".nc", ".zarr", ".csv"
-PACKAGES = {NETCDF: "h5netcdf", ZARR: "zarr", CSV: "pandas"}
-"""Suffixes of files, and the package beside xarray that writes each."""
 COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
-
-
-def maps_package(name: str) -> Any:
-    """A package of the extra ``maps``; an `InputError` if it is not installed."""
-    try:
-        return import_module(name)
-    except ModuleNotFoundError:
-        raise InputError(f"radio maps need {name}: pip install 'wrf-mi[maps]'") from None
 
 
 def check_map_file(out: Path) -> None:
@@ -47,8 +36,7 @@ def check_map_file(out: Path) -> None:
         raise InputError(f"{out}: is a folder; give the name of a file")
     if suffix == ZARR and out.exists() and not (out / ".zgroup").is_file():
         raise InputError(f"{out}: exists and is no Zarr store; remove it or give another name")
-    for name in ("xarray", PACKAGES[suffix]):
-        maps_package(name)
+    require_packages(out)
 
 
 def map_dataset(

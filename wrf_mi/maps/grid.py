@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +12,14 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..runs.run import Run
 
+logger = logging.getLogger(__name__)
+
 LARGEST = 10_000_000
 """Largest number of positions of a grid: 240 MB of coordinates."""
 MARGIN_M = 0.5
 """Margin around transmitter positions where no scene states the area."""
+MOUNTED_M = 0.02
+"""Distance from a surface up to which a receiver is taken to lie before it."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,10 @@ class Grid:
 
 
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
-    """Grid over a rectangle, whose cells have their centres on it and cover it from the lower corner on.
+    """Grid over a rectangle: square cells from its lower corner on, whose centres lie in it.
+
+    Where an extent is no multiple of the step, it is rounded to the nearest one, half down: of a last cell that the
+    upper side cuts, the centre decides. An extent of up to half a step has one position, in its middle.
 
     Args:
         low_m: lower corner of the rectangle [2 or more], metres; coordinates beyond the second are ignored.
@@ -51,12 +60,17 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
     """
     if not (np.isfinite(step_m) and step_m > 0):
         raise InputError(f"step {step_m:g} m: give a positive number of metres")
-    size = np.maximum(np.asarray(high_m, float)[:2] - np.asarray(low_m, float)[:2], 0.0)
-    counts = np.maximum(np.ceil(size / step_m - 1e-9), 1.0)
-    if counts.prod() > LARGEST:
-        text = f"{counts.prod():.3g} positions over {size[0]:.1f} x {size[1]:.1f} m, the limit is {LARGEST}"
+    low = np.asarray(low_m, float)[:2]
+    size = np.maximum(np.asarray(high_m, float)[:2] - low, 0.0)
+    # The tolerance keeps a centre that rounding alone puts inside off the upper side, which is a wall.
+    counts = np.ceil(size / step_m - 0.5 - 1e-9)
+    if (positions := np.maximum(counts, 1.0).prod()) > LARGEST:
+        text = f"{positions:.3g} positions over {size[0]:.1f} x {size[1]:.1f} m, the limit is {LARGEST}"
         raise InputError(f"step {step_m:g} m: {text}; give a larger step")
-    x, y = (low + step_m * (np.arange(int(count)) + 0.5) for low, count in zip(low_m[:2], counts, strict=True))
+    x, y = (
+        start + step_m * (np.arange(int(count)) + 0.5) if count >= 1 else np.array([start + extent / 2])
+        for start, extent, count in zip(low, size, counts, strict=True)
+    )
     return Grid(x, y, float(height_m))
 
 
@@ -83,3 +97,51 @@ def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
         return float(np.median(heights))
     low, high = area_of(run, tx_pos_m)
     return float(low[2] + high[2]) / 2
+
+
+def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
+    """Refuse a plane that the scene's floor or ceiling hides from all receivers; warn of one outside of what is known.
+
+    Args:
+        run: a finished run.
+        height_m: height z of the plane, metres.
+        tx_pos_m: positions of the transmitters of the data [n, 3], metres.
+
+    Raises:
+        InputError: a height above or below a scene with a surface between it and every receiver, with the scene's.
+    """
+    scene, low, high = run.problem.opened_scene, *(float(corner[2]) for corner in area_of(run, tx_pos_m))
+    if low <= height_m <= high:
+        return
+    if scene is None:
+        logger.warning(
+            "height %g m: the data's transmitters were at %.2f to %.2f m, so values are extrapolated",
+            *(height_m, low + MARGIN_M, high - MARGIN_M),
+        )
+        return
+    text = f"height {height_m:g} m: outside of the scene, which spans z = {low:.2f} to {high:.2f} m"
+    if _hidden(scene, [receiver.position_m for receiver in run.receivers], height_m > high):
+        raise InputError(f"{run.folder}: {text}; give a height in between")
+    logger.warning("%s", text)  # as above the roofs of a city
+
+
+def warn_of_points_outside(run: Run, positions_m: FloatArray, tx_pos_m: FloatArray) -> None:
+    """Warn of positions [m, 3] outside of the box around a run's scene, or around its data, metres."""
+    low, high = area_of(run, tx_pos_m)
+    outside = np.count_nonzero(((positions_m < low) | (positions_m > high)).any(axis=1))
+    if outside:
+        what = "data, so values are extrapolated" if run.problem.opened_scene is None else "scene"
+        logger.warning("%d of %d points of the surface lie outside of the %s", outside, len(positions_m), what)
+
+
+def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
+    """Whether a surface lies above, or below, every one of some positions [3], metres."""
+    import mitsuba as mi
+
+    from ..backend.device import to_vectors
+
+    up = 1 if above else -1
+    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.devices.before_walls`).
+    start = np.stack(positions_m) - np.array([0.0, 0.0, up * MOUNTED_M])
+    ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
+    return bool(np.all(np.array(scene.mi_scene.ray_test(ray), bool)))

@@ -15,7 +15,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..runs.folder import load_rows
 from ..runs.run import Run
-from .grid import Grid, area_of, grid_over, usual_height
+from .grid import Grid, area_of, check_height, grid_over, usual_height
 
 STEP_M = 0.25
 """Least distance of neighbouring candidates by default."""
@@ -74,7 +74,9 @@ def candidates_of(run: Run, step_m: float | None = None, height_m: float | None 
     low, high = area_of(run, known)
     if step_m is None:
         step_m = max(STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL)))
-    grid = grid_over(low, high, step_m, usual_height(run, known) if height_m is None else height_m)
+    height = usual_height(run, known) if height_m is None else height_m
+    check_height(run, height, known)
+    grid = grid_over(low, high, step_m, height)
     inside = np.ones(len(grid.x_m) * len(grid.y_m), bool) if scene is None else inside_scene(scene, grid.positions_m)
     if not inside.any():
         remedy = "give another --height" if height_m is not None else "give --height"

@@ -38,6 +38,7 @@ from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
 from ..tracing.corrected_scene import check_materials, write_corrected_scene
+from ..tracing.effects import without_effect
 from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.polarization import warn_of_cross_polarization
 from ..tracing.result import join_traces
@@ -305,9 +306,36 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
         return replace(settings, **json.loads(path.read_text())["options"])
 
 
+def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse a phase error that has no effect, and warn of other settings that have none.
+
+    Raises:
+        InputError: naming the setting.
+    """
+    settings, record = problem.settings, problem.record
+    idle = without_effect(settings.options)
+    if settings.phase_error and not task_of(record).image:
+        idle["phase_error"] = f"spectra alone are expectations, and {record.name} holds {record.task}"
+    if "phase_error" in idle:
+        raise InputError(f"phase_error {settings.phase_error:g}: without effect, as {idle['phase_error']}; omit it")
+    # The seed is also that of the split, which draws rows unless all official ones are used.
+    if record.official is None or any(set(split.all_train) != set(record.official[0]) for split in splits):
+        idle.pop("seed", None)
+    default = TracingSettings()
+    if settings.target_error_db is None:
+        target = {"target_kinds": "target_error_db is not set"}
+    else:
+        target = {name: "target_error_db chooses it" for name in ("max_depth", "rays")}
+        idle.pop("scattering_coefficient", None)
+    idle |= {name: why for name, why in target.items() if getattr(settings, name) != getattr(default, name)}
+    for name, reason in idle.items():
+        logger.warning("%s=%s has no effect: %s", name, getattr(settings, name), reason)
+
+
 def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
     settings, carriers = problem.settings, problem.record.carriers_hz
+    _check_effects(problem, splits)
     if carriers is not None:
         if settings.target_error_db is not None:
             text = "target_error_db serves one carrier; omit it"

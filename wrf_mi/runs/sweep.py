@@ -35,10 +35,12 @@ from .results import write_csv
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset", "receiver"),
-    *("paths", "depth", "reflections", "rays", "calibrate"),
+    *("paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
+FLAGS = ("deterministic", "intervals")
+"""Options without a value that may vary: ``true`` gives them."""
 FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"
@@ -97,8 +99,8 @@ def plan_sweep(
 
     Args:
         out: folder of the sweep.
-        vary: ``KEY=VALUE,VALUE,...`` each; a key is one of `OPTIONS` or a setting as for ``--set``. Where a value has
-            commas, semicolons separate the values.
+        vary: ``KEY=VALUE,VALUE,...`` each; a key is one of `OPTIONS`, one of `FLAGS` with ``true`` and ``false``, or a
+            setting as for ``--set``. Where a value has commas, semicolons separate the values.
         options: options of all runs, keys from `OPTIONS`.
         settings: ``KEY=VALUE`` of all runs.
         flags: further arguments of all runs, such as ``--deterministic``.
@@ -108,6 +110,7 @@ def plan_sweep(
     """
     choices: dict[str, list[str]] = {}
     fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
+    fixed |= {flag.removeprefix("--") for flag in flags}
     for text in vary:
         key, equals, listed = (part.strip() for part in text.partition("="))
         values = [value.strip() for value in listed.split(";" if ";" in listed else ",")]
@@ -117,6 +120,8 @@ def plan_sweep(
             raise InputError(f"--vary {text}: {key} is given already; give it once")
         if len(set(values)) < len(values):
             raise InputError(f"--vary {text}: a value is given twice; leave it out")
+        if key in FLAGS and not set(values) <= {"true", "false"}:
+            raise InputError(f"--vary {text}: {key} is on or off; give true, false")
         choices[key] = values
     if not choices:
         raise InputError("sweep: nothing varies; give --vary KEY=VALUE,VALUE,... once or more")
@@ -130,9 +135,10 @@ def plan_sweep(
         given = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
         dataset = [given.pop("dataset")] if "dataset" in given else []
         arguments = [part for key, value in given.items() for part in (f"--{key}", value)]
-        stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in OPTIONS)]
+        switched = [f"--{key}" for key, value in varied.items() if key in FLAGS and value == "true"]
+        stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in (*OPTIONS, *FLAGS))]
         set_all = [part for setting in stated for part in ("--set", setting)]
-        runs[name] = SweepRun(Path(out) / name, varied, ("train", *dataset, *arguments, *flags, *set_all))
+        runs[name] = SweepRun(Path(out) / name, varied, ("train", *dataset, *arguments, *flags, *switched, *set_all))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
     return Sweep(Path(out), shared, tuple(runs.values()))
 

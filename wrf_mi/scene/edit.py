@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from .edit_checks import check_moves
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
 from .surfaces import KINDS, Kind, Surface, mesh_parts, moved
@@ -99,6 +100,8 @@ def edit_scene(
 ) -> Path:
     """Write a scene with parts moved or removed; materials stay.
 
+    Parts that are moved partly out of the scene, or into other surfaces, are named in the log with the distance.
+
     Args:
         folder: scene folder.
         out: scene folder to make.
@@ -110,18 +113,25 @@ def edit_scene(
         The new folder.
 
     Raises:
-        InputError: not a scene folder, a name that no surface has, nothing to change, no surface left, or an existing
-            folder.
+        InputError: not a scene folder, a name that no surface has, nothing to change, a part that is moved and removed
+            or moved out of the scene, no surface left, or an existing folder.
     """
     surfaces, materials = read_surfaces(folder)
     if not moves and not remove:
         raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
+    stated, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
+        text = f"move {','.join(move.parts)}"
+        if not any(move.shift_m) and not move.turn_deg % 360:
+            raise InputError(f"{text}: by 0 m and {move.turn_deg:g} degrees changes nothing; omit it")
+        if both := sorted(names & gone):
+            raise InputError(f"{text}: {both[0]} is also removed; omit one of the two")
         matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
         surfaces = [moved([one], matrix)[0] if one.name in names else one for one in surfaces]
-    gone = _chosen(folder, surfaces, remove)
+        moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
+    check_moves(stated, left, moved_names)
     kept = {surface.name: materials.surfaces[surface.name] for surface in left}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]

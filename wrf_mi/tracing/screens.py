@@ -18,8 +18,8 @@ ENLARGED = 4e-5
 """Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are
 displaced (`wrf_mi.tracing.images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
 OVERLAP = 5e-7
-"""The same at edges at which a face goes on in another: eight times the rounding of a coordinate in single precision, by
-which edges of enlarged faces do not match."""
+"""The same at edges at which a face goes on in another: eight times the rounding of a coordinate in single precision,
+by which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""

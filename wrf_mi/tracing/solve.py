@@ -19,6 +19,7 @@ from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from .buffer import Legs, join
 from .devices import before_surfaces, check_devices, clear_m
+from .estimate import check_search
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
@@ -112,6 +113,7 @@ class Prepared:
         """Sequences of planes that rays from points [s, 3] meet."""
         key = sources_m.tobytes(), options, rays
         if key not in self._chains:
+            check_search(options, rays, len(sources_m))
             self._chains[key] = self.new_chains(sources_m, options, rays, options.seed)
         return self._chains[key]
 

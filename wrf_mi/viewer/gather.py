@@ -38,6 +38,7 @@ class _Gathered:
     titles: list[str] = field(default_factory=list)
     scene: tuple[Any, dict[str, str]] | None = None
     stored_m: FloatArray | None = None
+    material_used: bool = False
 
     def add(self, source: Source) -> None:
         """Add a source, by its kind."""
@@ -59,6 +60,7 @@ class _Gathered:
             self.on_stage("opening the scene", 0.0)
             self.titles.append(Path(source).name)
             self._take_scene(*read_scene(source, self.material))
+            self.material_used = True
 
     def _add_map(self, source: Any) -> None:
         found, notes = read_map(source)
@@ -138,6 +140,8 @@ def gather(
     found = _Gathered(options, material, on_stage, progress)
     for source in sources:
         found.add(source)
+    if material is not None and not found.material_used:
+        raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
     content = found.content
     if found.scene is not None:
         content.scene, note = scene_content(*found.scene)

@@ -7,7 +7,6 @@ import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from ..core import InputError
 from ..core.array_files import stored_arrays
+from ..maps.packages import require_packages
 from ..parallel import run_module
 from .content import MapContent
 
@@ -48,8 +48,7 @@ def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
     if not isinstance(source, str | Path):
         return map_content(source, "map")
     path = Path(source)
-    if find_spec("xarray") is None:
-        raise InputError(f"{path}: maps need xarray; install it: pip install 'wrf-mi[view]'")
+    require_packages(path, "view")
     if not path.exists():
         raise InputError(f"{path}: no such file; give a map made by wrf-mi map")
     with tempfile.TemporaryDirectory() as folder:

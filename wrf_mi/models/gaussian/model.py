@@ -6,8 +6,9 @@ calibrates `wrf_mi.models.ray_tracing`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import astuple, replace
+from dataclasses import astuple, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from ...training.targets import form_of, plan_rows, targets_of
 from ...training.trainer import Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
+
+logger = logging.getLogger(__name__)
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
 PARAM = "param/"
@@ -173,7 +176,12 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trai
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse settings, files and scenes that a training would refuse."""
+    """Refuse settings, files and scenes that a training would refuse; warn of settings of paths without a scene."""
+    traced, default = problem.settings.traced, TrainConfig().traced
+    if problem.scene is None and traced != default:
+        names = [field.name for field in fields(traced)]
+        changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
+        logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
     for split in splits:
         record, rows = trained_part(problem.record, split)
         known, scene = rows.all_train, _scene(problem, rows)

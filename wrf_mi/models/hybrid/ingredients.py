@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ...core import InputError, Split
+from ...tasks import task_of
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..model import Model, Problem, default_settings
@@ -22,12 +23,14 @@ class Ingredient:
         model: name of the model.
         scene: whether it is given the scene; then it needs one.
         settings: ``key=value`` that differ from its defaults.
+        of_spectra: further ones where the data are spectra.
         default: whether it is mixed where `HybridSettings.ingredients` names none.
     """
 
     model: str
     scene: bool = False
     settings: tuple[str, ...] = ()
+    of_spectra: tuple[str, ...] = ()
     default: bool = True
 
 
@@ -39,7 +42,7 @@ INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
     "physics-no-mesh": Ingredient("physics"),
-    "ray-tracing": Ingredient("ray-tracing", scene=True, settings=(*TRANSMISSION, PHASE_ERROR)),
+    "ray-tracing": Ingredient("ray-tracing", scene=True, settings=TRANSMISSION, of_spectra=(PHASE_ERROR,)),
     "surface": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials,surface", *TRANSMISSION)),
     "trees": Ingredient("trees"),
     "mri": Ingredient("mri"),
@@ -104,7 +107,8 @@ def _problem(problem: Problem, ingredient: Ingredient) -> tuple[Model, Problem]:
         raise InputError(f"ingredient {ingredient.model}: needs a scene; give --scene SCENE")
     chosen = entry.serving(record.task, ingredient.scene)
     given = {"model": ingredient.model, "seed": problem.seed}
-    settings = default_settings(chosen, ingredient.settings, given)
+    stated = (*ingredient.settings, *(ingredient.of_spectra if task_of(record).image else ()))
+    settings = default_settings(chosen, stated, given)
     scene = problem.scene if ingredient.scene else None
     material = problem.material if ingredient.scene else None
     return chosen, replace(problem, dataset=record, settings=settings, scene=scene, material=material)

@@ -1,0 +1,140 @@
+"""Options that change nothing beside the others are refused, or named in a warning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from calling import call, refused
+
+from wrf_mi.models.hybrid.ingredients import INGREDIENTS, problems
+from wrf_mi.models.model import Problem
+from wrf_mi.models.ray_tracing import TracingSettings
+from wrf_mi.runs.api import plan_run, train
+from wrf_mi.scene.make import make_scene
+from wrf_mi.tracing import TraceOptions
+from wrf_mi.tracing.effects import without_effect
+
+DIRECT = {"reflection": False, "max_depth": 0}
+
+
+@pytest.fixture(scope="module")
+def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flat's plan, extruded."""
+    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+@pytest.mark.parametrize(
+    ("settings", "idle"),
+    [
+        ({}, set()),
+        (DIRECT, set()),
+        ({"reflection": False}, set()),
+        ({"reflection": False, "max_depth": 5}, {"max_depth"}),
+        ({"reflection": False, "transmission": True, "max_depth": 5}, set()),
+        ({"reflection": False, "transmission": True, "max_reflections": 1}, {"max_reflections"}),
+        ({"reflection": False, "diffraction": True, "rays": 1 << 12, "seed": 7}, set()),
+        ({"reflection": False, "transmission": True, "rays": "auto", "seed": 7}, {"rays", "seed"}),
+        (DIRECT | {"transmission": True, "scattering": True}, {"transmission", "scattering"}),
+        ({"max_reflections": 4}, {"max_reflections"}),
+        ({"max_reflections": 2, "max_depth": 6, "transmission": True}, set()),
+        ({"max_reflections": 0, "rays": 64}, {"rays"}),
+        ({"scattering_coefficient": 0.5}, {"scattering_coefficient"}),
+        ({"scattering_coefficient": 0.5, "scattering": True}, set()),
+        (DIRECT | {"phase_error": 1.0}, {"phase_error"}),
+        ({"phase_error": 1.0}, set()),
+    ],
+)
+def test_settings_of_kinds_of_path_that_are_not_traced_have_no_effect(settings: dict[str, Any], idle: set[str]) -> None:
+    assert set(without_effect(TraceOptions(**settings))) == idle
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--phase-error", "1"], "phase_error 1: without effect, as spectra alone are expectations, and .* holds rssi"),
+        (["--calibrate", "gain", "--scheduler", "local:1"], "omit --scheduler"),
+        (["--material", "concrete"], "radio materials of its own"),
+        (["--target-error", "1", "--depth", "3"], "give one of them"),
+    ],
+)
+def test_options_of_trace_without_effect_are_refused(
+    arguments: list[str], message: str, flat_folder: Path, room: Path, tmp_path: Path, capsys: Any
+) -> None:
+    refused(["trace", room, flat_folder, *arguments, "--out", tmp_path / "run"], message, capsys)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "seed", "warned"),
+    [
+        ({"settings": TracingSettings(**DIRECT, rays=64)}, 0, ["rays=64 has no effect: no reflection"]),
+        ({"settings": TracingSettings(**DIRECT, seed=3)}, 3, ["seed=3 has no effect: no reflection"]),
+        ({"settings": TracingSettings(**DIRECT, seed=3), "split": "random"}, 3, []),
+        ({"settings": TracingSettings(target_kinds="")}, 0, ["target_kinds= has no effect: target_error_db"]),
+        (
+            {"settings": TracingSettings(target_error_db=1.0, max_depth=5, rays=64)},
+            0,
+            [
+                "max_depth=5 has no effect: target_error_db chooses it",
+                "rays=64 has no effect: target_error_db chooses it",
+            ],
+        ),
+        ({"settings": TracingSettings(max_depth=5)}, 0, []),
+    ],
+)
+def test_settings_of_ray_tracing_without_effect_are_named(
+    settings: dict[str, Any], seed: int, warned: list[str], flat_folder: Path, room: Path, caplog: Any
+) -> None:
+    plan_run(flat_folder, "ray-tracing", scene=room, seed=seed, **settings)
+    found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(found) == len(warned)
+    assert all(one.startswith(start) for one, start in zip(found, warned, strict=True)), found
+
+
+def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: Any) -> None:
+    plan_run(flat_folder)
+    assert caplog.text == ""
+    plan_run(flat_folder, settings=["traced.depth=5", "traced.rays=64"])
+    assert "traced.depth, traced.rays: no effect without a scene" in caplog.text
+
+
+def test_hybrid_of_strengths_traces_without_a_phase_error(flat_folder: Path, room: Path) -> None:
+    assert INGREDIENTS["ray-tracing"].of_spectra
+    problem = Problem(flat_folder, None, scene=str(room))
+    entry, found = problems(problem, ["ray-tracing"])["ray-tracing"]
+    assert found.settings.phase_error == 0
+    assert found.settings.transmission
+    entry.check(found, [])
+
+
+def test_other_commands_refuse_or_name_options_without_effect(
+    flat_folder: Path, room: Path, tmp_path: Path, capsys: Any, caplog: Any
+) -> None:
+    run = train(flat_folder, tmp_path / "run", "kriging").folder
+    positions = tmp_path / "positions.csv"
+    positions.write_text("x,y,z\n1,1,1\n")
+    predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]
+    refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging", capsys)
+    refused(["evaluate", run, "--no-operator"], "--no-operator belongs to learned fields", capsys)
+    correct = ["correct", room, flat_folder, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
+    refused(correct, "--shift-sd: of planes and frame, which --fit materials,gain leaves", capsys)
+    refused(["edit", room, "--replace"], "--out", capsys)
+    view = ["view", run, "--material", "concrete", "--out", tmp_path / "view.html"]
+    refused(view, "material concrete: of a bare mesh, and no source is one", capsys)
+    paths = ["export", room, "--format", "paths", "--tx", "1,1,1", "--rx", "2,1,1", "--frequency", "1e9"]
+    paths += ["--out", tmp_path / "paths.csv"]
+    for more, option in (
+        (["line-of-sight", "--depth", "2"], "--depth"),
+        (["line-of-sight,scattering", "--depth", "0"], "--paths scattering"),
+    ):
+        caplog.clear()
+        assert call([*paths, "--paths", *more], capsys)[0] == 0
+        assert f"{option} has no effect: " in caplog.text
+    status, _, err = call(
+        ["map", run, "--step", "2", "--threshold", "-60", "--json", "--out", tmp_path / "m.nc"], capsys
+    )
+    assert status == 0
+    assert "no coverage: the model states no standard deviation" in err
+    assert not (tmp_path / "corrected").exists()
