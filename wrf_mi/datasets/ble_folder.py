@@ -84,7 +84,6 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     runs = attempt(_runs, tables)
     strengths = [attempt(_signal_strength, table, ids) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
-    attempt(_refuse_silent, folder / TRAINING, ids, strengths)
     stop_at_faults()
     n_train, n_test = (len(table.value.rows) for table in tables)
     height = stated["z"].value
@@ -219,14 +218,6 @@ def _tx_antenna(anchors: CsvTable) -> Antenna:
             remedy = "there is one transmitter: state the same in every row"
             refuse(DataFault(anchors.path, f"{text}; {remedy}", row=row))
     return first
-
-
-def _refuse_silent(path: Path, ids: list[str], strengths: list[NDArray[np.float32]]) -> None:
-    """Refuse anchors that received nothing."""
-    silent = np.isnan(np.concatenate(strengths, axis=1)).all(axis=1)
-    for anchor in np.flatnonzero(silent):
-        text = f"{RSSI}{ids[anchor]} is empty in every row, in {TEST} too; remove the anchor and its columns"
-        refuse(DataFault(path, text))
 
 
 def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:

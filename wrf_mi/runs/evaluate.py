@@ -38,6 +38,8 @@ Scores = tuple[dict[str, Any], dict[str, Any]]
 
 NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
+LEFT_OUT = "receivers_left_out"
+"""Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
 """Arrays of ``predictions.npz`` without an axis of receivers."""
 REPEATS = 20
@@ -208,8 +210,9 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
 
 
 def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str, Any]:
-    known = {"model": config.model, "dataset": config.dataset, "split": config.split, "seed": config.seed}
+    known: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
     known |= {} if config.scene is None else {"scene": config.scene}
+    known |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}
     # The peak of the fit, if it is stored already.
     memory_mb = stored_metrics(folder).get("peak_memory_mb", peak_memory_mb())
     seconds = sum(part.seconds for part in parts)

@@ -227,6 +227,11 @@ class Kriging(CovarianceSettings):
         if not free.any():
             return value[:-1], float(value[-1])
         root = component_root(field[rows])
+        if not root.any() and not columns.shape[1]:
+            # The trend that was fitted before passes through every row, as through any two: there is no field, whose
+            # correlations would count.
+            value[free] = np.array(first)[free]
+            return value[:-1], float(value[-1])
         if not root.any():
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
 
