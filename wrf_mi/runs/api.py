@@ -135,7 +135,6 @@ def plan_run(
     # Without training rows the split keeps them for the references, which need some.
     record, splits, left_out = _split_rows(record, split, seed, None if scene_only else n_train)
     for rows in splits:
-        check_rows(rows, record, f"split {rows.name}")
         check_held_receivers(record, rows, chosen, MODELS.values())
         check_observations(record, rows, complete=chosen.complete)
     problem = Problem(record, found, seed, scene_name, material, antennas, not scene_only)
@@ -153,6 +152,8 @@ def _split_rows(
 ) -> tuple[Record, list[Split], dict[str, int]]:
     """Record without receivers that have too few training rows, its splits, and those receivers' numbers of rows."""
     left_out: dict[str, int] = {}
+    if isinstance(split, Split):
+        check_rows(split, record, f"split {split.name}")
     # Receivers are held out of those that have enough rows in the split of rows that lies below.
     below = () if isinstance(split, Split) else splits_below(record, split)
     for rule in (*below, split):

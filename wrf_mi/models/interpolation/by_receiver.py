@@ -18,8 +18,10 @@ from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import FitSession
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
-HEADING, CARRIERS = "heading", "carriers_hz"
-"""Keys of the arrays: whether headings are used, and the carriers where there are several."""
+HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
+"""Keys of the arrays: whether headings are used, and where there are several carriers these, and numbers of models that
+there are not.
+"""
 
 
 class Single(Protocol):
@@ -125,6 +127,7 @@ class ByReceiver(Fitted):
         arrays = {HEADING: np.asarray(self.heading)}
         if self.carriers_hz is not None:
             arrays[CARRIERS] = self.carriers_hz
+            arrays[WITHOUT] = np.array([number for number, model in enumerate(self.models) if model is None], np.int64)
         for number, model in enumerate(self.models):
             arrays |= {} if model is None else keyed(f"{number}/", model.arrays())
         return arrays
@@ -180,8 +183,11 @@ def model_by_receiver(
     def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:
         carriers = arrays.get(CARRIERS)
         receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
-        stored = [under(f"{number}/", arrays) for number in range(len(receivers))]
-        models = [load_single(one, found) if found else None for one, found in zip(receivers, stored, strict=True)]
+        without = arrays.get(WITHOUT, np.zeros(0, np.int64))
+        models = [
+            None if number in without else load_single(receiver, under(f"{number}/", arrays))
+            for number, receiver in enumerate(receivers)
+        ]
         return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
 
     how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}

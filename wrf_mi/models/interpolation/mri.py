@@ -65,7 +65,7 @@ def _fit(
     if problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
         return PathLoss(receiver.position_m, _shared_law(problem.record, split.all_train))
     received = ~np.isnan(observed)
-    if len(problem.record.receivers) > 1 and not np.ptp(columns[received, 1]) > 0:
+    if np.ptp(tx_pos, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
         # Rows at a single distance state a level but no exponent, which is that of all receivers.
         _, slope = _shared_law(problem.record, split.all_train)
         level = float(np.mean(observed[received] - slope * columns[received, 1]))
