@@ -40,6 +40,7 @@ def test_correct_data(flat: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "faults": [],
         "suspicions": [],
         "skipped": [],
+        "notes": [],
     }
 
 

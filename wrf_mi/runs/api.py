@@ -47,6 +47,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
+from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
@@ -247,6 +248,7 @@ def train(
     fit: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
     fit["intervals"] = intervals
     problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
+    warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out)
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
