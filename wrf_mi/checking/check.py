@@ -8,7 +8,6 @@ from pathlib import Path
 
 from ..core import InputError, Record
 from ..datasets.faults import collect_faults
-from ..datasets.layouts import is_data
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
@@ -121,8 +120,9 @@ def _path(dataset: str | Path) -> Path | None:
     Raises:
         InputError: there is no such data set.
     """
-    if isinstance(dataset, str) and not is_data(Path(dataset)) and known(dataset).base_url is None:
-        return locate(dataset)
+    is_name = isinstance(dataset, str) and Path(dataset).name == dataset and not Path(dataset).exists()
+    if is_name and known(str(dataset)).base_url is None:
+        return locate(str(dataset))
     return find(dataset)[0]
 
 

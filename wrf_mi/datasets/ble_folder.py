@@ -40,6 +40,7 @@ from .folder_files import (
     write_csv,
     write_extra,
 )
+from .unknown import Table, long_columns, table_text
 
 logger = logging.getLogger(__name__)
 
@@ -349,5 +350,8 @@ def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
     if unknown or lacking:
         text = f"{len(columns)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
-        raise DataFault(table.path, f"{text} ({which}); give one column per anchor, named by its id")
+        remedy = "give one column per anchor, named by its id"
+        if not columns and long_columns(table.header):
+            remedy = table_text(Table(table.path.name, tuple(table.header)))
+        raise DataFault(table.path, f"{text} ({which}); {remedy}")
     return np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids]).astype(np.float32)
