@@ -58,6 +58,14 @@ def test_a_number_that_each_receiver_has_once_shows_in_all_together() -> None:
     assert "hall 1.9 % (1 of 52 rows), stairs 1.9 % (1 of 52 rows), lab 1.9 % (1 of 52 rows)" in text
 
 
+@pytest.mark.parametrize("mark", [-200, 0, 100])
+def test_a_receiver_that_states_it_in_every_row_is_named_with_the_others(mark: float) -> None:
+    record = marked(0.3, mark, 0)
+    record.observation[2] = mark
+    ((_, text),) = list(not_heard(record))
+    assert "hall 31 % (16 of 52 rows), lab 100 % (52 of 52 rows)" in text
+
+
 def test_several_numbers_are_named_each() -> None:
     record = marked(0.2, -200, 0)
     record.observation[1, :9] = 100

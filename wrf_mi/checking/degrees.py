@@ -36,10 +36,10 @@ def degrees(record: Record) -> Found:
     if not known:
         return
     both = np.concatenate(list(known.values()))
-    found = ["receivers and transmitters"] if len(known) == 2 and _is_in_degrees(both) else []
-    if not found and (len(known) == 1 or _apart_m(*known.values()) >= APART_M):
-        found = [what for what, xy in known.items() if _is_in_degrees(xy)]
-    for what in found:
+    in_degrees = ["receivers and transmitters"] if len(known) == 2 and _is_in_degrees(both) else []
+    if not in_degrees and (len(known) == 1 or _apart_m(*known.values()) >= APART_M):
+        in_degrees = [what for what, xy in known.items() if _is_in_degrees(xy)]
+    for what in in_degrees:
         xy = known.get(what, both)
         low, high = xy.min(axis=0), xy.max(axis=0)
         order = "longitude, latitude" if np.abs(high[1]) <= LATITUDE else "latitude, longitude"

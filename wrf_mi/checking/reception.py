@@ -69,9 +69,9 @@ def not_heard(record: Record) -> Found:
 
 
 def _strengths(record: Record) -> Found:
-    # Values that are all positive are on another scale, which `strength_scale` reports.
+    # Different values that are all positive are on another scale, which `strength_scale` reports.
     observed = [values[np.isfinite(values)].astype(float) for values in record.observation]
-    observed = [np.zeros(0) if is_above_0_dbm(values) else values for values in observed]
+    observed = [values[:0] if is_above_0_dbm(values) and np.ptp(values) else values for values in observed]
     by_receiver = [{value.dbm: value for value in suspicious_values(values)} for values in observed]
     # A number that each receiver has once or twice shows in all of them together.
     pooled = suspicious_values(np.concatenate(observed))
@@ -95,12 +95,12 @@ def _strengths(record: Record) -> Found:
 
 def suspicious_values(strengths_dbm: FloatArray) -> list[Value]:
     """Values that stand for "not heard" among strengths [n] of a receiver, one after the other without those before."""
-    found: list[Value] = []
+    suspicious: list[Value] = []
     remaining = strengths_dbm
-    while len(found) < MOST_VALUES and (value := _next_value(remaining)) is not None:
-        found.append(value)
+    while len(suspicious) < MOST_VALUES and (value := _next_value(remaining)) is not None:
+        suspicious.append(value)
         remaining = remaining[remaining != value.dbm]
-    return found
+    return suspicious
 
 
 def _next_value(strengths_dbm: FloatArray) -> Value | None:
@@ -147,7 +147,7 @@ def _named_counts(record: Record, counts: IntArray, received: IntArray) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+    return f"{100 * share:.3g} %" if share >= 0.995 else f"{100 * share:.2g} %"
 
 
 def few_rows(record: Record) -> Found:

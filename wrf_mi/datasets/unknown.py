@@ -62,20 +62,20 @@ def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
     content = sorted(path.iterdir())
     if not content:
         return DataFault(path, f"an empty folder; {WANTED}")
-    held = f"holds {_listed([file.name for file in content])} and is no data set itself"
+    holding = f"holds {_listed([file.name for file in content])} and is no data set itself"
     if inner:
-        return DataFault(path, f"{held}; give {one_line(inner[0])}")
+        return DataFault(path, f"{holding}; give {one_line(inner[0])}")
     tables = [table for file in content if file.is_file() and (table := _read_header(file)) is not None]
     tables.sort(key=lambda table: long_columns(table.header) is None)  # tables of single readings first
-    return DataFault(path, f"{held}; {table_text(tables[0]) if tables else WANTED}")
+    return DataFault(path, f"{holding}; {table_text(tables[0]) if tables else WANTED}")
 
 
 def table_text(table: Table) -> str:
     """What a table lacks as signal strengths, and how a table of single readings is pivoted."""
     columns = f"{table.name} has the columns {_listed(table.header)}"
-    if (found := long_columns(table.header)) is None:
+    if (columns_of_readings := long_columns(table.header)) is None:
         return f"{columns}; {TABLE}"
-    receiver, strength, index = found
+    receiver, strength, index = columns_of_readings
     separated = "" if table.separator == "," else f", sep={table.separator!r}"
     pivot = f"pivot_table(index={index}, columns={receiver!r}, values={strength!r})"
     code = f"pandas.read_csv({table.name!r}{separated}).{pivot}.add_prefix('rssi_').reset_index()"
@@ -85,8 +85,8 @@ def table_text(table: Table) -> str:
 def long_columns(header: Sequence[str]) -> tuple[str, str, list[str]] | None:
     """Columns of receivers and strengths and those of the positions in a table with a row for each reading, or None."""
     words = {column: set(re.findall("[a-z]+", column.lower())) for column in header}
-    strengths = [column for column, found in words.items() if found & STRENGTH]
-    receivers = [column for word in RECEIVER for column, found in words.items() if word in found]
+    strengths = [column for column, parts in words.items() if parts & STRENGTH]
+    receivers = [column for word in RECEIVER for column, parts in words.items() if word in parts]
     receivers = [column for column in receivers if column not in strengths]
     if len(strengths) != 1 or not receivers:
         return None

@@ -58,7 +58,9 @@ def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> di
     gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
     # More than the standard error, so that chance seldom passes for a gain, and more than the last digit that is shown,
     # so that predicting all but zero does not either.
-    beaten = gain > max(error, 10.0**-task.digits)
+    clear = gain > max(error, 10.0**-task.digits)
+    # The median is the score that tables show first.
+    beaten = clear and sign * float(np.nanmedian(scores) - np.nanmedian(constant)) > 0
     return {**summary(constant + 0.0), "gain": gain, "gain_error": error, "beaten": beaten}
 
 
@@ -68,7 +70,8 @@ def unbeaten(metrics: dict[str, Any]) -> str | None:
     if block is None or block["beaten"]:
         return None
     task = TASKS[metrics["task"]]
-    means = f"mean {task.label} {metrics[task.block]['mean']:.3f} against {block['mean']:.3f}"
+    of_model = metrics[task.block]
+    both = [f"{key} {of_model[key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
     gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
     what = f"{metrics['model']} is no better than predicting {task.constant_words}"
-    return f"{what}: {means} ({gain}); see docs/data.md, Scores"
+    return f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores"

@@ -75,9 +75,9 @@ class TraceResult:
 
     def of_receivers(self, which: IntArray) -> TraceResult:
         """The trace of the receivers of ascending indices ``which`` [n]."""
-        found = self.select(np.isin(self.paths.rx, which))
-        paths = replace(found.paths, rx=np.searchsorted(which, found.paths.rx), n_rx=len(which))
-        return replace(found, paths=paths, receivers=tuple(self.receivers[number] for number in which))
+        selected = self.select(np.isin(self.paths.rx, which))
+        paths = replace(selected.paths, rx=np.searchsorted(which, selected.paths.rx), n_rx=len(which))
+        return replace(selected, paths=paths, receivers=tuple(self.receivers[number] for number in which))
 
     def legs(self, surfaces: Surfaces) -> Legs:
         """The paths in the direction of the search, for Sionna RT.

@@ -187,7 +187,8 @@ class Kriging(CovarianceSettings):
         circle = None if heading is None else _circle(heading)
         columns = self.trend(positions)
         if len(y) < columns.shape[1]:
-            raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
+            text = f"kriging: training rows received: {len(y)}; its trend needs {columns.shape[1]}"
+            raise InputError(f"{text}, so give more rows or a constant trend")
         field, ordinary = y, None
         if self.trend_fit == "ols":
             # The field is the residual of the least-squares trend, which is taken as known from here on.
