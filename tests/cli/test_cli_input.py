@@ -86,7 +86,10 @@ def test_bad_data_and_folders_are_refused(
         (["train", folder], "train needs DATASET and --out RUN"),
         (["train", "nowhere", "--out", tmp_path / "out"], "nowhere"),
         (["train", "rfid-lab", "--out", tmp_path / "out"], "wrf-mi data fetch rfid-lab"),
-        (["train", tmp_path / "empty", "--out", tmp_path / "out"], "gateway_info.yml: missing"),
+        (
+            ["train", tmp_path / "empty", "--out", tmp_path / "out"],
+            "empty: an empty folder; a data set is a folder with anchors.csv",
+        ),
         (["train", folder, "--out", folder], "exists and is not empty; choose another --out"),
         (["train", folder, "--out", tmp_path / "file", *SET], "file: exists and is not empty"),
         (["train", folder, "--out", tmp_path / "file" / "out", *SET], r"file.*; choose another place"),

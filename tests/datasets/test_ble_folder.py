@@ -107,14 +107,7 @@ def heights(training: str, test: str):
 TRAIN_FILE, TEST_FILE = "calibration_df.csv", "test_robot_df.csv"
 
 
-def deaf(folder: Path) -> None:
-    """Take all that anchor 3 received away."""
-    (folder / TRAIN_FILE).write_text("x,y,heading,rssi_1,rssi_3\n0,0,0,-50,\n1,1,0,-51,nan\n")
-    (folder / TEST_FILE).write_text("x,y,heading,rssi_1,rssi_3\n0,0,0,-50,\n")
-
-
 WRONG = {
-    "deaf anchor": (deaf, TRAIN_FILE, r"rssi_3 is empty in every row, in test_robot_df\.csv too; remove the anchor"),
     "no anchors file": (remove("anchors.csv"), "anchors.csv", "missing"),
     "no training rows file": (remove(TRAIN_FILE), TRAIN_FILE, "missing"),
     "no test rows file": (remove(TEST_FILE), TEST_FILE, "missing"),

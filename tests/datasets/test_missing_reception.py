@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from calling import call, refused
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Split
 from wrf_mi.datasets import load
 from wrf_mi.models import ray_tracing
 from wrf_mi.runs import api as runs
@@ -49,32 +49,43 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("model", ["ray-tracing", "physics", "physics without a mesh", "mri"])
-def test_a_gateway_without_training_rows_is_refused_before_anything_is_done(
-    model: str, silent: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_gateway_without_training_rows_is_left_out(
+    model: str, silent: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    out = tmp_path / "run"
-    asked: list[Any] = ["train", silent, "--model", model.split()[0], "--out", out]
-    asked += ["--scene", room] if model in ("ray-tracing", "physics") else []
-    message = f"{silent}, receiver far: received none of {TRAINED} training rows; leave it out or use another split"
-    refused(asked, message, capsys)
-    assert not out.exists()
+    settings, scene = (
+        (DIRECT if model == "ray-tracing" else ()),
+        (room if model in ("ray-tracing", "physics") else None),
+    )
+    left_out, alone = (
+        train(data, tmp_path / name, model.split()[0], scene=scene, settings=settings)
+        for name, data in (("run", silent), ("alone", load(silent).at_receivers([0])))
+    )
+    assert left_out.metrics["receivers_left_out"] == {"far": 0}
+    assert left_out.metrics["abs_error_db"] == alone.metrics["abs_error_db"]
+    (message,) = [record.message for record in caplog.records if record.name == "wrf_mi.datasets.observations"]
+    assert (
+        message == "silent: receivers with fewer than 2 training rows are left out, with their number of rows: far (0)"
+    )
 
 
-def test_every_split_is_checked(silent: Path, room: Path, tmp_path: Path) -> None:
-    """Rows that the second gateway received are in one block: where that is held out, none is left."""
+def test_data_without_any_received_training_row_are_refused_before_anything_is_done(
+    silent: Path, room: Path, tmp_path: Path
+) -> None:
     record = load(silent)
-    observation = record.observation.copy()
-    observation[1] = np.where(np.arange(ROWS) == 3, -60, np.nan)
-    object.__setattr__(record, "observation", observation)
+    record.observation[:, :3] = np.nan
+    split = Split("mine", 0, np.arange(3), np.zeros(0, np.int64), np.arange(3, 5))
     stages: list[str] = []
-    for start in (
-        lambda: train(record, tmp_path / "run", "ray-tracing", scene=room, settings=DIRECT, split="blocked"),
-        lambda: train(
-            record, tmp_path / "run", "physics", split="blocked", on_progress=lambda *said: stages.append(said[0])
-        ),
-    ):
-        with pytest.raises(InputError, match="receiver far: received none of"):
-            start()
+    message = r"nothing was received in the training rows by any receiver \(near, far\); use another split"
+    for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("physics", {})):
+        with pytest.raises(InputError, match=message):
+            train(
+                record,
+                tmp_path / "run",
+                model,
+                split=split,
+                on_progress=lambda *said: stages.append(said[0]),
+                **options,
+            )
         assert not (tmp_path / "run").exists()
     assert stages == []
 

@@ -149,11 +149,6 @@ WRONG = {
         "row 2: gateway2 is '1e39'; give a finite number of single pre",
     ),
     "power missing": (text(RSSI, "-61", ""), RSSI, "row 2: gateway2 is ''"),
-    "gateway without reception": (
-        lambda folder: (folder / RSSI).write_text("gateway1,gateway2\n" + "-50,-100\n" * 4) and None,
-        RSSI,
-        "column gateway2: every row is -100, so gateway gateway2 received nothing; remove it",
-    ),
     "one row": (one_row, POS, "1 row; give 2 at least"),
     "index out of range": (text("train_index.txt", "3", "4"), "train_index.txt", "row 4 is out of range.*rows 0 to 3"),
     "index of 5000 digits": (

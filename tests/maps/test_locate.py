@@ -127,7 +127,7 @@ def test_receivers_that_received_nothing_count_where_strength_decides_reception(
     places = candidates.positions_m[truth[keep]]
     record = record_of(places, value[:, keep], len(places) - 1)
     rows = np.array_split(np.arange(len(places)), 3)
-    parts = [Located(predicted, part, candidates.nearest(places[part])) for part in rows]
+    parts = [Located(predicted, np.arange(3), part, candidates.nearest(places[part])) for part in rows]
     silence = choose(record, parts, candidates, lambda share: None).likelihood.silence
     assert silence is not None
     assert abs(silence.middle_dbm + 54) < 3
@@ -147,7 +147,7 @@ def test_probability_of_silence_is_one_half_in_the_middle() -> None:
     assert (
         fit_silence(
             record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1),
-            [Located(law(room(), 3.0), np.arange(2), np.arange(2))],
+            [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2))],
         )
         is None
     )
@@ -242,7 +242,7 @@ def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None
         ("anchor0_dbm,anchor1_dbm\n-50,-60\n", "no column of receiver anchor2; name one anchor2_dbm"),
         ("rssi_0,rssi_1,rssi_2,rssi_9\n-5,-6,-7,-8\n", "rssi_9 names no receiver of the run"),
         ("rssi_0,rssi_1,rssi_2,anchor2_dbm\n-5,-6,-7,-8\n", "anchor2_dbm and rssi_2 are of one receiver"),
-        ("rssi_0,rssi_1,rssi_2\n-5,-6,-7\n,,\n", "row 2: no receiver received anything"),
+        ("rssi_0,rssi_1,rssi_2\n-5,-6,-7\n,,\n", "row 2: no receiver of the run received anything"),
         ("rssi_0,rssi_1,rssi_2\n-5,loud,-7\n", "row 1: rssi_1 is 'loud'"),
         ("rssi_0,rssi_1,rssi_2,x\n-5,-6,-7,1\n", "column x alone is no position"),
         ("rssi_0,rssi_1,rssi_2\n", "no rows below the header"),

@@ -253,7 +253,10 @@ def test_bad_calls_are_refused(
         ),
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
-        (["train", flat_folder, "--model", "kriging", *out, "--n-train", 1], "1 rows for a trend of 2 columns"),
+        (
+            ["train", flat_folder, "--model", "kriging", *out, "--n-train", 1],
+            "training rows received: 1; its trend needs 2, so give",
+        ),
         ([*train, "--scene", "x"], "mri on .*flat: takes no scene; omit --scene"),
         (
             [*train, "--preset", "quick"],

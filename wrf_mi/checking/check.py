@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from ..core import InputError, Record
 from ..datasets.faults import collect_faults
-from ..datasets.layouts import is_data
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
-from .building import at_vertices, building_file, inside_solids, need_packages, plan_against_walls, read_building
+from .degrees import degrees, far_from_origin
 from .directions import spectrum_axes
 from .distances import distance_law
+from .reception import few_rows, not_heard
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
 from .report import DataReport, Suspicion
 from .units import Found, channel_phase, heading_unit, position_unit, strength_scale
 
+logger = logging.getLogger(__name__)
+
 SUSPICIONS = {
     "headings": "headings in degrees, or clockwise",
     "positions": "positions in centimetres or millimetres",
+    "degrees": "longitudes and latitudes in degrees for metres",
+    "not-heard": "numbers for what was not heard among signal strengths, channels and spectra of zeros",
+    "few-rows": "receivers with too few training rows to be fitted",
     "strengths": "powers on a linear scale, or without their sign, for dBm",
     "channels": "channels that are magnitudes or decibels for complex coefficients",
     "spectrum-axes": "image rows or columns in another order or with another origin",
@@ -40,6 +46,8 @@ SUSPICIONS = {
 Check = Callable[[Record], Found]
 OF_VALUES: tuple[Check, ...] = (
     heading_unit,
+    not_heard,
+    few_rows,
     strength_scale,
     channel_phase,
     repeated_rows,
@@ -48,6 +56,8 @@ OF_VALUES: tuple[Check, ...] = (
     single_position,
 )
 """Suspicions about the values of a record."""
+WARNED: tuple[Check, ...] = (not_heard, degrees)
+"""Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
 OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
 """Suspicions about directions and distances, which need the unit of positions."""
 
@@ -87,13 +97,21 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
         return DataReport(name, source, None, tuple(faults), ())
     skipped: list[str] = []
     found = [suspicion for check in OF_VALUES for suspicion in check(record)]
-    wrong_unit = list(position_unit(record))
+    wrong_unit = list(degrees(record)) or list(position_unit(record))
     found += wrong_unit
-    if not wrong_unit or "positions" in ignore:
+    if all(name in ignore for name, _ in wrong_unit):
         found += [suspicion for check in OF_PLACES for suspicion in check(record)]
         found += _of_building(record, skipped)
     suspicions = tuple(Suspicion(name, text) for name, text in found if name not in ignore)
-    return DataReport(name, record.source, record, (), suspicions, tuple(skipped))
+    notes = tuple(note for note in (far_from_origin(record),) if note)
+    return DataReport(name, record.source, record, (), suspicions, tuple(skipped), notes)
+
+
+def warn_of_suspicions(record: Record) -> None:
+    """Log what a fit would learn as measured though it is not: numbers for "not heard", and degrees for metres."""
+    for check in WARNED:
+        for name, text in check(record):
+            logger.warning("%s: suspicion %s: %s (wrf-mi data check)", record.name, name, text)
 
 
 def _path(dataset: str | Path) -> Path | None:
@@ -102,13 +120,17 @@ def _path(dataset: str | Path) -> Path | None:
     Raises:
         InputError: there is no such data set.
     """
-    if isinstance(dataset, str) and not is_data(Path(dataset)) and known(dataset).base_url is None:
-        return locate(dataset)
+    is_name = isinstance(dataset, str) and Path(dataset).name == dataset and not Path(dataset).exists()
+    if is_name and known(str(dataset)).base_url is None:
+        return locate(str(dataset))
     return find(dataset)[0]
 
 
 def _of_building(record: Record, skipped: list[str]) -> Iterator[tuple[str, str]]:
     """Suspicions about positions in the building of the folder; adds the reason to ``skipped`` if it is not known."""
+    # Reads plans and meshes; other checks, which fits make too, start without these packages.
+    from .building import at_vertices, building_file, inside_solids, need_packages, plan_against_walls, read_building
+
     file = building_file(record.source) if record.source else None
     if file is None:
         return

@@ -73,7 +73,8 @@ def constant_observations(record: Record) -> Found:
             what = "received the same in every row; give what was measured, or leave the receiver out"
             yield "constant", f"receiver {receiver.name}: {what}"
         elif record.task == "spectrum":
-            blank = np.flatnonzero(values.min(axis=1) == values.max(axis=1))
+            # Spectra of zeros are reported as not heard.
+            blank = np.flatnonzero((values.min(axis=1) == values.max(axis=1)) & values.any(axis=1))
             if len(blank):
                 what = f"spectra of a single grey value in {named_rows(blank)}"
                 yield "constant", f"receiver {receiver.name}: {what}; give what was measured, or remove the rows"

@@ -37,6 +37,7 @@ class DataReport:
         faults: what the reader refuses, in the order in which it was found.
         suspicions: data that are likely wrong; only looked for where there is no fault.
         skipped: checks that could not be made, each with the reason.
+        notes: properties of the data that are no mistake, but count for some models.
     """
 
     dataset: str
@@ -45,6 +46,7 @@ class DataReport:
     faults: tuple[InputError, ...]
     suspicions: tuple[Suspicion, ...]
     skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -52,7 +54,7 @@ class DataReport:
         return not self.faults
 
     def lines(self, most: int = MOST_LINES) -> list[str]:
-        """A line for each fault, suspicion and skipped check, and a summary.
+        """A line for each fault, suspicion, skipped check and note, and a summary.
 
         Args:
             most: largest number of lines for faults of one kind in one file.
@@ -60,6 +62,7 @@ class DataReport:
         found = list(self._fault_lines(most))
         found += [f"suspicion {one.name}: {one.text}" for one in self.suspicions]
         found += [f"not checked: {text}" for text in self.skipped]
+        found += [f"note: {text}" for text in self.notes]
         if self.faults:
             summary = f"{_count(len(self.faults), 'fault')}; suspicions are looked for when there is none"
         else:
@@ -78,6 +81,7 @@ class DataReport:
             "faults": [_plain(fault) for fault in self.faults],
             "suspicions": [{"name": one.name, "text": one.text} for one in self.suspicions],
             "skipped": list(self.skipped),
+            "notes": list(self.notes),
         }
 
     def _fault_lines(self, most: int) -> Iterator[str]:

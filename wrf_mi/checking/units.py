@@ -117,7 +117,7 @@ def strength_scale(record: Record) -> Found:
         parts = dict(zip(parts, record.official, strict=True))
     wrong: dict[tuple[str, str], list[str]] = {}
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
-        above = [part for part, rows in parts.items() if _is_above_0_dbm(observed[rows])]
+        above = [part for part, rows in parts.items() if is_above_0_dbm(observed[rows])]
         if above:
             scale = _scale(observed[np.concatenate([parts[part] for part in above])])
             wrong.setdefault((" and ".join(above), scale), []).append(receiver.name)
@@ -125,7 +125,7 @@ def strength_scale(record: Record) -> Found:
         yield "strengths", f"signal strengths in {part} of {', '.join(names)} are {scale}"
 
 
-def _is_above_0_dbm(observed: NDArray[Any]) -> bool:
+def is_above_0_dbm(observed: NDArray[Any]) -> bool:
     """Whether strengths [n] are nowhere below 0 dBm, which is 1 mW: a few metres from a strong transmitter."""
     values = observed[np.isfinite(observed)]
     return bool(len(values) and values.min() >= 0 and values.any())

@@ -34,6 +34,7 @@ def add_parser(commands: Any) -> None:
 
 def correct_command(a: Arguments) -> int:
     """Correct a scene, and write its page."""
+    from ..checking import warn_of_suspicions
     from ..core import InputError
     from ..core.settings import with_settings
     from ..correction import correct_scene, default_options, write_page
@@ -55,6 +56,7 @@ def correct_command(a: Arguments) -> int:
     splits = make_splits(record, a.split, a.seed, a.n_train)
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
+    warn_of_suspicions(record)
     with stages("correct") as show:
         found = correct_scene(a.scene, record, splits[0], options, a.material, show)
         facts = write_page(found, a.out, a.replace)

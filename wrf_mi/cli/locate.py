@@ -51,7 +51,9 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    given = test_observations(run) if a.input is None else read_observations(a.input, run.receivers)
+    given = (
+        test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
+    )
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch() as watch:
         found = locate(run, given.value_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)

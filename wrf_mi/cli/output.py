@@ -30,6 +30,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if as_json:
         print_json(metrics)
         return 0
+    from ..runs.constant import unbeaten
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]
@@ -51,6 +52,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     )
     if folder is not None:
         print(f"results: {folder}")
+    if line := unbeaten(metrics):
+        print(line)
     return 0
 
 

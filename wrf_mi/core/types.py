@@ -201,6 +201,19 @@ class Split:
     held_receivers: tuple[int, ...] = ()
     left: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
+    def at_receivers(self, receivers: Sequence[int] | IntArray) -> Split:
+        """The split of `Record.at_receivers`, for numbers of receivers in ascending order.
+
+        >>> split = Split("mine", 0, np.array([0]), np.array([1]), np.array([2]), held_receivers=(0, 2))
+        >>> split.at_receivers([1, 2]).held_receivers
+        (1,)
+        """
+        numbers = np.asarray(receivers, np.int64)
+        held_receivers = np.searchsorted(numbers, np.intersect1d(self.held_receivers, numbers).astype(np.int64))
+        left = self.left[np.isin(self.left[:, 0], numbers)]
+        pairs = np.stack([np.searchsorted(numbers, left[:, 0]), left[:, 1]], axis=1)
+        return replace(self, held_receivers=tuple(held_receivers.tolist()), left=pairs)
+
     @property
     def all_train(self) -> IntArray:
         """Training and validation rows together, sorted."""

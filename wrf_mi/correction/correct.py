@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..datasets.observations import check_observations
+from ..datasets.observations import check_observations, fitted_receivers, warn_of_left_out
 from ..scene.correction_data import CorrectionData
 from ..scene.folder import read_scene_folder
 from ..scene.hidden import Boxes, with_hidden_faces
@@ -121,6 +121,9 @@ def correct_scene(
     """
     begun = time.perf_counter()
     record = record.seen(split)
+    numbers, left_out = fitted_receivers(record, [split])
+    warn_of_left_out(record, left_out)
+    record, split = record.at_receivers(numbers), split.at_receivers(numbers)
     task, name = task_of(record), record.name
     if not task.receiver_with_scene:
         raise InputError(f"{name}: no receiver model reports {task.name} from paths")

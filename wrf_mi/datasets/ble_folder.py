@@ -40,6 +40,7 @@ from .folder_files import (
     write_csv,
     write_extra,
 )
+from .unknown import Table, long_columns, table_text
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +85,6 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     runs = attempt(_runs, tables)
     strengths = [attempt(_signal_strength, table, ids) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
-    attempt(_refuse_silent, folder / TRAINING, ids, strengths)
     stop_at_faults()
     n_train, n_test = (len(table.value.rows) for table in tables)
     height = stated["z"].value
@@ -221,14 +221,6 @@ def _tx_antenna(anchors: CsvTable) -> Antenna:
     return first
 
 
-def _refuse_silent(path: Path, ids: list[str], strengths: list[NDArray[np.float32]]) -> None:
-    """Refuse anchors that received nothing."""
-    silent = np.isnan(np.concatenate(strengths, axis=1)).all(axis=1)
-    for anchor in np.flatnonzero(silent):
-        text = f"{RSSI}{ids[anchor]} is empty in every row, in {TEST} too; remove the anchor and its columns"
-        refuse(DataFault(path, text))
-
-
 def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
     """The antenna of each row; an empty field or a missing column is the default."""
     stated = {key: table.texts(prefix + key) for key in TX_ANTENNA_WORDS if prefix + key in table.header}
@@ -358,5 +350,8 @@ def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
     if unknown or lacking:
         text = f"{len(columns)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
-        raise DataFault(table.path, f"{text} ({which}); give one column per anchor, named by its id")
+        remedy = "give one column per anchor, named by its id"
+        if not columns and long_columns(table.header):
+            remedy = table_text(Table(table.path.name, tuple(table.header)))
+        raise DataFault(table.path, f"{text} ({which}); {remedy}")
     return np.stack([table.numbers(columns[anchor], may_be_empty=True) for anchor in ids]).astype(np.float32)

@@ -161,6 +161,8 @@ class CsvTable:
         if self.header.count(column) != 1:
             what = "has no column" if column not in self.header else "has twice the column"
             text = f"header {','.join(self.header)[:60]!r} {what} {column}; the first line must name each column once"
+            if len(self.header) == 1 and any(mark in self.header[0] for mark in ";\t|"):
+                text += ", separated by commas"
             raise DataFault(self.path, text, line=1)
         return self.header.index(column)
 

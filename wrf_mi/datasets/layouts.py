@@ -13,13 +13,15 @@ from pathlib import Path
 from ..core import Record
 from ..core.registry import Registry, resolve
 from .argos import SUFFIXES
-from .ble_folder import ANCHORS
+from .ble_folder import ANCHORS, TEST, TRAINING
 from .deepmimo import OLD_PARAMS, PARAMS
+from .folder_files import POSITIONS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
 from .nerf2_ble import POWERS
 from .nerf2_csi import CHANNELS, STATION
 from .record_file import VERSION
-from .spectrum_folder import GATEWAYS
+from .spectrum_folder import FOLDS, GATEWAYS, IMAGES
+from .unknown import unknown_data
 
 ENTRY_POINTS = "wrf_mi.layouts"
 Read = Callable[[Path, str | None], Record]
@@ -37,6 +39,8 @@ class Layout:
         files: names of files; a folder with any of them has this layout.
         suffixes: endings of files that are data sets, alone or in a folder without any layout's ``files``.
         array: name of an array that an ``.npz`` file of this layout holds, or "".
+        parts: names of further files; a folder with any of them that no layout describes is taken for this one, whose
+            reader names what is missing.
     """
 
     name: str
@@ -45,6 +49,7 @@ class Layout:
     files: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()
     array: str = ""
+    parts: tuple[str, ...] = ()
 
     def reads(self, file: Path) -> bool:
         """Whether a file has the ending and the array of this layout."""
@@ -57,13 +62,17 @@ class Layout:
         return read
 
 
-SPECTRA = Layout("spectra", "spectrum", "wrf_mi.datasets.spectrum_folder:read_spectrum_folder", (GATEWAYS,))
-"""Layout assumed for a folder without known files, so that its reader names the missing ones."""
 BUILT_IN = (
-    SPECTRA,
+    Layout(
+        "spectra",
+        "spectrum",
+        "wrf_mi.datasets.spectrum_folder:read_spectrum_folder",
+        (GATEWAYS,),
+        parts=(IMAGES, POSITIONS, FOLDS),
+    ),
     Layout("nerf2-ble", "rssi", "wrf_mi.datasets.nerf2_ble:read_nerf2_ble", (POWERS, BLE_GATEWAYS)),
     Layout("nerf2-csi", "csi", "wrf_mi.datasets.nerf2_csi:read_nerf2_csi", (CHANNELS, STATION)),
-    Layout("ble", "rssi", "wrf_mi.datasets.ble_folder:read_ble_folder", (ANCHORS,)),
+    Layout("ble", "rssi", "wrf_mi.datasets.ble_folder:read_ble_folder", (ANCHORS,), parts=(TRAINING, TEST)),
     Layout("deepmimo", "csi", "wrf_mi.datasets.deepmimo:read_deepmimo", (PARAMS, OLD_PARAMS)),
     Layout("npz", "", "wrf_mi.datasets.record_file:read_record_file", suffixes=(".npz",), array=VERSION),
     Layout("newrf", "csi", "wrf_mi.datasets.newrf:read_newrf", suffixes=(".npz",)),
@@ -81,14 +90,26 @@ def layouts() -> list[Layout]:
 
 
 def layout_of(path: Path) -> Layout:
-    """The layout of a folder or a file."""
+    """The layout of a folder or a file.
+
+    Raises:
+        InputError: it has none; the message says what it holds and what is wanted.
+    """
+    present = [] if path.is_file() else sorted(path.iterdir())
     if path.is_file():
         found = [layout for layout in layouts() if layout.reads(path)]
     else:
-        present = list(path.iterdir())
-        found = [layout for layout in layouts() if any((path / file).exists() for file in layout.files)]
+        found = _by_files(path)
         found += [layout for layout in layouts() if any(map(layout.reads, present))]
-    return next(iter(found), SPECTRA)
+        found += [layout for layout in layouts() if any((path / file).exists() for file in layout.parts)]
+    if not found:
+        raise unknown_data(path, [folder for folder in present if folder.is_dir() and _by_files(folder)])
+    return found[0]
+
+
+def _by_files(folder: Path) -> list[Layout]:
+    """Layouts of which a folder has a file."""
+    return [layout for layout in layouts() if any((folder / file).exists() for file in layout.files)]
 
 
 def array_names(file: Path) -> set[str]:

@@ -48,8 +48,8 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
         A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received.
 
     Raises:
-        InputError: anything missing, unreadable or inconsistent, a gateway that received nothing at all, or a single
-            transmission; one line with the file and the row.
+        InputError: anything missing, unreadable or inconsistent, or a single transmission; one line with the file and
+            the row.
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
     found = attempt(read_yaml, folder / GATEWAYS)
@@ -122,14 +122,11 @@ def _read_powers(path: Path, found: dict[Any, Any]) -> NDArray[np.float32]:
         text = f"no column {lacking}; name all columns as {GATEWAYS} does, or none"
         raise DataFault(path, text, line=1)
     if named:
-        columns, power = gateways, np.stack([table.numbers(gateway) for gateway in gateways])
+        power = np.stack([table.numbers(gateway) for gateway in gateways])
     else:
         columns = [f"{column} ({gateway})" for column, gateway in zip(table.header, gateways, strict=True)]
         power = np.stack([table.numbers(f"column {what}", index=index) for index, what in enumerate(columns)])
     power[power == NOT_RECEIVED_DBM] = np.nan
-    for silent in np.flatnonzero(np.isnan(power).all(axis=1)):
-        what = f"every row is {NOT_RECEIVED_DBM:g}, so gateway {gateways[silent]} received nothing"
-        refuse(DataFault(path, f"column {columns[silent]}: {what}; remove it here and from {GATEWAYS}"))
     return power.astype(np.float32)
 
 

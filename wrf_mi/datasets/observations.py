@@ -2,14 +2,71 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.types import IntArray
 
+logger = logging.getLogger(__name__)
+
 ROWS_PER_CHUNK = 256
 """Rows that are checked at a time, so that large records are not copied."""
+
+
+LEAST_ROWS = 2
+"""Training rows below which a receiver is left out: a level and its slope need two, as do a row that trains and another
+that chooses settings."""
+
+
+def rows_received(record: Record, rows: IntArray) -> IntArray:
+    """Number of some rows in which each receiver received something [n_rx].
+
+    Of rows at several carriers the largest number at one of them, as some models are fitted to each carrier alone.
+    """
+    received = np.stack([~_states(one, rows)[0] for one in record.observation])
+    if record.carriers_hz is None or not len(rows):
+        return np.asarray(received.sum(axis=1), np.int64)
+    carriers = np.unique(record.carriers_hz[rows])
+    return np.asarray(received.astype(np.int64) @ (record.carriers_hz[rows][:, None] == carriers)).max(axis=1)
+
+
+def fitted_receivers(record: Record, splits: Sequence[Split]) -> tuple[IntArray, dict[str, int]]:
+    """Receivers with enough training rows in every split that trains them, and those without.
+
+    Where no receiver has `LEAST_ROWS` rows, those with a row are enough: some models copy it, the others say what they
+    need. Receivers that a split holds out need no training row there.
+
+    Returns:
+        Numbers of the receivers, ascending, and the smallest number of training rows of each of the others by name.
+
+    Raises:
+        InputError: every receiver lacks rows in one of the splits.
+    """
+    counts = np.full(len(record.receivers), len(record))
+    for split in splits:
+        trained = np.setdiff1d(np.arange(len(counts)), split.held_receivers)
+        counts[trained] = np.minimum(counts[trained], rows_received(record, split.all_train)[trained])
+    least = min(LEAST_ROWS, max(int(counts.max()), 1))
+    enough = np.flatnonzero(counts >= least)
+    if not len(enough):
+        named = ", ".join(receiver.name for receiver in record.receivers)
+        place = f"in a fold of split {splits[0].name.partition(':')[0]}" if len(splits) > 1 else "in the training rows"
+        text = f"{place_of(record)}: nothing was received {place} by any receiver ({named})"
+        raise InputError(f"{text}; use another split or give more rows")
+    scarce = np.setdiff1d(np.arange(len(counts)), enough)
+    return enough, {record.receivers[number].name: int(counts[number]) for number in scarce}
+
+
+def warn_of_left_out(record: Record, left_out: Mapping[str, int]) -> None:
+    """Log receivers that are left out for want of training rows."""
+    if left_out:
+        named = ", ".join(f"{name} ({rows})" for name, rows in left_out.items())
+        text = "%s: receivers with fewer than %d training rows are left out, with their number of rows: %s"
+        logger.warning(text, record.name, LEAST_ROWS, named)
 
 
 def check_observations(record: Record, split: Split, complete: bool = False) -> None:

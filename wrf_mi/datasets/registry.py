@@ -16,6 +16,7 @@ from ..core import InputError, Record
 from ..core.arrays import planar_array
 from .layouts import is_data, layout_of
 from .spectrum_folder import parse_folds
+from .unknown import unknown_data
 
 DATA_VARIABLE = "WRF_MI_DATA"
 """Environment variable: a folder of data sets ``<name>/``, in place of the user's cache."""
@@ -174,6 +175,8 @@ def find(name_or_folder: str | Path) -> tuple[Path, DataSet | None]:
     path = Path(name_or_folder)
     if is_data(path):
         return path, None
+    if path.is_file():
+        raise unknown_data(path)
     if isinstance(name_or_folder, Path) or path.name != name_or_folder:
         raise InputError(f"{name_or_folder}: no such folder; give a folder or a known data set's name")
     dataset = known(name_or_folder)
@@ -189,7 +192,7 @@ def find(name_or_folder: str | Path) -> tuple[Path, DataSet | None]:
 def stated_task(name_or_folder: str | Path) -> str | None:
     """The task of a data set by its layout or name, read only if its layout has several; None if it is not known."""
     path = Path(name_or_folder)
-    if path.exists():
+    if is_data(path):
         layout = layout_of(path)
         return layout.task or layout.read(path, None).task
     return next((dataset.task for dataset in KNOWN if dataset.name == str(name_or_folder)), None)

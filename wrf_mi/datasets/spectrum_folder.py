@@ -48,7 +48,7 @@ from .folder_files import (
 
 CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 """Keys under which a file may state carriers."""
-GATEWAYS, FOLDS, TX_ANTENNA = "gateway_info.yml", "blocked_folds.txt", "tx_antenna"
+GATEWAYS, FOLDS, IMAGES, TX_ANTENNA = "gateway_info.yml", "blocked_folds.txt", "spectrum", "tx_antenna"
 RESERVED = ("array", TX_ANTENNA)
 """Mappings of the file that are no receivers; receivers cannot have these names."""
 MOST_PIXELS = 1 << 22
@@ -83,7 +83,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     stated = attempt(_frequency, gateways, info)
     attempt(_one_carrier, folder / POSITIONS, table, stated)
     rows = attempt(lambda read: len(read.positions_m), table)
-    observation = attempt(_read_images, folder / "spectrum", poses, rows)
+    observation = attempt(_read_images, folder / IMAGES, poses, rows)
     official = attempt(read_official, folder, rows, 1)
     folds = attempt(_folds, folder / FOLDS, rows)
     tx_antenna = attempt(_tx_antenna, gateways, info)
@@ -145,7 +145,7 @@ def write_spectrum_folder(
     with atomic_folder(Path(path), replace) as part:
         several = len(record.receivers) > 1
         for receiver, spectra in zip(record.receivers, grey, strict=True):
-            images = part / "spectrum" / receiver.name if several else part / "spectrum"
+            images = part / IMAGES / receiver.name if several else part / IMAGES
             images.mkdir(parents=True)
             for row, image in enumerate(spectra, start=1):
                 Image.fromarray(image).save(images / f"{row:05d}.png")

@@ -124,6 +124,12 @@ def make_splits(
     return splits
 
 
+def splits_below(record: Record, name: str) -> tuple[str, ...]:
+    """Name of the split of rows that a split by receivers divides further; none for any other split."""
+    by_receiver = name.partition(":")[0].partition("+")[0] == "receiver"
+    return ("random" if record.official is None else "official",) if by_receiver else ()
+
+
 def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: int, seed: int) -> IntArray:
     """Pairs [q, 2] of each of some receivers and up to ``count`` of the ``rows`` that it received, a seeded draw."""
     received = np.asarray(np.isfinite(record.observation[:, rows]).reshape(len(record.receivers), len(rows), -1).all(2))
@@ -299,8 +305,7 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
     order = np.arange(count)
     if count > MOST_RECEIVERS:
         order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
-    base = "random" if record.official is None else "official"
-    (rows,) = _train_and_test(record, base, seed)
+    (rows,) = (only for below in splits_below(record, name) for only in _train_and_test(record, below, seed))
     received = np.asarray(np.isfinite(record.observation).reshape(count, len(record), -1).all(axis=2), bool)
     found = []
     for k in _folds(record, name, int(order.max()) + 1):
@@ -308,5 +313,8 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
         train, test = (
             part[received[who][:, part].any(axis=0)] for who, part in ((~held, rows.train), (held, rows.test))
         )
-        found.append(_Rows(f"{name.partition(':')[0]}:{k}", train, test, tuple(np.flatnonzero(held).tolist()), left))
+        # A receiver without test rows cannot be scored; the others can.
+        if len(test) or ":" in name:
+            label = f"{name.partition(':')[0]}:{k}"
+            found.append(_Rows(label, train, test, tuple(np.flatnonzero(held).tolist()), left))
     return found

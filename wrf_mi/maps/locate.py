@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -162,9 +163,8 @@ def locate(
     session = Session(run.folder, run.folder, on_progress, stop)
     headings = headings_of(run)
     try:
-        predicted = predict_candidates(
-            run.fitted, record, headings, candidates, lambda share: session.report("predicting candidates", share)
-        )
+        report = partial(session.report, "predicting candidates")
+        predicted = predict_candidates(run.fitted, len(observed), headings, candidates, report)
         calibration = calibration_of(run, candidates, session)
     except InputError as error:
         raise InputError(f"{run.folder}: {error}") from None

@@ -29,7 +29,7 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..models import Fitted, Session
-from ..models.held_out import fit_model, hold_out_folds, labelled
+from ..models.held_out import fit_fold, hold_out_folds, labelled
 from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
@@ -86,14 +86,14 @@ class Predicted:
 
 
 def predict_candidates(
-    fitted: Fitted, record: Record, headings: int, candidates: Candidates, report: Callable[[float], None]
+    fitted: Fitted, count: int, headings: int, candidates: Candidates, report: Callable[[float], None]
 ) -> Predicted:
-    """Predictions of a fitted model for all receivers, at equally spaced headings where it uses them.
+    """Predictions of a fitted model for all its receivers, ``count``, at equally spaced headings where it uses them.
 
     Raises:
         InputError: the model states no standard deviation.
     """
-    positions, count = candidates.positions_m, len(record.receivers)
+    positions = candidates.positions_m
     mean, std = np.empty((2, headings, count, len(positions)), np.float32)
     for number in range(headings):
         turned = np.full(len(positions), 2 * np.pi * number / headings) if headings > 1 else None
@@ -115,9 +115,12 @@ def headings_of(run: Run) -> int:
 
 @dataclass(frozen=True)
 class Located:
-    """Held-out rows of a fold: rows of the record [m], and the candidate nearest to each [m]."""
+    """Held-out rows of a fold: predictions at the receivers of the given numbers, which have enough training rows in
+    the fold; rows of the record [m], and the candidate nearest to each [m].
+    """
 
     predicted: Predicted
+    receivers: IntArray
     rows: IntArray
     truth: IntArray
 
@@ -149,21 +152,24 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
         label = f"calibrating, fold {number + 1} of {len(folds)}"
         report = partial(session.report, f"{label}: map")
         arrays = stored_arrays(kept) if kept.exists() else {}
-        if arrays.get("positions_m", np.zeros(0)).shape != candidates.positions_m.shape:
+        if "receivers" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
             folder = place / f"fold{number}"
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             inner = labelled(replace(session, folder=folder, run=folder), label)
             with threadpool_limits(1, "blas"):
-                fitted, _ = fit_model(run.model, run.problem.seen(fold), fold, inner)
-                found = predict_candidates(fitted, record, headings, candidates, report)
+                fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
+                found = predict_candidates(fitted, len(numbers), headings, candidates, report)
             shutil.rmtree(folder)
             arrays = {"mean": found.mean_dbm, "std": found.std_db, "positions_m": candidates.positions_m}
+            arrays["receivers"] = numbers
             write_arrays(kept, arrays)
-        test = fold.test[np.isfinite(record.observation[:, fold.test]).any(axis=0)]
+        receivers = arrays["receivers"]
+        test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         most = max(1, MOST_ROWS // len(folds))
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
-        parts.append(Located(Predicted(arrays["mean"], arrays["std"]), test, candidates.nearest(record.tx_pos_m[test])))
+        predicted, nearest = Predicted(arrays["mean"], arrays["std"]), candidates.nearest(record.tx_pos_m[test])
+        parts.append(Located(predicted, receivers, test, nearest))
     neighbours, error_m = choose_neighbours(record, folds)
     chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
     chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
@@ -220,7 +226,8 @@ def choose(
     errors, inside = [], []
     for part in parts:
         for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
-            found = probabilities(best.log(_strengths(record, row), part.predicted.mean_dbm, part.predicted.std_db))
+            log = best.log(_strengths(record, part, row), part.predicted.mean_dbm, part.predicted.std_db)
+            found = probabilities(log)
             region = region_of(found, candidates.distance_m, candidates.positions_m, LEVEL)
             errors.append(np.linalg.norm(region.estimate_m - place[:2]))
             inside.append(densest(found, LEVEL)[truth])
@@ -248,9 +255,9 @@ def _clear_gain(difference: FloatArray) -> float:
     return mean if mean > difference.std() / np.sqrt(len(difference)) else 0.0
 
 
-def _strengths(record: Record, row: int) -> FloatArray:
-    """Signal strengths [n_rx] of a row of the record."""
-    return np.asarray(record.observation[:, row], float)
+def _strengths(record: Record, part: Located, row: int) -> FloatArray:
+    """Signal strengths of a row of the record at the receivers of a fold."""
+    return np.asarray(record.observation[part.receivers, row], float)
 
 
 def _words(form: Likelihood) -> str:
@@ -263,7 +270,7 @@ def _scores(record: Record, part: Located, form: Likelihood, candidates: Candida
     """Log posterior density [m] at the true positions of held-out rows, per square metre."""
     found = []
     for row, truth in zip(part.rows, part.truth, strict=True):
-        log = form.log(_strengths(record, row), part.predicted.mean_dbm, part.predicted.std_db)
+        log = form.log(_strengths(record, part, row), part.predicted.mean_dbm, part.predicted.std_db)
         found.append(log[truth] - np.logaddexp.reduce(log))
     return np.asarray(found) - np.log(candidates.cell_m2 or 1.0)
 
@@ -271,7 +278,8 @@ def _scores(record: Record, part: Located, form: Likelihood, candidates: Candida
 def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
     """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
     mean = np.concatenate([part.predicted.mean_dbm[:, :, part.truth].mean(axis=0).ravel() for part in parts])
-    received = np.concatenate([np.isfinite(record.observation[:, part.rows]).ravel() for part in parts])
+    heard = [np.isfinite(record.observation[part.receivers][:, part.rows]).ravel() for part in parts]
+    received = np.concatenate(heard)
     if received.all() or not received.any():
         return None
     middle, spread = float(mean.mean()), float(mean.std()) or 1.0

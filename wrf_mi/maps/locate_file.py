@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
@@ -38,12 +38,17 @@ class Observations:
     true_m: FloatArray | None = None
 
 
-def read_observations(path: str | Path, receivers: Sequence[Receiver]) -> Observations:
+def read_observations(path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = ()) -> Observations:
     """Read the signal strengths of each receiver from a CSV file with a header.
 
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
     needed for each receiver; a field is empty where nothing was received. Columns ``x`` and ``y``, if any, are true
-    positions in metres. Other columns are ignored.
+    positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
+
+    Args:
+        path: the file.
+        receivers: receivers of the run.
+        left_out: names of receivers whose columns are ignored.
 
     Raises:
         InputError: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver,
@@ -52,15 +57,16 @@ def read_observations(path: str | Path, receivers: Sequence[Receiver]) -> Observ
     table = read_csv(Path(path), skip_blank=True)
     names = [receiver.name for receiver in receivers]
     columns = [_column(table, name) for name in names]
+    ignored = [column for name in left_out for column in _able(name)]
     for column in table.header:
-        if column not in columns and (column.endswith(DBM) or column.startswith(RSSI)):
+        if column not in [*columns, *ignored] and (column.endswith(DBM) or column.startswith(RSSI)):
             listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
             text = f"column {one_line(column)} names no receiver of the run ({one_line(listed)})"
             raise DataFault(table.path, f"{text}; rename or remove it", line=1)
     values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
     silent = np.flatnonzero(~np.isfinite(values).any(axis=0))
     if len(silent):
-        text = "no receiver received anything, so there is no position; remove the row"
+        text = "no receiver of the run received anything, so there is no position; remove the row"
         raise DataFault(table.path, text, row=int(silent[0]) + 1)
     stated = [axis for axis in "xy" if axis in table.header]
     if len(stated) == 1:
@@ -68,10 +74,15 @@ def read_observations(path: str | Path, receivers: Sequence[Receiver]) -> Observ
     return Observations(values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None)
 
 
+def _able(name: str) -> list[str]:
+    """Names that the column of a receiver may have."""
+    number = name.removeprefix(ANCHOR)
+    return [f"{name}{DBM}", f"{RSSI}{name}", *([f"{RSSI}{number}"] if number.isdecimal() else [])]
+
+
 def _column(table: CsvTable, name: str) -> str:
     """Column of a receiver."""
-    number = name.removeprefix(ANCHOR)
-    able = [f"{name}{DBM}", f"{RSSI}{name}", *([f"{RSSI}{number}"] if number.isdecimal() else [])]
+    able = _able(name)
     found = [column for column in able if column in table.header]
     if not found:
         text = f"no column of receiver {one_line(name)}"

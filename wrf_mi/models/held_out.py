@@ -15,8 +15,10 @@ from scipy.spatial import cKDTree
 
 from ..core import Prediction, Record, Split
 from ..core.angles import FloatArray
+from ..core.antenna import AS_STATED
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import IntArray
+from ..datasets.observations import LEAST_ROWS, fitted_receivers, rows_received
 from ..datasets.splits import rows_left
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
@@ -81,8 +83,9 @@ def hold_out_folds(record: Record, split: Split) -> list[Split]:
     folds = []
     for number, out in enumerate(held):
         train, validation = (np.setdiff1d(part, rows[out]) for part in (split.train, split.validation))
-        if out.any() and len(train) + len(validation) >= 2:
-            folds.append(Split(f"fold {number}", split.seed, train, validation, rows[out]))
+        fold = Split(f"fold {number}", split.seed, train, validation, rows[out])
+        if out.any() and rows_received(record, fold.all_train).max() >= LEAST_ROWS:
+            folds.append(fold)
     return folds
 
 
@@ -178,7 +181,7 @@ class HeldOut:
         parts: list[tuple[IntArray, IntArray, IntArray, FloatArray]] = []
         for number, fold in enumerate(folds):
             distance = RowDistance(record.seen(fold), fold.all_train)
-            for receiver in fold.held_receivers or range(len(record.receivers)):
+            for receiver in fold.held_receivers or fitted_receivers(record, [fold])[0]:
                 rows = np.setdiff1d(fold.test, fold.left[fold.left[:, 0] == receiver, 1])
                 rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
                 away = distance(record.tx_pos_m[rows], receiver)
@@ -216,6 +219,19 @@ def fit_model(entry: Model, problem: Problem, split: Split, session: Session) ->
     if entry.prepare is not None:
         problem = replace(problem, settings=entry.prepare(problem, [split], session))
     return entry.fit(problem, split, session), problem
+
+
+def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:
+    """A model fitted to a fold of the training rows, at the receivers that have enough of them in the fold.
+
+    Returns:
+        The fitted model, and the numbers of its receivers among those of the problem, ascending.
+    """
+    numbers, left_out = fitted_receivers(problem.record, [fold])
+    if left_out:
+        problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
+        fold = fold.at_receivers(numbers)
+    return fit_model(entry, problem.seen(fold), fold, session)[0], numbers
 
 
 def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int) -> Prediction:
@@ -271,17 +287,17 @@ def held_out_predictions(
         if not kept.exists():
             folder.mkdir(parents=True, exist_ok=True)
             inner = labelled(replace(session, folder=folder), f"{name}, fold {number + 1} of {len(folds)}")
-            fitted, _ = fit_model(entry, problem.seen(fold), fold, inner)
+            fitted, numbers = fit_fold(entry, problem, fold, inner)
             found = [
-                predicted_rows(fitted, record, wanted.row[wanted.receiver == receiver], receiver)
-                for receiver in range(len(record.receivers))
+                predicted_rows(fitted, record, wanted.row[wanted.receiver == receiver], place)
+                for place, receiver in enumerate(numbers)
                 if (wanted.receiver == receiver).any()
             ]
             # Found receiver by receiver, while a fold may hold receivers out in any order.
-            place = np.argsort(np.argsort(wanted.receiver, kind="stable"), kind="stable")
-            arrays = {"mean": np.concatenate([one.mean for one in found])[place]}
+            order = np.argsort(np.argsort(wanted.receiver, kind="stable"), kind="stable")
+            arrays = {"mean": np.concatenate([one.mean for one in found])[order]}
             if found[0].std is not None:
-                arrays["std"] = np.concatenate([one.stated_std for one in found])[place]
+                arrays["std"] = np.concatenate([one.stated_std for one in found])[order]
             write_arrays(kept, arrays)
         arrays = stored_arrays(kept)
         means.append(arrays["mean"])

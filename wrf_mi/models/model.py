@@ -81,6 +81,7 @@ class Problem:
         antennas: patterns and polarisations in place of those of the data.
         use_rows: whether training rows are used; False: the scene alone predicts.
         operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
+        left_out: names of receivers that are left out of the data, as if they had not been there.
     """
 
     dataset: str | Path | Record
@@ -91,17 +92,21 @@ class Problem:
     antennas: AntennaOptions = AS_STATED
     use_rows: bool = True
     operator: bool = True
+    left_out: tuple[str, ...] = ()
 
     @cached_property
     def record(self) -> Record:
-        """The data with the stated antennas, read on first access.
+        """The data with the stated antennas and without the receivers that are left out, read on first access.
 
         Raises:
             InputError: they cannot be read.
         """
         from ..synthetic import load_record
 
-        return self.antennas.of(self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset))
+        record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
+        if self.left_out:
+            record = record.at_receivers([k for k, one in enumerate(record.receivers) if one.name not in self.left_out])
+        return self.antennas.of(record)
 
     @cached_property
     def opened_scene(self) -> Any | None:

@@ -123,7 +123,7 @@ class FittedTracing(Fitted):
 
     @cached_property
     def _stored(self) -> TraceResult:
-        return load_trace(self._paths)
+        return _stored_trace(self._paths, self._problem.record)
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions from the stored paths."""
@@ -225,9 +225,8 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     assert problem.scene is not None
     settings: TracingSettings = problem.settings
     tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
-    if path.exists():
-        traced = load_trace(path)
-    else:
+    traced = _stored_trace(path, record) if path.exists() else None
+    if traced is None or len(traced.receivers) < len(record.receivers):  # of a fold that left some out
         traced = _trace(tracer, problem, session)
         warn_of_cross_polarization(traced, tracer.scene)
         save_trace(path, traced)
@@ -246,6 +245,12 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
     fitted = FittedTracing(problem, arrays, path)
     fitted.train_seconds = 0.0
     return fitted
+
+
+def _stored_trace(path: Path, record: Record) -> TraceResult:
+    """The run's trace at the receivers of a record: a fold leaves out those with too few training rows."""
+    traced, names = load_trace(path), {receiver.name for receiver in record.receivers}
+    return traced.of_receivers(np.array([k for k, one in enumerate(traced.receivers) if one.name in names], np.int64))
 
 
 def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None:

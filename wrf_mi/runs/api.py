@@ -47,11 +47,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
+from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
 from ..datasets import make_splits
-from ..datasets.observations import check_observations, place_of
+from ..datasets.observations import check_observations, fitted_receivers, place_of, warn_of_left_out
+from ..datasets.splits import splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.calibrated import with_intervals
 from ..models.checks import check_held_receivers, check_record
@@ -132,9 +134,8 @@ def plan_run(
     if scene_only and scene is None:
         raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
     # Without training rows the split keeps them for the references, which need some.
-    splits = [split] if isinstance(split, Split) else make_splits(record, split, seed, None if scene_only else n_train)
+    record, splits, left_out = _split_rows(record, split, seed, None if scene_only else n_train)
     for rows in splits:
-        check_rows(rows, record, f"split {rows.name}")
         check_held_receivers(record, rows, chosen, MODELS.values())
         check_observations(record, rows, complete=chosen.complete)
     problem = Problem(record, found, seed, scene_name, material, antennas, not scene_only)
@@ -143,8 +144,31 @@ def plan_run(
         checked.check(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
-    options = (seed, scene_name, material, antennas, deterministic, intervals, found)
+    options = (seed, scene_name, material, antennas, deterministic, intervals, found, left_out)
     return problem, RunConfig(model, source, record.task, name, n_train, *options), splits
+
+
+def _split_rows(
+    record: Record, split: str | Split, seed: int, n_train: int | float | None
+) -> tuple[Record, list[Split], dict[str, int]]:
+    """Record without receivers that have too few training rows, its splits, and those receivers' numbers of rows."""
+    left_out: dict[str, int] = {}
+    if isinstance(split, Split):
+        check_rows(split, record, f"split {split.name}")
+    # Receivers are held out of those that have enough rows in the split of rows that lies below.
+    below = () if isinstance(split, Split) else splits_below(record, split)
+    for rule in (*below, split):
+        while True:
+            splits = [rule] if isinstance(rule, Split) else make_splits(record, rule, seed, n_train)
+            numbers, scarce = fitted_receivers(record, splits)
+            if not scarce:
+                break
+            # Rows that only these receivers received are in no split any more, and a seeded draw from fewer rows may
+            # leave another receiver without: so again, until none is left out. Each turn leaves out one at least.
+            left_out |= scarce
+            record = record.at_receivers(numbers)
+            rule = rule.at_receivers(numbers) if isinstance(rule, Split) else rule
+    return record, splits, left_out
 
 
 def _check_scene(
@@ -224,6 +248,8 @@ def train(
     fit: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
     fit["intervals"] = intervals
     problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
+    warn_of_suspicions(problem.record)
+    warn_of_left_out(problem.record, config.left_out)
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)

@@ -26,6 +26,7 @@ from ..models.model import default_settings, inputs_of
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from ..training.trainer import peak_memory_mb
+from .constant import CONSTANT, SCORES, against_constant, constant_scores
 from .folder import METRICS, PREDICTIONS, RunConfig
 from .results import Observations, reference_key
 
@@ -38,6 +39,8 @@ Scores = tuple[dict[str, Any], dict[str, Any]]
 
 NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
+LEFT_OUT = "receivers_left_out"
+"""Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
 """Arrays of ``predictions.npz`` without an axis of receivers."""
 REPEATS = 20
@@ -76,10 +79,11 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         single: prediction that is timed at one row; None: ``predict``.
 
     Returns:
-        The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, for several
-        receivers ``receivers``, with standard deviations ``inside_90`` and ``crps``, ``n_train``, ``n_test``,
-        ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite
-        is not scored: its truth is NaN; so are all of the trained receivers in a split that holds out others.
+        The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
+        (`wrf_mi.runs.constant.against_constant`), for several receivers ``receivers``, with standard deviations
+        ``inside_90`` and ``crps``, ``n_train``, ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of
+        ``predictions.npz``. An observation that is not finite is not scored: its truth is NaN; so are all of the
+        trained receivers in a split that holds out others.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
@@ -105,6 +109,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
         **{reference_key(key): values for key, values in reference_predictions(record, split).items()},
+        SCORES: constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
     if found[0].std is not None:
@@ -140,6 +145,7 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
             str(name): {**(blocks(r) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
+    metrics[CONSTANT] = against_constant(scorer, scores, arrays[SCORES])
     if "std" in arrays:
         stated = arrays["prediction"], arrays["std"], arrays["truth"]
         metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
@@ -208,8 +214,9 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
 
 
 def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str, Any]:
-    known = {"model": config.model, "dataset": config.dataset, "split": config.split, "seed": config.seed}
+    known: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
     known |= {} if config.scene is None else {"scene": config.scene}
+    known |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}
     # The peak of the fit, if it is stored already.
     memory_mb = stored_metrics(folder).get("peak_memory_mb", peak_memory_mb())
     seconds = sum(part.seconds for part in parts)
@@ -218,7 +225,7 @@ def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str,
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
     """Write ``predictions.npz`` and then ``metrics.json``, which marks the run as finished."""
-    write_predictions(folder / PREDICTIONS, arrays)
+    write_predictions(folder / PREDICTIONS, {key: values for key, values in arrays.items() if key != SCORES})
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 

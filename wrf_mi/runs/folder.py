@@ -17,9 +17,9 @@ import importlib.metadata
 import json
 import platform
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,7 @@ class RunConfig:
         deterministic: fitted on one thread of the CPU, bit-identical from run to run.
         intervals: standard deviations are calibrated on held-out training rows (`wrf_mi.models.calibrated`).
         settings: all settings of the model.
+        left_out: training rows of the receivers that are left out for having too few, by name.
     """
 
     model: str
@@ -84,6 +85,7 @@ class RunConfig:
     deterministic: bool
     intervals: bool
     settings: Any
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def entry(self) -> Model:
@@ -137,6 +139,7 @@ def read_config(folder: Path) -> RunConfig:
         needed = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material", "antennas")
         stated = {name: content[name] for name in needed}
         stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
+        stated["left_out"] = content.get("left_out") or {}
         config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
         if config.task not in TASKS or config.seed < 0:
             raise InputError(f"{path}: task {shown(config.task)} with seed {config.seed}: not known; restore it")

@@ -79,7 +79,8 @@ class Run:
         config = self.config
         scene = config.scene, config.material, config.antennas
         rows = config.n_train != 0
-        return Problem(self.record or config.dataset, config.settings, config.seed, *scene, rows, self.operator)
+        data, left_out = self.record or config.dataset, tuple(config.left_out)
+        return Problem(data, config.settings, config.seed, *scene, rows, self.operator, left_out)
 
     @cached_property
     def fitted(self) -> Fitted:

@@ -24,6 +24,7 @@ class Csi(Task):
     axes, more_axes, is_complex = 1, 1, True
     receiver = receiver_with_scene = "csi"
     from_uplink = "copy of the uplink"
+    constant_words = "zero"
     heading, quantity = "channel coefficients", "power (dB)"
     level_kind, level_note = "gain", "mean of |h|^2 over antennas and subcarriers, in the unit of the data"
     note = (
@@ -35,6 +36,12 @@ class Csi(Task):
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Channel estimation accuracy (`wrf_mi.tasks.scores.cea_db`)."""
         return cea_db(prediction, truth)
+
+    def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
+        """Zero, whose accuracy is 0 dB: over some wavelengths of positions the phase takes every value, and the mean of
+        few training rows is what chance has left.
+        """
+        return np.zeros(observed.shape[1:], observed.dtype)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """Mean squared difference over received observations."""

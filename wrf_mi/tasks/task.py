@@ -48,6 +48,7 @@ class Task(ABC):
         neighbours: training rows of the reference, inverse-distance weighting.
         softening_m: addend of the distances in the reference, metres.
         from_uplink: words for the second reference, of data with an uplink; "" where the task has none.
+        constant_words: what `constant` predicts, in words.
         heading: heading of the task.
         quantity: quantity that is drawn over positions, with its unit.
         note: sentence for readers of a table.
@@ -71,6 +72,7 @@ class Task(ABC):
     neighbours: ClassVar[int] = 4
     softening_m: ClassVar[float] = 0.0
     from_uplink: ClassVar[str] = ""
+    constant_words: ClassVar[str] = "the mean of each receiver's training rows"
     heading: ClassVar[str]
     quantity: ClassVar[str]
     note: ClassVar[str] = ""
@@ -114,6 +116,10 @@ class Task(ABC):
         Raises:
             InputError: naming what differs.
         """
+
+    def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
+        """The best constant prediction of a receiver's observations [n, ...], all finite: by default their mean."""
+        return np.asarray(observed.mean(axis=0))
 
     @property
     def reference(self) -> str:

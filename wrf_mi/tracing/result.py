@@ -82,6 +82,12 @@ class TraceResult:
         paths = replace(found.paths, tx=row % len(which), n_tx=len(which))
         return replace(found, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
 
+    def of_receivers(self, which: IntArray) -> TraceResult:
+        """The trace of the receivers of ascending indices ``which`` [n]."""
+        selected = self.select(np.isin(self.paths.rx, which))
+        paths = replace(selected.paths, rx=np.searchsorted(which, selected.paths.rx), n_rx=len(which))
+        return replace(selected, paths=paths, receivers=tuple(self.receivers[number] for number in which))
+
     def legs(self, surfaces: Surfaces) -> Legs:
         """The paths in the direction of the search, for Sionna RT.
 

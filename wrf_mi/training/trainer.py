@@ -363,7 +363,8 @@ class Trainer(TrainingLoop):
         if chosen:
             self._restore_paths()
         if chosen and self.state.reach_m == 0 and self.graph.scene is None:
-            self.state.step = self.config.steps  # zero is the best prediction
+            logger.warning("at no distance from training rows do the Gaussians predict held-out rows better than zero")
+            self.state.step = self.config.steps
         return chosen
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:

@@ -146,7 +146,7 @@ def test_bad_arguments_are_refused():
             model.fit(positions, np.full(6, np.nan))
         with pytest.raises(InputError, match="predict with the same"):
             model.fit(positions, values).predict(positions, heading)
-    with pytest.raises(InputError, match="1 rows for a trend of 2 columns"):
+    with pytest.raises(InputError, match="training rows received: 1; its trend needs 2, so give more rows"):
         Kriging(1.0, 0.1, trend=log_distance([0, 0, 0])).fit(positions[:1], values[:1])
     with pytest.raises(InputError, match="rows coincide"):
         Kriging(1.0, 0).fit(np.zeros((2, 3)), [1.0, 2])

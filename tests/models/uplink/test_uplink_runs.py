@@ -176,7 +176,7 @@ def test_invalid_uplinks_of_predictions_are_refused(
 
 
 BAD_DATA = {
-    "a receiver without rows": ("flat, receiver anchor2: received none of 24 training rows", "rssi"),
+    "no training row": ("flat, split official: no row that was received trains; use another split", "rssi"),
     "one sample": ("a random split needs 3 at least", "rssi"),
     "no uplink": ("made-up: has no uplink channels, from which turned predicts", "csi"),
     "frequencies": ("made-up: 4 subcarriers and 5 frequencies; give one for each", "csi"),
@@ -196,8 +196,8 @@ def test_invalid_data_are_refused(what: str, turned: None, flat_folder: Path, tm
     observation = record.observation.copy()
     uplink = None if record.uplink is None else record.uplink.copy()
     split = "official"
-    if what == "a receiver without rows":
-        observation[1, :24] = np.nan
+    if what == "no training row":
+        observation[:, :24] = np.nan
     elif what == "one sample":
         observation[:, 1:], split = np.nan, "random"
     elif what == "NaN in the downlink":
@@ -223,7 +223,6 @@ def test_invalid_data_are_refused(what: str, turned: None, flat_folder: Path, tm
 
 PLACED = {
     "task": ({}, "turned", ": holds rssi; turned serves csi"),
-    "receiver": ({"at": (1, slice(24)), "value": np.nan}, "mri", ", receiver anchor2: received none of 24 training"),
     "row": ({"at": (1, 23), "value": np.inf}, "mri", ", receiver anchor2, row 23: 1 of 1 values are not finite"),
     "first row": ({"at": (0, 0), "value": -np.inf}, "mri", ", receiver anchor1, row 0: 1 of 1 values are not finite"),
 }

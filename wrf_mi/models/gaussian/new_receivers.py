@@ -29,9 +29,7 @@ def trained_part(record: Record, split: Split) -> tuple[Record, Split]:
     if not new:
         return record, split
     kept = np.setdiff1d(np.arange(len(record.receivers)), new)
-    held = tuple(int(np.searchsorted(kept, number)) for number in split.held_receivers if number not in new)
-    left = np.stack([np.searchsorted(kept, split.left[:, 0]), split.left[:, 1]], axis=1)
-    return record.at_receivers(kept), replace(split, held_receivers=held, left=left)
+    return record.at_receivers(kept), split.at_receivers(kept)
 
 
 def of_all_receivers(

@@ -14,11 +14,14 @@ from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
+from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import FitSession
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
-HEADING, CARRIERS = "heading", "carriers_hz"
-"""Keys of the arrays: whether headings are used, and the carriers where there are several."""
+HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
+"""Keys of the arrays: whether headings are used, and where there are several carriers these, and numbers of models that
+there are not.
+"""
 
 
 class Single(Protocol):
@@ -61,21 +64,21 @@ class ByReceiver(Fitted):
 
     Attributes:
         name: name of the method, for errors.
-        models: models of the receivers in turn, and so for each carrier.
+        models: models of the receivers in turn, and so for each carrier; None: too few rows at that carrier.
         heading: whether the models use headings.
         carriers_hz: carriers of the training rows, ascending; None: a single carrier.
     """
 
     name: str
-    models: list[Single]
+    models: list[Single | None]
     heading: bool
     carriers_hz: FloatArray | None = None
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of a receiver, [m, ...].
 
-        At a carrier without training rows they are linear in the logarithm of the frequency between the two next
-        carriers with rows, and beyond all of them those of the nearest.
+        At a carrier without a model of the receiver they are linear in the logarithm of the frequency between the two
+        next carriers with one, and beyond all of them those of the nearest.
 
         Raises:
             InputError: positions, headings or carriers that are not known.
@@ -88,23 +91,31 @@ class ByReceiver(Fitted):
             )
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
-            return Prediction(self.models[receiver].predict(inputs.tx_pos_m, heading))
+            (model,) = self._of(receiver).values()
+            return Prediction(model.predict(inputs.tx_pos_m, heading))
         if inputs.carriers_hz is None:
             known = carriers_text(self.carriers_hz)
             raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
-        known_log, receivers = np.log(self.carriers_hz), len(self.models) // len(self.carriers_hz)
+        models = self._of(receiver)
+        fitted, known_log = list(models.values()), np.log(self.carriers_hz[list(models)])
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
             place = np.interp(np.log(carrier_hz), known_log, np.arange(len(known_log)))
             turned = None if heading is None else heading[rows]
 
             def at(number: int) -> NDArray[Any]:
-                return np.asarray(self.models[number * receivers + receiver].predict(inputs.tx_pos_m[rows], turned))
+                return np.asarray(fitted[number].predict(inputs.tx_pos_m[rows], turned))
 
             below, share = int(place), place % 1
             return at(below) if share == 0 else (1 - share) * at(below) + share * at(below + 1)
 
         return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
+
+    def _of(self, receiver: int) -> dict[int, Single]:
+        """Models of a receiver by the number of the carrier."""
+        carriers = 1 if self.carriers_hz is None else len(self.carriers_hz)
+        models = enumerate(self.models[receiver :: len(self.models) // carriers])
+        return {number: model for number, model in models if model is not None}
 
     @property
     def depends_on_heading(self) -> bool:
@@ -116,8 +127,9 @@ class ByReceiver(Fitted):
         arrays = {HEADING: np.asarray(self.heading)}
         if self.carriers_hz is not None:
             arrays[CARRIERS] = self.carriers_hz
+            arrays[WITHOUT] = np.array([number for number, model in enumerate(self.models) if model is None], np.int64)
         for number, model in enumerate(self.models):
-            arrays |= keyed(f"{number}/", model.arrays())
+            arrays |= {} if model is None else keyed(f"{number}/", model.arrays())
         return arrays
 
 
@@ -150,10 +162,16 @@ def model_by_receiver(
         headings = record.tx_heading_rad if heading(record, problem.settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
         parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
-        models: list[Single] = []
-        for part in parts:
+        models: list[Single | None] = []
+        counts = np.stack([rows_received(record, part) for part in parts])
+        # A receiver with few rows at one carrier is interpolated between its other carriers.
+        enough = counts >= np.minimum(counts.max(axis=0), LEAST_ROWS)
+        for part, fits in zip(parts, enough, strict=True):
             turned = None if headings is None else headings[part]
-            for receiver, observed in zip(record.receivers, record.observation, strict=True):
+            for receiver, observed, fit_it in zip(record.receivers, record.observation, fits, strict=True):
+                if not fit_it:
+                    models.append(None)
+                    continue
                 try:
                     rows_of = record.tx_pos_m[part], observed[part], turned
                     models.append(fit_single(problem, split, receiver, *rows_of))
@@ -165,7 +183,11 @@ def model_by_receiver(
     def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:
         carriers = arrays.get(CARRIERS)
         receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
-        models = [load_single(receiver, under(f"{number}/", arrays)) for number, receiver in enumerate(receivers)]
+        without = arrays.get(WITHOUT, np.zeros(0, np.int64))
+        models = [
+            None if number in without else load_single(receiver, under(f"{number}/", arrays))
+            for number, receiver in enumerate(receivers)
+        ]
         return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
 
     how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}

@@ -187,7 +187,8 @@ class Kriging(CovarianceSettings):
         circle = None if heading is None else _circle(heading)
         columns = self.trend(positions)
         if len(y) < columns.shape[1]:
-            raise InputError(f"kriging: {len(y)} rows for a trend of {columns.shape[1]} columns; give more rows")
+            text = f"kriging: training rows received: {len(y)}; its trend needs {columns.shape[1]}"
+            raise InputError(f"{text}, so give more rows or a constant trend")
         field, ordinary = y, None
         if self.trend_fit == "ols":
             # The field is the residual of the least-squares trend, which is taken as known from here on.
@@ -227,6 +228,11 @@ class Kriging(CovarianceSettings):
         if not free.any():
             return value[:-1], float(value[-1])
         root = component_root(field[rows])
+        if not root.any() and not columns.shape[1]:
+            # The trend that was fitted before passes through every row, as through any two: there is no field, whose
+            # correlations would count.
+            value[free] = np.array(first)[free]
+            return value[:-1], float(value[-1])
         if not root.any():
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
 

@@ -2,7 +2,8 @@
 
 P(d) = T - 10 gamma log10(d), with the power T at one metre and the exponent gamma fitted by least squares to the rows
 that were received; d is the distance between transmitter and receiver. Each receiver has its T and gamma, as in Shin et
-al.; ``shared=true`` fits both for all receivers together, as the code of NeRF2's authors does.
+al.; one whose rows are all at one distance takes the gamma of all receivers together. ``shared=true`` fits both for all
+receivers together, as the code of NeRF2's authors does.
 
 Source: Shin, Chon, Kim and Cha, "MRI: Model-based radio interpolation for indoor war-walking", IEEE Transactions on
 Mobile Computing 14, 1231 (2015); Rappaport, "Wireless Communications" (2002), section 4.9.
@@ -16,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Receiver, Split
+from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
+from ...core.types import IntArray
 from ..model import Problem
 from .by_receiver import model_by_receiver
 from .kriging import log_distance
@@ -61,10 +63,20 @@ def _fit(
 ) -> PathLoss:
     columns = log_distance(receiver.position_m)(tx_pos)
     if problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
-        record, rows = problem.record, split.all_train
-        columns = np.stack([log_distance(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
-        observed = record.observation[:, rows]
+        return PathLoss(receiver.position_m, _shared_law(problem.record, split.all_train))
+    received = ~np.isnan(observed)
+    if np.ptp(tx_pos, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
+        # Rows at a single distance state a level but no exponent, which is that of all receivers.
+        _, slope = _shared_law(problem.record, split.all_train)
+        level = float(np.mean(observed[received] - slope * columns[received, 1]))
+        return PathLoss(receiver.position_m, np.array([level, slope]))
     return PathLoss(receiver.position_m, _law(columns, observed))
+
+
+def _shared_law(record: Record, rows: IntArray) -> FloatArray:
+    """Power at one metre and slope that fit some rows of all receivers together."""
+    columns = np.stack([log_distance(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
+    return _law(columns, record.observation[:, rows])
 
 
 def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:

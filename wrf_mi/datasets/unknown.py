@@ -1,0 +1,111 @@
+"""Errors about folders and files that are no data set: what they hold, and the layout that is wanted."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..core import DataFault, InputError
+from ..core.files import one_line, text_lines
+
+WANTED = (
+    "a data set is a folder with anchors.csv, calibration_df.csv and test_robot_df.csv (signal strengths), with "
+    "gateway_info.yml, tx_pos.csv and spectrum/ (spectra), with csidata.npy and base-station.yml (channels), or of "
+    "another layout of docs/data.md"
+)
+TABLE = (
+    "signal strengths are a row for each position with the columns x,y and rssi_<id> of each receiver, in "
+    "calibration_df.csv (training) and test_robot_df.csv (test), beside anchors.csv with id,x,y,z of each receiver "
+    "(docs/howto/own-data.md)"
+)
+TABLES = (".csv", ".tsv", ".txt")
+SEPARATORS = ",;\t|"
+STRENGTH = frozenset({"rssi", "rss", "rsrp", "dbm", "level", "signal", "strength", "power"})
+"""Words in the names of columns that hold strengths."""
+RECEIVER = (
+    *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "beacon", "cell", "station"),
+    *("pci", "node", "device", "ssid", "id", "name"),
+)
+"""Words in the names of columns that tell receivers apart, the most particular first."""
+PLACE = frozenset(
+    {"x", "y", "z", "lat", "lon", "lng", "latitude", "longitude", "easting", "northing", "heading", "floor"}
+    | {"time", "timestamp", "ts", "date", "run", "scan", "point", "position", "place", "location", "row", "frequency"}
+)
+"""Words in the names of columns that tell positions and scans apart."""
+SHOWN = 8
+"""Columns or files that a message names."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Name, names of the columns and separator of a table."""
+
+    name: str
+    header: tuple[str, ...]
+    separator: str = ","
+
+
+def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
+    """The error about a folder or file that no layout describes.
+
+    Args:
+        path: the folder or file.
+        inner: folders in it that are data sets.
+    """
+    if path.is_file():
+        table = _read_header(path)
+        what = "a file of no known layout" if table is None else "a table, where a folder is wanted"
+        return DataFault(path, f"{what}; {WANTED if table is None else table_text(table)}")
+    content = sorted(path.iterdir())
+    if not content:
+        return DataFault(path, f"an empty folder; {WANTED}")
+    holding = f"holds {_listed([file.name for file in content])} and is no data set itself"
+    if inner:
+        return DataFault(path, f"{holding}; give {one_line(inner[0])}")
+    tables = [table for file in content if file.is_file() and (table := _read_header(file)) is not None]
+    tables.sort(key=lambda table: long_columns(table.header) is None)  # tables of single readings first
+    return DataFault(path, f"{holding}; {table_text(tables[0]) if tables else WANTED}")
+
+
+def table_text(table: Table) -> str:
+    """What a table lacks as signal strengths, and how a table of single readings is pivoted."""
+    columns = f"{table.name} has the columns {_listed(table.header)}"
+    if (columns_of_readings := long_columns(table.header)) is None:
+        return f"{columns}; {TABLE}"
+    receiver, strength, index = columns_of_readings
+    separated = "" if table.separator == "," else f", sep={table.separator!r}"
+    pivot = f"pivot_table(index={index}, columns={receiver!r}, values={strength!r})"
+    code = f"pandas.read_csv({table.name!r}{separated}).{pivot}.add_prefix('rssi_').reset_index()"
+    return f"{columns}, a row for each reading; {TABLE}: pivot it by {one_line(code)}"
+
+
+def long_columns(header: Sequence[str]) -> tuple[str, str, list[str]] | None:
+    """Columns of receivers and strengths and those of the positions in a table with a row for each reading, or None."""
+    words = {column: set(re.findall("[a-z]+", column.lower())) for column in header}
+    strengths = [column for column, parts in words.items() if parts & STRENGTH]
+    receivers = [column for word in RECEIVER for column, parts in words.items() if word in parts]
+    receivers = [column for column in receivers if column not in strengths]
+    if len(strengths) != 1 or not receivers:
+        return None
+    others = [column for column in header if column not in (receivers[0], strengths[0])]
+    return receivers[0], strengths[0], [column for column in others if words[column] & PLACE] or others
+
+
+def _read_header(file: Path) -> Table | None:
+    """The first line of a table; None of another file."""
+    if file.suffix.lower() not in TABLES:
+        return None
+    try:
+        first = next(iter(text_lines(file)), "")
+        separator = max(SEPARATORS, key=first.count)
+        header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
+    except (InputError, csv.Error):
+        return None
+    return Table(file.name, tuple(header), separator) if len(header) > 1 else None
+
+
+def _listed(names: Sequence[str]) -> str:
+    return one_line(",".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""))
