@@ -6,7 +6,7 @@ import logging
 
 from ..core import InputError
 from .options import TraceOptions
-from .search import _patterns
+from .search import patterns
 
 logger = logging.getLogger(__name__)
 
@@ -19,11 +19,11 @@ WARN_S, MOST_S = 10.0, 3600.0
 def hits(options: TraceOptions, rays: int) -> int:
     """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere.
 
-    Rays are shot once for each choice of the hits that reflect (`wrf_mi.tracing.search.shoot`), of which there are up
-    to two to the power of the depth.
+    Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
+    (`wrf_mi.tracing.search.shoot`), of which there are up to two to the power of the depth.
     """
     met = options.max_depth if options.transmission else options.reflections
-    return len(_patterns(met, options.reflections)) * rays * met if options.reflections else 0
+    return len(patterns(met, options.reflections, options.transmission)) * rays * met if options.reflections else 0
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:

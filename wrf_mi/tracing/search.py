@@ -71,12 +71,19 @@ class ReflectionChains:
 
 
 def shoot(
-    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, depth: int, reflections: int, seed: int
+    scene: Any,
+    surfaces: Surfaces,
+    source_m: FloatArray,
+    rays: int,
+    depth: int,
+    reflections: int,
+    seed: int,
+    passing: bool = True,
 ) -> IntArray:
     """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
-    Rays leave on a randomly rotated Fibonacci lattice. Where waves are also transmitted (``depth`` is more than
-    ``reflections``), the rays are shot once for each choice of the hits that reflect. What they found is kept in the
+    Rays leave on a randomly rotated Fibonacci lattice. Where waves pass surfaces, the rays are shot once for each
+    choice of the hits that reflect: up to two to the power of the depth. What they found is kept in the
     process for `MOST_KEPT` bytes of the last calls: models, folds and carriers trace the same rooms from the same
     receivers.
 
@@ -88,15 +95,17 @@ def shoot(
         depth: largest number of surfaces met.
         reflections: largest number of reflections.
         seed: seed of the lattice's random rotation.
+        passing: whether rays pass surfaces, or are reflected at each.
 
     Returns:
         Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
     """
-    key = surfaces.digest, source_m.tobytes(), rays, depth, reflections, seed
+    key = surfaces.digest, source_m.tobytes(), rays, depth, reflections, seed, passing
     if key in _kept:
         _kept.move_to_end(key)
     else:
-        _kept[key] = _chains(scene, surfaces, source_m, rays, depth, reflections, seed)
+        reflecting = patterns(depth, reflections, passing)
+        _kept[key] = _chains(scene, surfaces, source_m, rays, depth, reflections, seed, reflecting)
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -104,13 +113,20 @@ def shoot(
 
 
 def _chains(
-    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, depth: int, reflections: int, seed: int
+    scene: Any,
+    surfaces: Surfaces,
+    source_m: FloatArray,
+    rays: int,
+    depth: int,
+    reflections: int,
+    seed: int,
+    choices: Sequence[tuple[int, ...]],
 ) -> IntArray:
     found = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
         return found[0]
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    for reflecting in _patterns(depth, reflections):
+    for reflecting in choices:
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
             sequence = np.full((stop - start, reflections), -1, np.int64)
@@ -121,8 +137,10 @@ def _chains(
     return unique_chains(np.concatenate(found))
 
 
-def _patterns(depth: int, reflections: int) -> list[tuple[int, ...]]:
-    """Indices of the hits that reflect: all choices that are not a prefix of another one."""
+def patterns(depth: int, reflections: int, passing: bool) -> list[tuple[int, ...]]:
+    """Indices of the hits that reflect: all choices that are not a prefix of another one, see `shoot`."""
+    if not passing:
+        return [tuple(range(reflections))]
     full = list(combinations(range(depth), reflections))
     fewer = [pattern for r in range(1, reflections) for pattern in combinations(range(depth), r)]
     return full + [pattern for pattern in fewer if depth - 1 - pattern[-1] < reflections - len(pattern)]

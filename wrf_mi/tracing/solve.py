@@ -121,7 +121,7 @@ class Prepared:
         """Chains from points [s, 3] by rays of any seed, not kept here."""
         met, surfaces, found = options.max_depth if options.transmission else options.reflections, self.surfaces, []
         for source_m in sources_m:
-            plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed)
+            plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed, options.transmission)
             image = image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:]
             found.append(ReflectionChains(plane, image, np.zeros(len(plane), np.int64)))
         return ReflectionChains.joined(found)
