@@ -110,13 +110,14 @@ def test_train_prints_a_table_and_progress_elsewhere(
     out_folder = tmp_path / "run"
     status, out, err = call(["train", folder, "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys)
     assert status == 0
-    head, own, blend, facts, where = out.splitlines()
+    head, own, blend, facts, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
     metrics = json.loads((out_folder / "metrics.json").read_text())
     for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw4"])):
         assert line.split()[-4:] == [f"{block[k]:.3f}" for k in ("median", "mean", "p10", "p90")]
     assert own.startswith("wrf-gs ")
     assert facts.startswith("split official, 19 training rows,")
+    assert worse.startswith("wrf-gs is no better than predicting the mean")  # after four steps
     assert where == f"results: {out_folder}"
     assert (metrics["model"], metrics["seed"], metrics["steps"]) == ("wrf-gs", 3, 4)
     assert re.fullmatch(

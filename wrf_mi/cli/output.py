@@ -50,10 +50,10 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
         f"{metrics['ms_per_sample']:.2g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
     )
-    if folder is not None:
-        print(f"results: {folder}")
     if line := unbeaten(metrics):
         print(line)
+    if folder is not None:
+        print(f"results: {folder}")
     return 0
 
 
