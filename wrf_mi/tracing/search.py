@@ -27,6 +27,8 @@ BESIDE = 1e-5
 displaced by `wrf_mi.tracing.images`."""
 MOST_KEPT = 1 << 27
 """Bytes of chains that a process keeps."""
+Choices = list[tuple[int, ...]]
+"""Indices of the hits that reflect, for each time that the rays are shot."""
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
@@ -104,8 +106,8 @@ def shoot(
     if key in _kept:
         _kept.move_to_end(key)
     else:
-        reflecting = patterns(depth, reflections, passing)
-        _kept[key] = _chains(scene, surfaces, source_m, rays, depth, reflections, seed, reflecting)
+        turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, depth, patterns(depth, reflections, passing))
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -113,19 +115,12 @@ def shoot(
 
 
 def _chains(
-    scene: Any,
-    surfaces: Surfaces,
-    source_m: FloatArray,
-    rays: int,
-    depth: int,
-    reflections: int,
-    seed: int,
-    choices: Sequence[tuple[int, ...]],
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, turn: FloatArray, depth: int, choices: Choices
 ) -> IntArray:
+    reflections = len(choices[0])
     found = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
         return found[0]
-    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     for reflecting in choices:
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
@@ -137,7 +132,7 @@ def _chains(
     return unique_chains(np.concatenate(found))
 
 
-def patterns(depth: int, reflections: int, passing: bool) -> list[tuple[int, ...]]:
+def patterns(depth: int, reflections: int, passing: bool) -> Choices:
     """Indices of the hits that reflect: all choices that are not a prefix of another one, see `shoot`."""
     if not passing:
         return [tuple(range(reflections))]
