@@ -8,7 +8,7 @@ found where planes have moved. What is kept is decided on other training rows.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -142,6 +142,7 @@ def correct_scene(
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
     parts = _parts(record, split)
+    hidden = _surfaces_of(prepared.tables("surface").slabs.names, supposed)
 
     def fit_of(record: Record, rows: IntArray, found: Found | None = None, by: Fit | None = None) -> Fit:
         """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a fit has found."""
@@ -151,7 +152,9 @@ def correct_scene(
             absent = by.absent(found.known, found.vector)
             parameters = {name: values.astype(np.float32) for name, values in by.of_scene(found).items()}
             searched = moved_search(copy, prepared.surfaces, parameters, absent)
-        how = search_options(options), options.changes, prepared, searched, supposed
+        # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
+        further = (by.misfit.planes, by.misfit.slabs) if by else hidden
+        how = search_options(options), options.changes, prepared, searched, further
         return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed, boxes.members)
 
     trial = fit_of(parts.known, parts.known_rows)
@@ -212,6 +215,13 @@ def correct_scene(
             "paths": sum(int(s.exists.sum()) for s in final.misfit.sides),
         },
     )
+
+
+def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArray, IntArray]:
+    """Numbers of the planes and of the surfaces of some objects, by the names of a scene's surfaces."""
+    parts = [name.rpartition("/")[::2] for name in names]
+    slabs = np.array([slab for slab, (thing, _) in enumerate(parts) if thing in objects], np.int64)
+    return np.array([int(parts[slab][1]) for slab in slabs], np.int64), slabs
 
 
 class _Stage(NamedTuple):

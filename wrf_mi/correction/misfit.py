@@ -7,7 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -58,7 +58,8 @@ class Misfit:
         wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
         prepared: shared state of the scene.
         searched: where paths are searched; None: in the scene as stated.
-        objects: names of objects all of whose surfaces have parameters; of others those that paths meet. None: all.
+        surfaces: numbers of planes and of surfaces of the scene that have parameters though no path meets them; all
+            others have none. None: all have parameters.
 
     Attributes:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
@@ -83,7 +84,7 @@ class Misfit:
         wanted: Callable[[str], bool],
         prepared: Prepared | None = None,
         searched: MovedSearch | None = None,
-        objects: Collection[str] | None = None,
+        surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
         self.record, self.rows, task = record, rows, task_of(record)
         placed = placed_receivers(record, by_uplink=False)
@@ -118,8 +119,8 @@ class Misfit:
         for receiver in placed:
             self._instruments |= instrument_parameters(receiver, options.gain, options.pattern_degree)
         self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self._tables.slabs.names))
-        if objects is not None:
-            self.planes, self.slabs = _met_surfaces(sides, self._tables.slabs.names, len(self.planes), objects)
+        if surfaces is not None:
+            self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
             tables = self._tables.select(shared.surfaces, self.planes, self.slabs)
             sides = [side.select(tables, self.planes, self.slabs) for side in sides]
         self.sides = sides
@@ -329,24 +330,21 @@ class Misfit:
 
 
 def _met_surfaces(
-    sides: Sequence[TracedField], names: Sequence[str], count: int, objects: Collection[str]
+    sides: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Numbers of the planes, of ``count``, and of the surfaces by ``names`` that paths meet or ``objects`` have.
+    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending.
 
     Of furniture of 100,000 facets, the paths of some rows meet hundreds.
     """
-    planes, slabs = np.zeros(count, bool), np.zeros(len(names), bool)
+    used_planes, used_slabs = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
+    used_planes[planes], used_slabs[slabs] = True, True
     for side in sides:
         for level in side.chains.levels:
-            used = (np.asarray(level.reflects) | np.asarray(level.transmits)) & side.exists
-            planes[np.asarray(level.plane)[used]] = True
-            slabs[np.asarray(level.material)[used]] = True
-    for slab, name in enumerate(names if objects else ()):
-        thing, _, plane = name.rpartition("/")
-        if thing in objects:
-            slabs[slab] = planes[int(plane)] = True
-    planes[:1], slabs[:1] = True, True  # Dr.Jit gathers from no empty array
-    return np.flatnonzero(planes), np.flatnonzero(slabs)
+            met = (np.asarray(level.reflects) | np.asarray(level.transmits)) & side.exists
+            used_planes[np.asarray(level.plane)[met]] = True
+            used_slabs[np.asarray(level.material)[met]] = True
+    used_planes[:1], used_slabs[:1] = True, True  # Dr.Jit gathers from no empty array
+    return np.flatnonzero(used_planes), np.flatnonzero(used_slabs)
 
 
 def _recorded_gain(side: TracedField) -> Recorded:
