@@ -8,7 +8,7 @@ found where planes have moved. What is kept is decided on other training rows.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -53,18 +53,19 @@ class Correction:
 
     Attributes:
         scene: the stated scene (``sionna.rt.Scene``).
-        misfit: residuals over all training rows.
+        misfit: residuals over all training rows, with parameters of the surfaces that their paths meet.
         kept: parts that were changed, joined by "+"; "" for none.
         vector: parameters [p] of `Misfit`.
         deviation: their standard deviations [p], 0 of those that were held.
         prior: standard deviations before the correction [p].
         free: indices of the changed entries.
         materials: material that each changed surface took first, by its name.
-        absent: slabs of surfaces that are left out.
+        absent: surfaces that are left out, by their numbers in the scene.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
         supposed: names of objects that the stated scene lacks (`wrf_mi.scene.hidden`).
         options: options.
+        scene_parameters: parameters by name for all planes and surfaces of the scene; none where nothing was changed.
         data: rows that were used, and how much smaller their errors are for it; None where nothing was changed.
         seconds: duration.
         facts: sizes for the page.
@@ -83,13 +84,14 @@ class Correction:
     kinds: Mapping[str, Kind]
     supposed: frozenset[str]
     options: CorrectionOptions
+    scene_parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     data: CorrectionData | None = None
     seconds: float = 0.0
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Parameters by the names of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
+        """Parameters of `misfit` by the names of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
         return self.misfit.named(self.vector)
 
 
@@ -143,15 +145,19 @@ def correct_scene(
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
     parts = _parts(record, split)
+    hidden = _surfaces_of(prepared.tables("surface").slabs.names, supposed)
 
-    def fit_of(record: Record, rows: IntArray, found: Found | None = None) -> Fit:
-        """Fit to paths of the stated scene, or to those of a scene whose planes have moved."""
+    def fit_of(record: Record, rows: IntArray, found: Found | None = None, by: Fit | None = None) -> Fit:
+        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a fit has found."""
         on_stage("tracing", 0.0)
         searched = None
-        if found and _moves(found.known.stage):
-            absent = trial.absent(found.known, found.vector)
-            searched = moved_search(copy, prepared.surfaces, trial.misfit.named(found.vector), absent)
-        how = search_options(options), options.changes, prepared, searched
+        if found and by and _moves(found.known.stage):
+            absent = by.absent(found.known, found.vector)
+            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(found).items()}
+            searched = moved_search(copy, prepared.surfaces, parameters, absent)
+        # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
+        further = (by.misfit.planes, by.misfit.slabs) if by else hidden
+        how = search_options(options), options.changes, prepared, searched, further
         return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed, boxes.members)
 
     trial = fit_of(parts.known, parts.known_rows)
@@ -159,27 +165,31 @@ def correct_scene(
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
-    chosen = trial.all_parts()
+    chosen = {stage: _Stage(found, trial) for stage, found in trial.all_parts().items()}
     stated = fit_of(parts.held, parts.held_rows).misfit
     unseen = dict.fromkeys(chosen, stated)
-    scores = {"": stated.scores(parts.with_mean_gain(trial.stated, trial.misfit))}
-    for stage, found in chosen.items():
+    scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}
+    for stage, (found, by) in chosen.items():
         if _moves(stage):
-            chosen[stage] = found = fit_of(parts.known, parts.known_rows, found).continued(found)
-            unseen[stage] = fit_of(parts.held, parts.held_rows, found).misfit
-        scores[stage] = unseen[stage].scores(parts.with_mean_gain(found.vector, trial.misfit))
+            again = fit_of(parts.known, parts.known_rows, found, by)
+            found, by = chosen[stage] = _Stage(again.continued(found, by), again)
+            unseen[stage] = fit_of(parts.held, parts.held_rows, found, by).misfit
+        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], found, by))
     judged = {key: parts.units(score) for key, score in scores.items()}
     kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
-    final = fit_of(record, split.all_train, best)
+    final = fit_of(record, split.all_train, *(best or ()))
     vector, deviation, free = final.stated, np.zeros(len(final.stated)), np.zeros(0, np.int64)
-    materials, absent, data = dict[str, str](), frozenset(final.supposed.values()), None
+    materials, parameters, data = dict[str, str](), dict[str, FloatArray](), None
+    absent = final.misfit.slabs[list(final.supposed.values())].tolist()
     if best:
-        solution = final.solve(kept, best.vector, best.known.mean)
-        vector, free = solution.vector, final.free(kept)
+        start = final.carried_over(*best)
+        solution = final.solve(kept, start.vector, start.known.mean)
+        last = Found(solution, start.known)
+        vector, free, parameters = solution.vector, final.free(kept), final.of_scene(last)
         deviation[free] = np.sqrt(np.diag(solution.covariance))
-        materials, absent = dict(best.known.materials), final.absent(best.known, vector)
-        before = parts.with_mean_gain(best.vector, trial.misfit), parts.with_mean_gain(vector, final.misfit)
+        materials, absent = dict(start.known.materials), final.absent(start.known, vector)
+        before = _vector_at(parts, unseen[kept], *best), parts.with_mean_gain(vector, final.misfit)
         others = final.left_out_residuals(kept, solution)
         ratio = _error_ratio(unseen[kept], before[0], final.misfit, before[1], others)
         data = CorrectionData(name, split.all_train, ratio)
@@ -193,11 +203,12 @@ def correct_scene(
         final.prior_deviation,
         free,
         materials,
-        absent,
+        frozenset(absent),
         scores,
         kinds,
         supposed,
         options,
+        parameters,
         data,
         time.perf_counter() - begun,
         {
@@ -207,6 +218,25 @@ def correct_scene(
             "paths": sum(int(s.exists.sum()) for s in final.misfit.sides),
         },
     )
+
+
+def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArray, IntArray]:
+    """Numbers of the planes and of the surfaces of some objects, by the names of a scene's surfaces."""
+    parts = [name.rpartition("/")[::2] for name in names]
+    slabs = np.array([slab for slab, (thing, _) in enumerate(parts) if thing in objects], np.int64)
+    return np.array([int(parts[slab][1]) for slab in slabs], np.int64), slabs
+
+
+class _Stage(NamedTuple):
+    """What a stage has found, and the fit that has."""
+
+    found: Found
+    by: Fit
+
+
+def _vector_at(parts: _Parts, misfit: Misfit, found: Found, by: Fit) -> FloatArray:
+    """Vector of a misfit of other rows from what a fit has found, with the mean gain at receivers held out."""
+    return parts.with_mean_gain(misfit.vector_of(by.of_scene(found)), misfit)
 
 
 def _error_ratio(unseen: Misfit, found: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:

@@ -16,7 +16,7 @@ from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .bodies import Bodies
 from .doubts import Doubts
-from .frame import rigid_motions
+from .frame import rigid_motions, scene_entries
 from .least_squares import Noise, Prior, Solution, left_out_residuals, minimised, solve
 from .misfit import Misfit
 from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
@@ -100,6 +100,7 @@ class Fit:
         self.stated = misfit.start.copy()
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
         planes, slabs = misfit.counts()
+        # Entries by their places in `Misfit.planes` and `Misfit.slabs`.
         self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
         self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
         self.planes = self.planes[np.argsort(-planes[self.planes], kind="stable")]
@@ -134,7 +135,7 @@ class Fit:
                 known = MATERIALS in parts and (self.misfit.several_carriers or not name.endswith(EXPONENT))
                 free.append(entries[self.slabs] if known else entries[:0])
             elif name in (SHIFT, TILT):
-                size = len(entries) // len(self.misfit.sides[0].surfaces.normal)
+                size = len(entries) // len(self.misfit.planes)
                 moved = entries.reshape(-1, size)[self.planes].ravel()
                 free.append(moved if PLANES in parts or FRAME in parts else entries[:0])
             else:
@@ -143,20 +144,21 @@ class Fit:
 
     def prior(self, mean: FloatArray, free: IntArray) -> Prior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
-        covariance = np.diag(np.square(self.prior_deviation))
+        covariance = np.diag(np.square(self.prior_deviation[free]))
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            motions = rigid_motions(self.misfit.sides[0].surfaces)
             deviation = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
-            places = self.misfit.plane_entries
-            covariance[np.ix_(places, places)] += (motions * deviation**2) @ motions.T
-        return Prior(mean[free], np.linalg.inv(covariance[np.ix_(free, free)]))
+            _, among, which = np.intersect1d(free, self.misfit.plane_entries, return_indices=True)
+            motions = self.misfit.motions[which]
+            covariance[np.ix_(among, among)] += (motions * deviation**2) @ motions.T
+        return Prior(mean[free], np.linalg.inv(covariance))
 
     def absent(self, known: Known, vector: FloatArray) -> frozenset[int]:
-        """Slabs of surfaces that are left out of the scene of a vector [p]."""
+        """Surfaces that are left out of the scene of a vector [p], by their numbers in the scene."""
         names = self.misfit.sides[0].slabs.names
         taken = [slab for slab, name in enumerate(names) if known.materials.get(name) == ABSENT]
         thin = {slab for slab in taken if vector[material_places(self.misfit, slab)[0]] < np.log(STILL_ABSENT)}
-        return frozenset(thin.union(set(self.supposed.values()).intersection(taken)))
+        absent = thin.union(set(self.supposed.values()).intersection(taken))
+        return frozenset(self.misfit.slabs[sorted(absent)].tolist())
 
     def all_parts(self) -> dict[str, Found]:
         """Results by the names of their parts: with materials alone, and with planes."""
@@ -185,8 +187,9 @@ class Fit:
             found = self.solved(vector, known)
         return found
 
-    def continued(self, found: Found) -> Found:
+    def continued(self, found: Found, by: Fit) -> Found:
         """Rounds of choices and least squares from what a fit to other paths has found."""
+        found = self.carried_over(found, by)
         choices, stage = self._choices(found.known.stage), found.known.stage
         found = Found(self.solve(stage, found.vector, found.known.mean), found.known)
         found = self._rounds(found, choices, range(1, ROUNDS + 1))
@@ -196,7 +199,7 @@ class Fit:
         """Choices of a stage."""
         parts, options, misfit = stage.split("+"), self.options, self.misfit
         shifts, materials = list[Choice](), list[Choice]()
-        if PLANES in parts or FRAME in parts:
+        if SHIFT in misfit.parts and (PLANES in parts or FRAME in parts):
             alone, common = PLANES in parts, FRAME in parts
             sd_m = float(np.hypot(options.shift_sd_m * alone, options.frame_sd_m * common))
             shifts = shift_choices(misfit, self.planes, sd_m, self.frequency_hz)
@@ -238,16 +241,36 @@ class Fit:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
         expected = vector[places].copy()
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            planes = self.misfit.plane_entries
-            known = np.isin(planes, np.setdiff1d(self.free(PLANES), places))
-            weight = known / np.square(self.prior_deviation[planes])
-            motions = rigid_motions(self.misfit.sides[0].surfaces)
-            before = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
-            information = motions.T @ (weight[:, None] * motions) + np.diag(before**-2.0)
-            motion = np.linalg.solve(information, motions.T @ (weight * vector[planes]))
-            here = dict(zip(planes, motions @ motion, strict=True))
+            here = dict(zip(self.misfit.plane_entries, self.misfit.motions @ self._motion(vector, places), strict=True))
             expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
         return expected
+
+    def _motion(self, vector: FloatArray, without: IntArray) -> FloatArray:
+        """Rigid motion [6] of the planes that enough paths meet, but for those of some entries."""
+        planes, motions = self.misfit.plane_entries, self.misfit.motions
+        known = np.isin(planes, np.setdiff1d(self.free(PLANES), without))
+        weight = known / np.square(self.prior_deviation[planes])
+        before = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
+        information = motions.T @ (weight[:, None] * motions) + np.diag(before**-2.0)
+        return np.asarray(np.linalg.solve(information, motions.T @ (weight * vector[planes])), float)
+
+    def of_scene(self, found: Found) -> dict[str, FloatArray]:
+        """Parameters by name for all planes and surfaces of the scene: planes that no path meets move with the frame,
+        their materials are as stated.
+        """
+        misfit, parameters = self.misfit, self.misfit.of_scene(found.vector)
+        if FRAME in found.known.stage.split("+"):
+            surfaces = misfit.sides[0].surfaces
+            count = len(surfaces.normal)
+            moved = rigid_motions(surfaces) @ self._motion(found.vector, misfit.plane_entries[:0])
+            moved[scene_entries(misfit.planes, count)] = found.vector[misfit.plane_entries]
+            parameters |= {SHIFT: moved[:count], TILT: moved[count:].reshape(count, 2)}
+        return parameters
+
+    def carried_over(self, found: Found, by: Fit) -> Found:
+        """What a fit to other paths, which meet other surfaces, has found: vector and means of this fit's entries."""
+        vector, mean = map(self.misfit.vector_of, (by.of_scene(found), by.misfit.of_scene(found.known.mean)))
+        return Found(replace(found.solution, vector=vector), replace(found.known, mean=mean))
 
     def refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..tracing.surfaces import Surfaces
 from ..tracing.walls import plane_centres
 
@@ -24,6 +25,11 @@ def rigid_motions(surfaces: Surfaces) -> FloatArray:
     turn = np.cross(normal[:, None], axes)
     tilt = np.concatenate([np.zeros_like(turn), turn], axis=2).reshape(-1, 6)
     return np.concatenate([shift, tilt])
+
+
+def scene_entries(planes: IntArray, count: int) -> IntArray:
+    """Rows of `rigid_motions` of some of ``count`` planes, by their numbers [k]: shifts, then tilts, [3 k]."""
+    return np.concatenate([planes, count + (2 * planes[:, None] + np.arange(2)).ravel()])
 
 
 def rigid_motion(surfaces: Surfaces, change: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -29,11 +30,14 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
 from ..tracing.instrument_parameters import instrument_parameters
+from ..tracing.material_parameters import PREFIX, SlabMaterials
 from ..tracing.moved_scene import MovedSearch
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions
+from ..tracing.walls import plane_centres
+from .frame import rigid_motions, scene_entries
 from .options import PATTERNS, CorrectionOptions
 
 LATTICE = (12, 40)
@@ -54,6 +58,8 @@ class Misfit:
         wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
         prepared: shared state of the scene.
         searched: where paths are searched; None: in the scene as stated.
+        surfaces: numbers of planes and of surfaces of the scene that have parameters though no path meets them; all
+            others have none. None: all have parameters.
 
     Attributes:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
@@ -61,6 +67,8 @@ class Misfit:
         sides: traced side of each of these at each carrier, receiver by receiver.
         models: receiver models of the sides.
         places: entries of ``observed`` of each side.
+        planes: numbers of the scene's planes whose shifts and tilts are entries of the vector, in their order.
+        slabs: numbers of the scene's surfaces whose materials are.
         start: stated values of the vector [p].
         parts: slice of each parameter in the vector, by name.
         observed: observations [n_rx * rows, values] in the residuals' unit, NaN where nothing was received.
@@ -76,6 +84,7 @@ class Misfit:
         wanted: Callable[[str], bool],
         prepared: Prepared | None = None,
         searched: MovedSearch | None = None,
+        surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
         self.record, self.rows, task = record, rows, task_of(record)
         placed = placed_receivers(record, by_uplink=False)
@@ -84,6 +93,7 @@ class Misfit:
         self.receivers = [placed[number] for number in seen]
         self._image = task.image
         shared = prepared or Prepared(scene)
+        self._tables = shared.tables(options.materials)
         shape = record.observation.shape[2:]
         size, whole_size = (1, 1), (1, 1)
         if task.image:
@@ -93,23 +103,29 @@ class Misfit:
         outputs = tuple(map(int, shape)) if task.is_complex else ()
         floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
         form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
-        self.sides, self.places = list[TracedField](), list[IntArray]()
+        sides, self.places = list[TracedField](), list[IntArray]()
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in zip(seen, self.receivers, strict=True):
             given = record.tx_pos_m[rows], receiver, options, shared, heading, carriers
-            self.sides += traced_fields(scene, *given, searched=searched)
+            sides += traced_fields(scene, *given, searched=searched)
             for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))
                 self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
                 self.places.append(number * len(rows) + which)
         # The same order of entries whichever receivers are seen.
-        own = instrument_parameters(self.receivers[0], options.gain, options.pattern_degree)
-        every = {name: value for name, value in self.sides[0].parameters().items() if name not in own}
+        self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
-            every |= instrument_parameters(receiver, options.gain, options.pattern_degree)
-        values = {name: value for name, value in every.items() if wanted(name)}
+            self._instruments |= instrument_parameters(receiver, options.gain, options.pattern_degree)
+        self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self._tables.slabs.names))
+        if surfaces is not None:
+            self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
+            tables = self._tables.select(shared.surfaces, self.planes, self.slabs)
+            sides = [side.select(tables, self.planes, self.slabs) for side in sides]
+        self.sides = sides
+        every = {name: value for name, value in sides[0].parameters().items() if name.startswith((PREFIX, SHIFT, TILT))}
+        values = {name: value for name, value in (every | self._instruments).items() if wanted(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
@@ -118,6 +134,41 @@ class Misfit:
         self._reports = [self._recorded(r, tangent=False) for r in range(len(self.sides))]
         self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
         self._gains = [_recorded_gain(side) for side in self.sides]
+
+    @property
+    def scene_slabs(self) -> SlabMaterials:
+        """Stated materials of all surfaces of the scene."""
+        return self._tables.slabs
+
+    @cached_property
+    def centre_m(self) -> FloatArray:
+        """Centres of the planes, [k, 3] in metres."""
+        return plane_centres(self.sides[0].surfaces)[0][self.planes]
+
+    @cached_property
+    def motions(self) -> FloatArray:
+        """Derivatives of `plane_entries` by a rigid motion of the scene [3 k, 6] (`rigid_motions`)."""
+        every = rigid_motions(self.sides[0].surfaces)
+        return every[scene_entries(self.planes, len(every) // 3)]
+
+    def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
+        """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
+        stated = self._tables.slabs.parameters(thickness=True, exponent=True) | self._tables.planes.parameters()
+        found = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
+        for name in stated.keys() & found.keys():
+            every = stated[name].astype(float)
+            every[self.slabs if name.startswith(PREFIX) else self.planes] = found[name]
+            found[name] = every
+        return found
+
+    def vector_of(self, parameters: Mapping[str, FloatArray]) -> FloatArray:
+        """The vector [p] of parameters of the whole scene, as of `of_scene` of a misfit of other rows."""
+        every = np.zeros(len(self.start))
+        for name, part in self.parts.items():
+            numbers = self.slabs if name.startswith(PREFIX) else self.planes
+            chosen = parameters[name] if name in self._instruments else parameters[name][numbers]
+            every[part] = chosen.ravel()
+        return every
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
         """Observations and their units [n_rx * rows], in which residuals are."""
@@ -266,15 +317,34 @@ class Misfit:
         return {name: int(name.rpartition("/")[2]) for name in self.sides[0].slabs.names}
 
     def counts(self) -> tuple[IntArray, IntArray]:
-        """Number of paths that each plane reflects [q] and that meet each slab [n], over all receivers."""
-        first = self.sides[0]
-        planes, slabs = np.zeros(len(first.surfaces.normal), np.int64), np.zeros(len(first.slabs.names), np.int64)
+        """Number of paths that each plane of ``planes`` reflects, and that meet each slab of ``slabs``, over all
+        receivers.
+        """
+        planes, slabs = np.zeros(len(self.planes), np.int64), np.zeros(len(self.slabs), np.int64)
         for side in self.sides:
             for level in side.chains.levels:
                 reflects, passes = (np.asarray(mask) & side.exists for mask in (level.reflects, level.transmits))
                 np.add.at(planes, np.asarray(level.plane)[reflects], 1)
                 np.add.at(slabs, np.asarray(level.material)[reflects | passes], 1)
         return planes, slabs
+
+
+def _met_surfaces(
+    sides: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending.
+
+    Of furniture of 100,000 facets, the paths of some rows meet hundreds.
+    """
+    used_planes, used_slabs = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
+    used_planes[planes], used_slabs[slabs] = True, True
+    for side in sides:
+        for level in side.chains.levels:
+            met = (np.asarray(level.reflects) | np.asarray(level.transmits)) & side.exists
+            used_planes[np.asarray(level.plane)[met]] = True
+            used_slabs[np.asarray(level.material)[met]] = True
+    used_planes[:1], used_slabs[:1] = True, True  # Dr.Jit gathers from no empty array
+    return np.flatnonzero(used_planes), np.flatnonzero(used_slabs)
 
 
 def _recorded_gain(side: TracedField) -> Recorded:

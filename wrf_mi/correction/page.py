@@ -38,7 +38,7 @@ from ..tracing.material_parameters import SURFACE, name_of, slabs_of_faces
 from ..tracing.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
-from .frame import rigid_motion
+from .frame import rigid_motion, scene_entries
 from .options import FRAME, MATERIALS
 from .search import CONSTANTS, QUANTITIES
 
@@ -69,7 +69,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
         write_corrected_scene(
             part,
             correction.scene,
-            correction.parameters if correction.kept else {},
+            correction.scene_parameters,
             grouping="surface",
             kinds=correction.kinds,
             absent=correction.absent,
@@ -111,6 +111,7 @@ def _facts(correction: Correction) -> dict[str, Any]:
         **correction.facts,
         DATA: correction.data and correction.data.facts(),
         "frame": _frame(correction),
+        "surfaces": len(misfit.scene_slabs.names),
         "planes": _planes(correction),
         "materials": _materials(correction),
         "parameters": parameters,
@@ -122,12 +123,17 @@ def _stage(stage: str) -> str:
 
 
 def _planes(correction: Correction) -> list[dict[str, Any]]:
-    """Each plane: objects, paths, movement and its standard deviation."""
+    """Each plane that paths meet: objects, paths, movement and its standard deviation."""
     misfit, surfaces = correction.misfit, correction.misfit.sides[0].surfaces
     if SHIFT not in misfit.parts:
         return []
-    count = len(surfaces.normal)
-    paths, things = misfit.counts()[0], surfaces.object_of(np.arange(len(surfaces.plane)))
+    count, paths = len(misfit.planes), misfit.counts()[0]
+    faces = np.flatnonzero(np.isin(surfaces.plane, misfit.planes))
+    objects = [set[str]() for _ in range(count)]
+    for place, thing in zip(
+        np.searchsorted(misfit.planes, surfaces.plane[faces]), surfaces.object_of(faces), strict=True
+    ):
+        objects[place].add(surfaces.names[thing])
     shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
     turned = correction.vector[tilt].reshape(count, 2)
     turned_sd = correction.deviation[tilt].reshape(count, 2)
@@ -135,8 +141,8 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
     ratio = correction.deviation[shift] / correction.prior[shift]
     return [
         {
-            "objects": sorted({surfaces.names[thing] for thing in things[surfaces.plane == plane]}),
-            "normal": surfaces.normal[plane].round(4).tolist(),
+            "objects": sorted(objects[plane]),
+            "normal": surfaces.normal[misfit.planes[plane]].round(4).tolist(),
             "paths": int(paths[plane]),
             "shift_mm": 1e3 * float(correction.vector[shift][plane]),
             "shift_sd_mm": 1e3 * float(correction.deviation[shift][plane]) if free[plane] else None,
@@ -149,7 +155,7 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
 
 
 def _materials(correction: Correction) -> list[dict[str, Any]]:
-    """Each surface: paths, constants before and after, standard deviations of their logarithms."""
+    """Each surface that paths meet: paths, constants before and after, standard deviations of their logarithms."""
     misfit, slabs = correction.misfit, correction.misfit.sides[0].slabs
     paths = misfit.counts()[1]
     before = material_constants(slabs, {})
@@ -167,7 +173,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
                 "surface": name.partition("/")[0],
                 "paths": int(paths[index]),
                 "first_choice": correction.materials.get(name),
-                "absent": index in correction.absent,
+                "absent": misfit.slabs[index] in correction.absent,
                 "permittivity": [float(before[index, 0]), float(after[index, 0])],
                 "conductivity": [float(before[index, 1]), float(after[index, 1])],
                 "thickness_m": [float(before[index, 2]), float(after[index, 2])],
@@ -184,10 +190,12 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
     misfit = correction.misfit
     if FRAME not in correction.kept.split("+"):
         return None
-    places = misfit.plane_entries
-    free = np.isin(places, correction.free)
-    deviation = np.where(free, correction.deviation[places], np.inf)
-    motion, sd = rigid_motion(misfit.sides[0].surfaces, correction.vector[places], 1 / np.square(deviation))
+    surfaces, places = misfit.sides[0].surfaces, misfit.plane_entries
+    change, precision = np.zeros((2, 3 * len(surfaces.normal)))
+    entries, free = scene_entries(misfit.planes, len(surfaces.normal)), np.isin(places, correction.free)
+    change[entries] = correction.vector[places]
+    precision[entries[free]] = 1 / np.square(correction.deviation[places[free]])
+    motion, sd = rigid_motion(surfaces, change, precision)
     return {
         "translation_mm": (1e3 * motion[:3]).tolist(),
         "translation_sd_mm": (1e3 * sd[:3]).tolist(),
@@ -256,11 +264,11 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
             taken = "absent, left out" if one["absent"] else one["first_choice"] or "as stated"
             lines.append(f"| {one['surface']} | {one['paths']} | {taken} | " + " | ".join(cells) + " |")
         lines.append("")
-    few = sum(one["sd_log"] is None for one in facts["materials"])
+    few = facts["surfaces"] - len(fitted)
     lines += [
         "## What the data do not tell",
         "",
-        f"- {few} of {len(facts['materials'])} surfaces are as stated: fewer than {LEAST_PATHS} paths meet them"
+        f"- {few} of {facts['surfaces']} surfaces are as stated: fewer than {LEAST_PATHS} paths meet them"
         f"{'' if MATERIALS in facts['kept'] else ', or no change of materials was kept'}.",
         f'- "Measured" are quantities whose standard deviation fell below {SUPPORTED:.0%} of the one before; '
         "`x/ 1.2` is a factor of one standard deviation.",
@@ -279,8 +287,8 @@ def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list
     """The change of the material of each face, a key of `CHANGES`."""
     side = correction.misfit.sides[0]
     slab_of_face = slabs_of_faces(side.scene, side.surfaces, "surface")[1]
-    of_slab = [AS_STATED] * len(facts["materials"])
-    for index, one in enumerate(facts["materials"]):
+    of_slab = [AS_STATED] * facts["surfaces"]
+    for index, one in zip(correction.misfit.slabs, facts["materials"], strict=True):
         if one["sd_log"] is not None:
             of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
     return [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
@@ -289,19 +297,18 @@ def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     """The scene coloured by the shifts of its planes, or where none moved by its materials, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
-    triangles = moved_triangles(surfaces, correction.parameters if correction.kept else {})
-    shift = np.array([plane["shift_mm"] for plane in facts["planes"]])
+    triangles = moved_triangles(surfaces, correction.scene_parameters)
+    shift = np.zeros(len(surfaces.normal)) + 1e3 * correction.scene_parameters.get(SHIFT, 0.0)
     figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
-    shown = [
-        k
-        for k in range(len(triangles))
-        if correction.kinds.get(surfaces.names[surfaces.object_of(np.array([k]))[0]]) != "ceiling"
-    ]
-    if not shift.any():
+    above = [correction.kinds.get(name) == "ceiling" for name in surfaces.names]
+    shown = ~np.array(above)[surfaces.object_of(np.arange(len(triangles)))]
+    if not any(plane["shift_mm"] for plane in facts["planes"]):
         label, which = "materials of surfaces", _changes_of_materials(correction, facts)
         colours = np.array([to_rgba(CHANGES[one], alpha=0.45) for one in which])[shown]
-        room.legend(handles=[Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES], fontsize=8)
+        handles = [Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES]
+        # At a fixed place: the best one is searched for among all corners of all faces.
+        room.legend(handles=handles, fontsize=8, loc="upper left")
     else:
         label, most = "shifts of planes along their normals", max(1.0, float(np.abs(shift).max()))
         shades = ScalarMappable(Normalize(-most, most), "RdBu")

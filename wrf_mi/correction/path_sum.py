@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
+from scipy.sparse import coo_array, csr_array, vstack
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -25,7 +26,7 @@ from ..tasks import task_of
 from ..tracing.image_method import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.walls import moved_planes, plane_centres
+from ..tracing.walls import moved_planes
 from .sums import Channels, Complex, Reports, Spectra, Strengths
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ class PathSum:
         self._planes = np.zeros((len(self._row), 0), np.int64)
         if len(self._plane_places):
             sides = [_geometry(misfit, number, entries, vector) for number, entries in enumerate(self._entries)]
-            length, self.slope, self._planes = (np.concatenate(each) for each in zip(*sides, strict=True))
+            length, self._planes = (np.concatenate([side[part] for side in sides]) for part in (0, 2))
+            self.slope = vstack([side[1] for side in sides], "csr")
         self._unit: Complex | None = None
         self._reports: Reports
         if task.in_decibel:
@@ -73,7 +75,7 @@ class PathSum:
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
         self._touched: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
         self._phase: tuple[tuple[bytes, ...], Complex] = (), np.zeros((0, 0), complex)
-        count = len(misfit.sides[0].surfaces.normal)
+        count = len(misfit.planes)
         self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])[: len(self._plane_places)]
         material = [part for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         places = np.array([np.arange(part.start, part.stop) for part in material], np.int64)
@@ -146,7 +148,7 @@ class PathSum:
                 by_gain = (1j if imaginary else 1) if self._unit is not None else (0 if imaginary else 2)
                 changes.append((rows, by_gain * total[rows]))
             elif column in self._plane_places:
-                slope = self.slope[:, np.flatnonzero(self._plane_places == column)[0]]
+                slope = self.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()[:, 0]
                 moved = np.flatnonzero(slope)
                 rows = np.unique(self._row[moved])
                 change = present[moved] * (-1j * slope[moved, None] * self._wavenumber(moved))
@@ -265,19 +267,19 @@ def _met(misfit: Misfit, entries: Sequence[IntArray]) -> tuple[IntArray, IntArra
 
 def _geometry(
     misfit: Misfit, number: int, exists: IntArray, vector: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
+) -> tuple[FloatArray, csr_array, IntArray]:
     """Paths ``exists`` of one side.
 
     Returns:
         Lengths [n], their derivatives by shifts, then tilts [n, 3 q], and reflecting planes at each interaction
-        [n, depth], -1 for none; the depth is the largest of all sides.
+        [n, depth], -1 for none; the depth is the largest of all sides. Of the q planes of the misfit.
     """
-    side, receiver = misfit.sides[number], misfit.sides[number].receiver
-    surfaces, count = side.surfaces, len(side.surfaces.normal)
-    centre = plane_centres(surfaces)[0]
+    side, receiver, chosen = misfit.sides[number], misfit.sides[number].receiver, misfit.planes
+    surfaces, count, centre = side.surfaces, len(chosen), misfit.centre_m
+    axes = surfaces.axes[chosen]
     shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
     change = np.column_stack([shift, tilt.reshape(count, 2)])
-    normal, offset = moved_planes(surfaces.normal, surfaces.axes, centre, change)
+    normal, offset = moved_planes(surfaces.normal[chosen], axes, centre, change)
 
     def taken(values: Any) -> NDArray[Any]:
         return np.asarray(values)[exists]
@@ -292,15 +294,17 @@ def _geometry(
         row = np.flatnonzero(at >= 0)
         image[row] = mirrored(image[row], normal[at[row]], offset[at[row]])
     length = np.linalg.norm(image - point, axis=1)
-    way, slope = (image - point) / length[:, None], np.zeros((len(point), 3 * count))
+    way, none = (image - point) / length[:, None], np.zeros(0, np.int64)
+    slopes = [(none, none, np.zeros(0))]  # sparse: a path meets few planes
     for at in plane:
         row = np.flatnonzero(at >= 0)
         q, n = at[row], normal[at[row]]
         along = (way[row] * n).sum(axis=1)
         point[row] += way[row] * ((offset[q] - (point[row] * n).sum(axis=1)) / along)[:, None]
-        flat = np.einsum("nad,nd->na", surfaces.axes[q], point[row] - centre[q])
-        slope[row, q] += 2 * along
-        for axis in range(2):
-            slope[row, count + 2 * q + axis] -= 2 * along * flat[:, axis]
+        flat = np.einsum("nad,nd->na", axes[q], point[row] - centre[q])
+        slopes.append((row, q, 2 * along))
+        slopes += [(row, count + 2 * q + axis, -2 * along * flat[:, axis]) for axis in range(2)]
         way[row] = mirrored(way[row], n)
-    return length, slope, plane.T
+    rows, columns, values = (np.concatenate(each) for each in zip(*slopes, strict=True))
+    # Slopes of a plane that reflects a path twice are added.
+    return length, coo_array((values, (rows, columns)), (len(point), 3 * count)).tocsr(), plane.T

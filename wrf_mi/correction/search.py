@@ -116,8 +116,8 @@ def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, frequency_hz: floa
     values = {f"{1e3 * shift:+.0f} mm": np.array([shift, np.nan, np.nan]) for shift in shifts}
     shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
     places = {plane: np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in hit}
-    of_plane = np.ones(3, bool)
-    return [Choice(f"plane {plane}", place, values, of_plane) for plane, place in places.items()] if most else []
+    of_plane, names = np.ones(3, bool), [f"plane {number}" for number in misfit.planes]
+    return [Choice(names[plane], place, values, of_plane) for plane, place in places.items()] if most else []
 
 
 def joint_choices(

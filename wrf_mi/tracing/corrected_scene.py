@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -37,6 +36,9 @@ from .walls import moved_planes, plane_centres
 FLAT = 0.2
 """Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
 may lie far from it."""
+FACET_M2, CREASE_COS = 0.01, np.cos(np.radians(30))
+"""Area in square metres below which a surface is a facet, and cosine of the bend towards a neighbour below which both
+are: sides of boxes are none."""
 UNCHANGED = 1e-4
 """Relative change of a constant below which a material keeps its name: less than any measurement supports."""
 ODD_IN_FILES, ODD_IN_MATERIALS = r"[^\w.-]", r"[^A-Za-z0-9_]"
@@ -61,19 +63,23 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
         ValueError: parameters of a scene with another number of planes.
     """
     normal, offset = planes_at(surfaces, parameters)
-
     corners = surfaces.triangles.reshape(-1, 3)
     _, first, same = np.unique(np.round(corners / SAME_CORNER_M), axis=0, return_index=True, return_inverse=True)
     same = same.reshape(-1)
     pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
-    bounds = np.searchsorted(pairs[:, 0], np.arange(len(first) + 1))
     area = np.bincount(surfaces.plane, trimesh.triangles.area(surfaces.triangles), len(normal)).astype(float)
+    planes, count = _determining(pairs, len(first), area, normal)
     way = np.zeros((len(first), 3))
-    for corner, (low, high) in enumerate(pairwise(bounds)):
-        plane = _determining(pairs[low:high, 1], area, normal)
+    for size in range(1, 4):
+        corner = np.flatnonzero(count == size)
+        plane = planes[corner, :size]
         # Relative to the corner: the distance of faces from their planes within the tolerance stays.
-        off = offset[plane] - surfaces.offset[plane] - (normal - surfaces.normal)[plane] @ corners[first[corner]]
-        way[corner] = np.linalg.lstsq(normal[plane], off)[0]
+        change = np.einsum("cpx,cx->cp", (normal - surfaces.normal)[plane], corners[first[corner]])
+        off = offset[plane] - surfaces.offset[plane] - change
+        # The shortest way: a combination of the normals, which are far from parallel.
+        across = normal[plane]
+        share = np.linalg.solve(across @ across.swapaxes(1, 2), off[..., None])
+        way[corner] = (across.swapaxes(1, 2) @ share)[..., 0]
     return (corners + way[same]).reshape(-1, 3, 3)
 
 
@@ -92,15 +98,33 @@ def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tup
     return moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
 
 
-def _determining(planes: IntArray, area: FloatArray, normal: FloatArray) -> IntArray:
-    """Of planes at a corner, the largest first, those that are not parallel to what the larger ones span."""
-    kept, basis = list[int](), np.zeros((0, 3))
-    for plane in planes[np.argsort(-area[planes], kind="stable")]:
-        across = normal[plane] - basis.T @ (basis @ normal[plane])
-        if (size := float(np.linalg.norm(across))) > FLAT:
-            kept.append(plane)
-            basis = np.vstack([basis, across / size])
-    return np.array(kept)
+def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArray) -> tuple[IntArray, IntArray]:
+    """Of the planes at each of ``count`` corners, the largest first, those that are not parallel to what the larger
+    ones span.
+
+    Args:
+        pairs: corner and plane [n, 2].
+        count: number of corners c.
+        area: area of each plane [q].
+        normal: unit normals [q, 3].
+
+    Returns:
+        Planes [c, 3] and their numbers [c].
+    """
+    corner, plane = pairs[np.lexsort((pairs[:, 1], -area[pairs[:, 1]], pairs[:, 0]))].T
+    first = np.searchsorted(corner, np.arange(count + 1))
+    planes, basis, number = np.zeros((count, 3), np.int64), np.zeros((count, 3, 3)), np.zeros(count, np.int64)
+    for rank in range(int(np.diff(first).max(initial=0))):
+        row = np.flatnonzero((first[:-1] + rank < first[1:]) & (number < 3))
+        candidate = plane[first[row] + rank]
+        along = np.einsum("cbx,cx->cb", basis[row], normal[candidate])
+        across = normal[candidate] - np.einsum("cb,cbx->cx", along, basis[row])
+        size = np.linalg.norm(across, axis=1)
+        new = size > FLAT
+        row, place = row[new], number[row[new]]
+        planes[row, place], basis[row, place] = candidate[new], across[new] / size[new, None]
+        number[row] += 1
+    return planes, number
 
 
 def check_materials(scene: Any) -> None:
@@ -146,9 +170,10 @@ def write_corrected_scene(
 ) -> Path:
     """Write a scene with moved planes and changed materials as a scene folder.
 
-    Objects whose surfaces differ in material become several. Materials that have not changed keep their names, unless
-    Sionna RT does not know them at the carrier that the scene is set to; others have constants, which hold there, and
-    the exponent of the conductivity with the frequency.
+    Each surface becomes an object, but facets of an object that have not changed stay one object: those of curved
+    furniture are many. Materials that have not changed keep their names, unless Sionna RT does not know them at the
+    carrier that the scene is set to; others have constants, which hold there, and the exponent of the conductivity with
+    the frequency.
 
     Args:
         folder: the new folder.
@@ -172,19 +197,30 @@ def write_corrected_scene(
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
-    stated, fitted = material_constants(slabs, {}), material_constants(slabs, parameters)
-    exponent = material_exponents(slabs, parameters)
-    changed: NDArray[np.bool_] = np.any(np.abs(fitted - stated) > UNCHANGED * np.abs(stated), axis=1)
+    fitted, exponent = material_constants(slabs, parameters), material_exponents(slabs, parameters)
+    # As stated, or as parameters state it: metal has a permittivity of 1, of whose logarithm less one there is none.
+    stated = [material_constants(slabs, start) for start in ({}, slabs.parameters(thickness=True))]
+    changed: NDArray[np.bool_] = np.all(
+        [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated], axis=0
+    )
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
     entries, constants = dict[str, str](), dict[str, dict[str, float]]()
     fitted_names = dict[str, str]()
+    together = ~changed & _facets(surfaces, slab_of_face, len(slabs.names))
+    together[list(absent)] = False
     for index, name in enumerate(surfaces.names):
         faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])
-        present = [slab for slab in np.unique(slab_of_face[faces]) if slab not in absent]
-        for number, slab in enumerate(present):
-            part = plain_name(name if len(present) == 1 else f"{name}_{number + 1:02d}", ODD_IN_FILES, entries)
-            corners = triangles[faces[slab_of_face[faces] == slab]].reshape(-1, 3)
+        slab_of_part = slab_of_face[faces]
+        small = (slab_of_part >= 0) & together[slab_of_part]  # absorbers have no slab
+        slab_of_part[small] = slab_of_part[small].min(initial=len(slabs.names))
+        order = np.argsort(slab_of_part, kind="stable")
+        present, first = np.unique(slab_of_part[order], return_index=True)
+        pieces = np.split(faces[order], first[1:])
+        written = [(slab, piece) for slab, piece in zip(present, pieces, strict=True) if slab not in absent]
+        for number, (slab, piece) in enumerate(written):
+            part = plain_name(name if len(written) == 1 else f"{name}_{number + 1:02d}", ODD_IN_FILES, entries)
+            corners = triangles[piece].reshape(-1, 3)
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
             material = scene.objects[name].radio_material.name
@@ -213,6 +249,24 @@ def write_corrected_scene(
         description="A scene corrected by measurements",
         replace=replace,
     )
+
+
+def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[np.bool_]:
+    """Mask of ``count`` surfaces that are facets of curved or small things: small, or with a neighbour in the same
+    object that bends little.
+    """
+    known, area = slab_of_face >= 0, trimesh.triangles.area(surfaces.triangles)
+    facets: NDArray[np.bool_] = np.bincount(slab_of_face[known], area[known], count) < FACET_M2
+    corners = np.round(surfaces.triangles.reshape(-1, 3) / SAME_CORNER_M)
+    vertices, same = np.unique(corners, axis=0, return_inverse=True)
+    pairs = trimesh.Trimesh(vertices, same.reshape(-1, 3), process=False).face_adjacency
+    plane, thing = surfaces.plane[pairs], surfaces.object_of(pairs)
+    bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
+    smooth = (
+        (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS) & known[pairs].all(axis=1)
+    )
+    facets[slab_of_face[pairs[smooth]]] = True
+    return facets
 
 
 def _rounded(value: float) -> float:

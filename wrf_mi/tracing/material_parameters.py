@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import drjit as dr
@@ -34,6 +34,8 @@ LEAST_CONDUCTIVITY = 1e-6
 PREFIX, EXPONENT = "material.", "exponent"
 SURFACE = "surface"
 """In place of a material's name: parameters [n] of all surfaces."""
+COLUMNS = ("permittivity", "conductivity", "thickness_m", "reflected", "exponent")
+"""Constants of `SlabMaterials`, each an array."""
 MaterialGrouping = Literal["named", "surface"]
 """Whether each named material, or each surface, has a permittivity and a conductivity."""
 
@@ -67,6 +69,11 @@ class SlabMaterials:
     exponent: FloatArray
     grouping: MaterialGrouping = "named"
 
+    def select(self, slabs: IntArray) -> SlabMaterials:
+        """Materials by their numbers, in that order."""
+        columns = {name: getattr(self, name)[slabs] for name in COLUMNS}
+        return replace(self, names=tuple(self.names[slab] for slab in slabs), **columns)
+
     def parameters(self, thickness: bool = False, exponent: bool = False) -> dict[str, NDArray[np.float32]]:
         """Parameters x, y and, with the thickness, z, and the exponent d: of each material [1], or of all surfaces
         [n].
@@ -87,8 +94,7 @@ class SlabMaterials:
 
     def constants(self, float_type: Any) -> list[Any]:
         """Stated permittivity, conductivity, thickness, reflected share and exponent, [n] each, on the device."""
-        columns = self.permittivity, self.conductivity, self.thickness_m, self.reflected, self.exponent
-        return columns_on_device(columns, float_type)
+        return columns_on_device([getattr(self, name) for name in COLUMNS], float_type)
 
     def tables(
         self, parameters: Mapping[str, Any], stated: Sequence[Any], frequency_ratio: float = 1.0
@@ -162,8 +168,4 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
     pairs, surface = np.unique(np.stack([thing, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
     slab_of_face[is_slab] = surface.reshape(-1)
     names = tuple(f"{surfaces.names[index]}/{plane}" for index, plane in pairs)
-    which = number[pairs[:, 0]]
-    columns = named.permittivity, named.conductivity, named.thickness_m, named.reflected, named.exponent
-    permittivity, conductivity, thickness_m, reflected, exponent = (column[which] for column in columns)
-    found = SlabMaterials(names, permittivity, conductivity, thickness_m, reflected, exponent, grouping)
-    return found, slab_of_face
+    return replace(named.select(number[pairs[:, 0]]), names=names, grouping=grouping), slab_of_face

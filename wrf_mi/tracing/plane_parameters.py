@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.device import columns_on_device, on_device
+from ..core.types import IntArray
 from .field_calculator import Level, Vector
 from .surfaces import Surfaces
 from .walls import plane_centres
@@ -51,14 +52,14 @@ class PlaneTables:
     axes: list[Vector]
 
     @classmethod
-    def of(cls, surfaces: Surfaces) -> PlaneTables:
-        """Tables of a scene's surfaces."""
+    def of(cls, surfaces: Surfaces, planes: IntArray | slice = slice(None)) -> PlaneTables:
+        """Tables of a scene's surfaces, or of some of its planes in the order of their numbers ``planes`` [q]."""
 
         def columns(vectors: NDArray[Any]) -> Vector:
-            return columns_on_device(vectors.T, Float64)
+            return columns_on_device(vectors[planes].T, Float64)
 
         axes = [columns(surfaces.axes[:, k]) for k in range(2)]
-        offset = on_device(surfaces.offset, Float64)
+        offset = on_device(surfaces.offset[planes], Float64)
         return cls(columns(surfaces.normal), offset, columns(plane_centres(surfaces)[0]), axes)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:

@@ -15,6 +15,7 @@ searches again. Planes that move keep their paths (see `wrf_mi.tracing.plane_par
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -43,7 +44,7 @@ from .path_chains import chains_of
 from .pattern_parameters import pattern_factor
 from .pose import component, moved_m, receiver_pose, spread_pose
 from .result import without_faint
-from .scene_tables import SceneTables
+from .scene_tables import SceneTables, renumbered
 from .solve import Prepared
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 from .surfaces import Surfaces, scene_surfaces
@@ -180,9 +181,7 @@ class TracedField:
             text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
             raise InputError(f"{text}; trace these")
         kind = options.materials
-        tables = prepared.tables(kind) if prepared else SceneTables.of(scene, self.surfaces, kind)
-        self.slabs, self._slab_of_face = tables.slabs, tables.slab_of_face
-        self._constants, self._planes = tables.constants, tables.planes
+        self._set_tables(prepared.tables(kind) if prepared else SceneTables.of(scene, self.surfaces, kind))
         if traced is None:
             self.search(here)
         else:
@@ -302,6 +301,20 @@ class TracedField:
     def interactions(self) -> Interactions:
         """Points at which paths meet surfaces, as found with the planes as stated."""
         return self._met
+
+    def select(self, tables: SceneTables, planes: IntArray, slabs: IntArray) -> TracedField:
+        """The same paths with parameters of some planes and materials alone, all those that paths meet among them.
+
+        The result is not searched again: ``tables`` (`SceneTables.select`) have no other surfaces.
+        """
+        result = copy(self)
+        result._set_tables(tables)
+        result.chains = replace(self.chains, levels=renumbered(self.chains.levels, planes, slabs))
+        return result
+
+    def _set_tables(self, tables: SceneTables) -> None:
+        self.slabs, self._slab_of_face = tables.slabs, tables.slab_of_face
+        self._constants, self._planes = tables.constants, tables.planes
 
     def attach(self, gaussians: SurfaceGaussians) -> None:
         """Let Gaussians on the surfaces change paths, by the parameter `wrf_mi.tracing.options.FACTOR`."""

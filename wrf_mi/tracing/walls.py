@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -117,7 +118,16 @@ def walls_of(surfaces: Surfaces) -> Walls:
     centre, total = plane_centres(surfaces)
     flat = np.einsum("fad,fcd->fca", surfaces.axes[plane], triangles - centre[plane, None])
     low, high = plane_bounds(plane, flat, count)
-    edges = [outline_edges(flat[plane == q]) for q in range(count)]
+    # Faces by their planes: a mask of all faces for each plane would take the square of their number.
+    order, sizes = np.argsort(plane, kind="stable"), np.bincount(plane, minlength=count)
+    parts = np.split(flat[order], np.cumsum(sizes)[:-1]) if count else []
+    alone = np.flatnonzero(sizes == 1)
+    sides, simple = _sides_of_one(np.array([parts[q][0] for q in alone]).reshape(-1, 3, 2))
+    edges: list[FloatArray] = [np.zeros((0, 2, 2))] * count
+    for q, outline in zip(alone[simple], sides[simple], strict=True):
+        edges[q] = outline
+    for q in np.setdiff1d(np.arange(count), alone[simple]):
+        edges[q] = outline_edges(parts[q])
     first = np.cumsum([0, *(len(part) for part in edges)])
     return Walls(
         surfaces.normal,
@@ -130,6 +140,24 @@ def walls_of(surfaces: Surfaces) -> Walls:
         np.concatenate([np.zeros((0, 2, 2)), *edges]),
         np.asarray(first, np.int64),
     )
+
+
+def _sides_of_one(triangles_m: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Sides [f, 3, 2, 2] of single triangles [f, 3, 2] as `outline_edges` has them, and which have no others [f].
+
+    Slivers, of whose sides two may lie on one line, have others. Curved furniture has 100,000 single triangles.
+    """
+    first, second = triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0]
+    twice = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    start = np.where((twice < 0)[:, None, None], triangles_m[:, ::-1], triangles_m)
+    along = np.roll(start, -1, axis=1) - start
+    length = np.linalg.norm(along, axis=2)
+    simple = np.abs(twice) > 4 * ON_LINE_M * length.max(axis=1, initial=0)  # heights above 4 ON_LINE_M
+    longest = np.argsort(-length, axis=1, kind="stable")[..., None]
+    start, along = (np.take_along_axis(each, longest, axis=1) for each in (start, along))
+    length = np.take_along_axis(length, longest[..., 0], axis=1)[..., None]
+    end = start + np.round(length / ON_LINE_M) * ON_LINE_M * np.divide(along, length, where=length > 0, out=along)
+    return np.stack([start, end], axis=2), simple
 
 
 def outline_edges(triangles_m: FloatArray) -> FloatArray:
