@@ -263,7 +263,8 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
     plane, thing = surfaces.plane[pairs], surfaces.object_of(pairs)
     bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
     smooth = (
-        (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS) & known[pairs].all(axis=1)
+        (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS)
+    smooth &= known[pairs].all(axis=1)
     )
     facets[slab_of_face[pairs[smooth]]] = True
     return facets
