@@ -262,10 +262,8 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
     pairs = trimesh.Trimesh(vertices, same.reshape(-1, 3), process=False).face_adjacency
     plane, thing = surfaces.plane[pairs], surfaces.object_of(pairs)
     bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
-    smooth = (
-        (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS)
+    smooth = (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS)
     smooth &= known[pairs].all(axis=1)
-    )
     facets[slab_of_face[pairs[smooth]]] = True
     return facets
 
