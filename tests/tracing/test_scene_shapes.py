@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, THICKNESS_M, receiver, write_xml
 from wrf_mi_scenes.build_laboratory import sheet
 
@@ -158,8 +159,8 @@ def test_triangles_that_mitsuba_reads_alike_stay_in_its_order(tmp_path: Path) ->
 
 def test_names_of_textures_and_shapes_without_ids_stay(tmp_path: Path) -> None:
     """Shapes within a merge shape, and a BSDF with a picture, too."""
-    mi.Bitmap(np.zeros((2, 2, 3), np.float32)).write(str(tmp_path / "wood.exr"))
-    picture = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.exr"/></texture>'
+    Image.new("RGB", (2, 2)).save(tmp_path / "wood.png")
+    picture = '<texture type="bitmap" name="reflectance"><string name="filename" value="wood.png"/></texture>'
     looks = f'<bsdf type="diffuse" id="mat-itu_wood">{picture}</bsdf>'
     shapes = f'<shape type="disk">{looks}</shape>{file_shape("ply", "quad.ply", "")}'
     surfaces = surfaces_of(scene_file(tmp_path, shapes))
