@@ -24,6 +24,8 @@ CLEAR = 2.5e-5
 """The same as a share of `Surfaces.scale_m`: twice as far as `wrf_mi.tracing.images.displaced` moves an antenna."""
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
+ON_SHARE = 0.1
+"""Depth behind a surface, as a share of `clear_m`, up to which an antenna counts as on it: rounding of its position."""
 OUTSIDE_M = 0.02
 """Distance beyond the box around the scene from which an antenna is named: the wall before it may let no path pass."""
 PAIRS_PER_CHUNK = 1 << 20
@@ -84,6 +86,13 @@ def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
             low = sides * height < clear
             moved[near[low]] += (sides * clear - height)[low, None] * normal
     return moved
+
+
+def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
+    """Positions [n, 3] of which those behind a surface, not those on it, are moved as by `before_surfaces`."""
+    moved = before_surfaces(surfaces, positions_m)
+    behind = np.linalg.norm(moved - positions_m, axis=1) > (1 + ON_SHARE) * clear_m(surfaces)
+    return np.where(behind[:, None], moved, positions_m)
 
 
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from .buffer import SPECULAR, Legs, join, specular_legs
+from .devices import before_surfaces, clear_m
 from .image_method import image_sources, meeting_point
 from .options import TraceOptions
+from .seams import reflect_on_faces
 from .search import ReflectionChains, possible
 from .surfaces import Surfaces
 from .visibility import unobstructed
@@ -59,20 +61,24 @@ def specular_paths(
     columns = [(np.full(np.count_nonzero(apart), -1), source[apart], target[apart])]
     columns += [(chain, chains.source[chain], target) for chain, target in possible(surfaces, chains, targets_m)]
     candidates = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    clear_sources, clear_targets = (
+        before_surfaces(surfaces, ends) - surfaces.centre_m for ends in (sources_m, targets_m)
+    )
     parts = []
     for start in range(0, len(candidates[0]), CANDIDATES_PER_CHUNK):
         chain, source, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         plane = np.where(chain[:, None] >= 0, chains.plane[chain], -1) if len(chains) else chain[:, None][:, :0]
         # Whether a path exists is told near its ends, not at them; its points are exact.
-        near = displaced(
-            surfaces.scale_m, *(ends - surfaces.centre_m for ends in (sources_m[source], targets_m[target]))
-        )
+        near = displaced(surfaces.scale_m, clear_sources[source], clear_targets[target])
         vertices, meets = _vertices(surfaces, plane, *(ends + surfaces.centre_m for ends in near))
+        meets &= ~_mounted(surfaces, plane, sources_m[source], targets_m[target])
         row = np.flatnonzero(meets)
         met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission)
         kept = row[met.candidate]
         found = specular_legs(source[kept], target[kept], met.interactions, met.face, met.points_m)
-        parts.append(_exact(surfaces, chains, chain[kept], found, sources_m, targets_m))
+        exact = _exact(surfaces, chains, chain[kept], found, sources_m, targets_m)
+        valid = reflect_on_faces(surfaces, exact)
+        parts.append(exact if valid.all() else exact.select(valid))
     return join(parts, depth)
 
 
@@ -114,6 +120,20 @@ def _vertices(
         vertices[row, level + 1] = here[row]
         meets[row] &= near * far < 0
     return vertices, meets
+
+
+def _mounted(surfaces: Surfaces, plane: IntArray, source_m: FloatArray, target_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of chains [n, b] whose first or last plane holds the source, or the target: an antenna on a wall has no
+    image in it.
+    """
+    rows, last = np.arange(len(plane)), np.count_nonzero(plane >= 0, axis=1) - 1
+    mounted = np.zeros(len(plane), bool)
+    if not plane.shape[1]:
+        return mounted
+    for mirror, ends in ((plane[:, 0], source_m), (plane[rows, last], target_m)):
+        height = (surfaces.normal[mirror] * ends).sum(axis=1) - surfaces.offset[mirror]
+        mounted |= (last >= 0) & (np.abs(height) < 1.5 * clear_m(surfaces))
+    return mounted
 
 
 def _exact(

@@ -15,13 +15,16 @@ from trimesh.triangles import closest_point
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .buffer import SPECULAR, TRANSMISSION
+from .buffer import SPECULAR, TRANSMISSION, Legs
 from .screens import ENLARGED
 from .surfaces import Surfaces
 
 NEAR = 1e-5
 """Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
 times that within which rays do not count them (`wrf_mi.tracing.visibility.WINDOW`)."""
+SEAM_M, SEAM = 5e-5, 1e-6
+"""Distance from a face in metres, and the same as a share of the scale, within which a point is on it: half the gap that
+sheets leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
 PAIRS_TOGETHER = 1 << 20
 """Pairs of points and planes, or faces, in a chunk."""
 UNKNOWN_FACE = (1 << 31) - 1
@@ -120,6 +123,21 @@ def _with_faces(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met
     face[path, slot], points_m[path, slot] = nearest, points
     every[path[away_m > ENLARGED * surfaces.scale_m]] = False
     return met._replace(face=face, points_m=points_m).select(every), every
+
+
+def reflect_on_faces(surfaces: Surfaces, legs: Legs) -> NDArray[np.bool_]:
+    """Mask of paths [p] whose points of reflection are on faces, and not beside them where rays meet enlarged ones."""
+    path, slot = np.nonzero(legs.interactions == SPECULAR)
+    points, face = legs.vertices_m[path, slot], legs.face[path, slot]
+    normal, offset = surfaces.face_edges
+    # Heights above the three edges; beyond one, another face of the plane may go on.
+    height = np.einsum("nkc,nc->nk", normal[face], points) - offset[face]
+    seam_m = max(SEAM_M, SEAM * surfaces.scale_m)
+    beside = np.flatnonzero(height.min(axis=1) < -seam_m)
+    away_m = nearest_faces(surfaces, surfaces.plane[face[beside]], points[beside])[1]
+    valid = np.ones(len(legs), bool)
+    valid[path[beside[away_m > seam_m]]] = False
+    return valid
 
 
 def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> tuple[IntArray, FloatArray]:

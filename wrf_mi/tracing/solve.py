@@ -18,7 +18,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from .buffer import Legs, join
-from .devices import before_surfaces, check_devices, clear_m
+from .devices import before_surfaces, check_devices, from_behind
 from .estimate import check_search
 from .fields import path_gains, scattering_materials
 from .image_method import image_sources
@@ -78,19 +78,18 @@ class Prepared:
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
             new = np.array([row for row in side if stated[row].tobytes() not in self._checked], int)
-            traced = before_surfaces(self.surfaces, stated[new])
-            # Those on a surface are moved, too, by less than a mesh's error.
-            far = np.linalg.norm(stated[new] - traced, axis=1) > 1.5 * clear_m(self.surfaces)
-            if len(moved := new[far]):
+            traced = from_behind(self.surfaces, stated[new])
+            if len(moved := new[(stated[new] != traced).any(axis=1)]):
                 text = "%d of %d antennas lie up to 1 cm behind a surface (first: %s): traced from 0.1 mm before it"
                 logger.warning(text, len(moved), len(new), names[moved[0]])
-            check_devices(self.surfaces, traced, [names[row] for row in new])
+            check_devices(self.surfaces, before_surfaces(self.surfaces, traced), [names[row] for row in new])
             self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
-        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.before_surfaces`."""
+        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.from_behind`."""
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
-        positions, others = np.split(before_surfaces(self.surfaces, stated), [len(tx_pos_m)])
+        # Those on a surface stay: their paths are searched for before it, and have the lengths from the surface.
+        positions, others = np.split(from_behind(self.surfaces, stated), [len(tx_pos_m)])
         return positions, tuple(replace(rx, position_m=here) for rx, here in zip(receivers, others, strict=True))
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:

@@ -111,6 +111,15 @@ class Surfaces:
         return shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T)), np.stack([low, high], axis=1)
 
     @cached_property
+    def face_edges(self) -> tuple[FloatArray, FloatArray]:
+        """Unit vectors [f, 3, 3] in each face across its edges, inwards, and their products with the edges [f, 3]."""
+        along = np.roll(self.triangles, -1, axis=1) - self.triangles
+        inwards = np.cross(trimesh.triangles.cross(self.triangles)[:, None], along)
+        size = np.linalg.norm(inwards, axis=2, keepdims=True)
+        inwards = np.divide(inwards, size, out=np.zeros_like(inwards), where=size > 0)
+        return inwards, (inwards * self.triangles).sum(axis=2)
+
+    @cached_property
     def faces_by_plane(self) -> tuple[IntArray, IntArray]:
         """Faces sorted by their plane, and the first of each plane among them [q + 1]."""
         order = np.argsort(self.plane, kind="stable")
