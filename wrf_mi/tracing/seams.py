@@ -23,8 +23,8 @@ NEAR = 1e-5
 """Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
 times that within which rays do not count them (`wrf_mi.tracing.visibility.WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
-"""Distance from a face in metres, and the same as a share of the scale, within which a point is on it: half the gap that
-sheets leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
+"""Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
+leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
 PAIRS_TOGETHER = 1 << 20
 """Pairs of points and planes, or faces, in a chunk."""
 UNKNOWN_FACE = (1 << 31) - 1
