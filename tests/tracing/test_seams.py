@@ -16,6 +16,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.backend.device import to_vectors
 from wrf_mi.core import Paths
 from wrf_mi.tracing import TraceOptions, trace_paths
+from wrf_mi.tracing.buffer import TRANSMISSION
 from wrf_mi.tracing.images import displaced
 from wrf_mi.tracing.screens import ENLARGED, OVERLAP, enlarged, scale_m, screens
 from wrf_mi.tracing.solve import Prepared
@@ -152,6 +153,7 @@ PAIRS = (
     ([1.0, 1, 1], [2.0, 2, 2]),
     ([1.0, 1, 1], [2.0, 1, 2]),
     ([2.0, 2, 1], [4.0, 3, 1]),
+    ([1.5, 1.25, 0.75], [2.4, 2.0, 1.2]),
 )
 """Pairs with paths through edges of the shoebox, in which two reflections coincide."""
 
@@ -291,3 +293,70 @@ def test_no_ray_passes_at_an_edge_within_a_surface():
         away = away[np.abs(away @ normal) > 0.2]
         ray = mi.Ray3f(to_vectors(at[: len(away)] - 3 * away, mi.Point3f), to_vectors(away, mi.Vector3f))
         assert scene.ray_intersect_preliminary(ray, coherent=False).is_valid().numpy().all()
+
+
+BLOCK = ("itu_concrete", trimesh.creation.box(bounds=[(0, 0, 0), (6, 4, 2.6)]))
+JUNCTIONS: Mapping[str, tuple[Parts, list[float], list[float], int]] = {
+    "antenna on a partition": (
+        {"room": BLOCK, "wall": ("itu_concrete", sheet(0, 4.0, (0.0, 4.0), (0.0, 2.6)))},
+        [1.7, 2.2, 1.3],
+        [4.0, 1.0, 2.0],
+        7,
+    ),
+    "antenna on a cabinet, over its edge": (
+        {"room": BLOCK, "cabinet": ("itu_wood", trimesh.creation.box(bounds=[(1, 1, 0), (2, 2, 1)]))},
+        [3.0, 3.0, 0.5],
+        [1.5, 1.5, 1.0],
+        7,
+    ),
+    "reflection where two walls meet": (
+        {
+            "wall": ("itu_concrete", sheet(0, 4.0, (0.0, 4.0), (0.0, 2.7))),
+            "other": ("itu_concrete", sheet(1, 2.0, (4.0, 8.0), (0.0, 2.7))),
+            "floor": ("itu_concrete", sheet(2, 0.0, (0.0, 8.0), (0.0, 4.0))),
+        },
+        [4.5, 3.5, 1.0],
+        [4.5, 0.5, 0.5],
+        3,
+    ),
+    "transmission where two walls cross": (
+        {
+            "wall": ("itu_concrete", sheet(1, 3.0, (0.0, 8.0), (0.0, 2.7))),
+            "other": ("itu_concrete", sheet(0, 4.0, (0.0, 6.0), (0.0, 2.7))),
+        },
+        [7.5, 5.5, 1.35],
+        [0.5, 0.5, 1.35],
+        1,
+    ),
+}
+"""Parts, both antennas, and the number of paths at least, with one reflection at most."""
+
+
+@pytest.mark.parametrize("name", JUNCTIONS)
+def test_paths_at_junctions_are_those_of_the_other_direction(tmp_path: Path, name: str):
+    parts, a, b, least = JUNCTIONS[name]
+    scene = room(tmp_path, parts)
+    options = TraceOptions(max_depth=3, max_reflections=1, transmission=True)
+    there, back = (trace_paths(scene, [x], receiver(y), options).paths for x, y in ((a, b), (b, a)))
+    assert len(there) == len(back) >= least
+    for unit in (there.departure, there.arrival):
+        np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1, atol=EXACT_M)
+    passed = [np.sort((paths.interactions == TRANSMISSION).sum(axis=1)) for paths in (there, back)]
+    np.testing.assert_array_equal(*passed)
+    if "cross" in name:
+        assert passed[0].tolist() == [2]
+    power = [10 * np.log10(np.square(np.abs(paths.gain)).sum()) for paths in (there, back)]
+    assert power[0] == pytest.approx(power[1], abs=SLOPE_DB)
+
+
+def test_halls_of_round_sizes_do_not_leak(tmp_path: Path):
+    """Places at which displacements of a rational ratio cancel at the end of the wall between both halls."""
+    for number, (size, source, target) in enumerate(
+        (((80, 40, 27), [2.5, 12.5, 10], [60, 20, 13.5]), ((48, 24, 16.2), [1.5, 7.5, 8.1], [36, 12, 3]))
+    ):
+        wall = sheet(0, size[0] / 2, (0.0, float(size[1])), (0.0, float(size[2])))
+        hall = trimesh.creation.box(bounds=[(0, 0, 0), size])
+        scene = room(tmp_path / str(number), {"hall": ("itu_metal", hall), "wall": ("itu_metal", wall)})
+        for a, b in ((source, target), (target, source)):
+            paths = trace_paths(scene, [a], receiver(b), TraceOptions(max_depth=3), gains=False, check=False).paths
+            assert not len(paths)

@@ -255,3 +255,10 @@ def test_fine_and_coarse_walls_give_the_same_paths(tmp_path: Path):
     np.testing.assert_allclose(found[1].length_m, found[0].length_m, atol=1e-9)
     np.testing.assert_allclose(found[1].gain, found[0].gain, atol=1e-5 * np.abs(found[0].gain).max())
     assert sheet(2, 0.0, (0.0, 1.0), (0.0, 1.0)).area == pytest.approx(1)
+
+
+def test_a_mesh_with_dots_in_its_name_opens(tmp_path: Path):
+    """Mitsuba's names have none."""
+    box((0, 0, 0), (6, 5, 3)).export(tmp_path / "room.v2.stl")
+    scene = open_scene(tmp_path / "room.v2.stl", FREQUENCY_HZ, material="wood")
+    assert list(scene.objects) == ["room_v2"]

@@ -22,6 +22,8 @@ from .surfaces import Surfaces
 
 PATHS_PER_CHUNK = 1 << 19
 """Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
+COINCIDENT_M = 1e-9
+"""Distance within which an interaction is at the antenna, or at its image, so that it tells no direction."""
 SHORT = 1e-4
 """Distance to which coinciding points are moved apart, as a share of `Surfaces.scale_m`: single precision gives the
 direction from one to the other to 1e-3 rad."""
@@ -181,7 +183,11 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     plane = np.where(reflects, surfaces.plane[legs.face[row]], -1)
     image = image_sources(surfaces.normal, surfaces.offset, plane, points[row, 0])
     direction = points[row, 1:] - image
-    direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-30)
+    size = np.linalg.norm(direction, axis=2, keepdims=True)
+    direction /= np.maximum(size, 1e-30)
+    for leg in reversed(range(direction.shape[1] - 1)):  # an antenna within a sheet that its path passes
+        at_image = size[:, leg] < COINCIDENT_M
+        direction[:, leg] = np.where(at_image, direction[:, leg + 1], direction[:, leg])
     moved = np.zeros_like(points[row])
     for leg in range(short.shape[1]):  # forwards from a point that stays
         step = (moved[:, leg] + SHORT * surfaces.scale_m * direction[:, leg]) * short[row, leg, None]

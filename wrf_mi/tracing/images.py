@@ -27,8 +27,9 @@ COINCIDENT_M = 1e-6
 DISPLACED = 5e-6
 """Displacement of a pair's first antenna, as a share of `Surfaces.scale_m`: 0.05 mm at 10 m, eighty times the rounding
 of a coordinate in single precision."""
-FARTHER = 1.6
-"""Displacement of the pair's second antenna by that of the first."""
+FARTHER = (1 + np.sqrt(5)) / 2
+"""Displacement of the pair's second antenna by that of the first: irrational, as mirrored displacements of both would
+cancel at places of round numbers."""
 ASLANT = np.array([1.0, 0.7548776662466927, 0.5698402909980532])
 """Direction of both: powers of the plastic number, so that no plane of a building is parallel to it, nor at a simple
 ratio."""

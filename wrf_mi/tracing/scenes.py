@@ -138,7 +138,8 @@ def _from_mesh(path: Path, material: str) -> Any:
         objects = []
         for index, part in enumerate(parts):
             # Vertices and faces only: Mitsuba warns of unknown attributes.
-            name = path.stem if len(parts) == 1 else f"{path.stem}_{index}"
+            stem = path.stem.replace(".", "_")  # Mitsuba's names have no dots
+            name = stem if len(parts) == 1 else f"{stem}_{index}"
             file = Path(folder) / f"{name}.ply"
             trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)
             objects.append(rt.SceneObject(fname=str(file), name=name, radio_material=radio_material))

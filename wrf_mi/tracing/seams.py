@@ -52,12 +52,18 @@ class Met(NamedTuple):
 
 
 class _Crossings(NamedTuple):
-    """Crossings [n]: paths, legs, faces, and whether each is at the start of the leg."""
+    """Crossings [n]: paths, legs, faces, shares of the legs before them, and points [n, 3]."""
 
     path: IntArray
     leg: IntArray
     face: IntArray
-    at_start: NDArray[np.bool_]
+    share: FloatArray
+    points_m: FloatArray
+
+    def select(self, which: NDArray[Any]) -> _Crossings:
+        """The crossings of a mask or of indices."""
+        path, leg, face, share, points_m = self
+        return _Crossings(path[which], leg[which], face[which], share[which], points_m[which])
 
 
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
@@ -72,7 +78,7 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     """
     met, faces = _with_faces(surfaces, vertices_m, plane, met)
     vertices_m, plane = vertices_m[faces], plane[faces]
-    crossings = _crossings(surfaces, vertices_m, plane)
+    crossings = _crossings(surfaces, vertices_m, plane, met)
     if not len(crossings.path):
         return met
     # Few paths have any: the others stay as they are.
@@ -80,7 +86,7 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     part = met.select(few)
     new = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
     if transmission:
-        part, valid = _inserted(part, new, vertices_m[few[new.path], new.leg + ~new.at_start])
+        part, valid = _inserted(part, new, vertices_m[few])
     else:
         valid = ~np.isin(np.arange(len(few)), new.path)
     met.interactions[few], met.face[few], met.points_m[few] = part.interactions, part.face, part.points_m
@@ -89,18 +95,20 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     return met if valid.all() else met.select(kept)
 
 
-def _inserted(met: Met, new: _Crossings, points_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
-    """Paths [k] with further transmissions at points [n, 3], and the mask of those that are not too deep."""
+def _inserted(met: Met, new: _Crossings, vertices_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
+    """Paths [k] with further transmissions, and the mask of those that are not too deep."""
     path, slot = np.nonzero(met.interactions)
     mirrors = met.interactions[path, slot] == SPECULAR
     leg = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot] - mirrors
-    # On each leg crossings at its start, those that rays met, crossings at its end, and the reflection there.
-    place = np.concatenate([np.where(mirrors, 3, 1), np.where(new.at_start, 0, 2)])
+    start, end = vertices_m[path, leg], vertices_m[path, leg + 1]
+    away = np.linalg.norm(met.points_m[path, slot] - start, axis=1) / np.linalg.norm(end - start, axis=1)
+    # By their place on the leg, and the reflections of a cluster, which end it together, in their order.
+    place = np.concatenate([np.where(mirrors, 2.0, away), new.share])
     paths, legs = np.concatenate([path, new.path]), np.concatenate([leg, new.leg])
-    order = np.lexsort((np.concatenate([slot, np.zeros_like(new.leg)]), place, legs, paths))
+    order = np.lexsort((place, legs, paths))
     kinds = np.concatenate([met.interactions[path, slot], np.full(len(new.path), TRANSMISSION, np.uint8)])[order]
     faces = np.concatenate([met.face[path, slot], new.face])[order]
-    points = np.concatenate([met.points_m[path, slot], points_m])[order]
+    points = np.concatenate([met.points_m[path, slot], new.points_m])[order]
     paths = paths[order]
     slots = np.arange(len(paths)) - np.searchsorted(paths, paths)
     within = slots < met.face.shape[1]
@@ -154,37 +162,55 @@ def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> 
     return face, away_m
 
 
-def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray) -> _Crossings:
-    """All crossings of faces within `NEAR` of a point of reflection, each leg and plane once."""
+def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met) -> _Crossings:
+    """All crossings of faces within `NEAR` of a point where a path meets another surface, each leg and plane once."""
     path, level = np.nonzero(plane >= 0)
-    points, near_m = vertices_m[path, level + 1], NEAR * surfaces.scale_m
-    point, crossed = _near_planes(surfaces, plane[path, level], points, near_m)
+    row, slot = np.nonzero(met.interactions == TRANSMISSION)
+    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[row, slot]
+    mirrored = _near_planes(surfaces, plane[path, level], vertices_m[path, level + 1])
+    passed = _near_planes(surfaces, surfaces.plane[met.face[row, slot]], met.points_m[row, slot])
+    # At a reflection, both of its legs; at a transmission, which rays do not tell from another one at the same point,
+    # the leg that it is on.
+    places = ((path, level, mirrored), (path, level + 1, mirrored), (row, leg, passed))
+    parts = [_crossed(surfaces, vertices_m, plane, *place) for place in places]
+    crossings = _Crossings(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    key = np.stack([crossings.path, crossings.leg, surfaces.plane[crossings.face]])
+    _, once = np.unique(key, axis=1, return_index=True)
+    return crossings.select(once)
+
+
+def _crossed(
+    surfaces: Surfaces,
+    vertices_m: FloatArray,
+    plane: IntArray,
+    path: IntArray,
+    leg: IntArray,
+    near: tuple[IntArray, IntArray, FloatArray],
+) -> _Crossings:
+    """Crossings of the planes near points, on one leg [n] of each point's path [n]."""
+    point, crossed, points = near
+    row, leg = path[point], leg[point]
     normal, offset = surfaces.normal[crossed], surfaces.offset[crossed]
+    start, end = vertices_m[row, leg], vertices_m[row, leg + 1]
+    before, after = ((ends * normal).sum(axis=1) - offset for ends in (start, end))
+    # The planes on which the leg begins and ends have heights of zero, whose signs are rounding.
     ends_on = np.pad(plane, ((0, 0), (1, 1)), constant_values=-1)
-    parts = []
-    for at_start in (False, True):
-        row, leg = path[point], level[point] + at_start
-        start, end = vertices_m[row, leg], vertices_m[row, leg + 1]
-        before, after = ((ends * normal).sum(axis=1) - offset for ends in (start, end))
-        # The planes on which the leg begins and ends have heights of zero, whose signs are rounding.
-        crosses = (before * after < 0) & (crossed != ends_on[row, leg]) & (crossed != ends_on[row, leg + 1])
-        index = np.flatnonzero(crosses)
-        share = before[index] / (before[index] - after[index])
-        where = start[index] + (end[index] - start[index]) * share[:, None]
-        near = np.linalg.norm(where - points[point[index]], axis=1) < near_m
-        index, where = index[near], where[near]
-        face, away_m = nearest_faces(surfaces, crossed[index], where)
-        closed = away_m < ENLARGED * surfaces.scale_m
-        index, face = index[closed], face[closed]
-        parts.append((row[index], leg[index], face, np.full(len(index), at_start), crossed[index]))
-    row, leg, face, starts, crossed = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    # Where both ends of a leg are near the crossing, it is listed twice.
-    _, once = np.unique(np.stack([row, leg, crossed]), axis=1, return_index=True)
-    return _Crossings(row[once], leg[once], face[once], starts[once])
+    crosses = ((before > 0) != (after > 0)) & (crossed != ends_on[row, leg]) & (crossed != ends_on[row, leg + 1])
+    index = np.flatnonzero(crosses)
+    share = before[index] / (before[index] - after[index])
+    where = start[index] + (end[index] - start[index]) * share[:, None]
+    close = np.linalg.norm(where - points[index], axis=1) < NEAR * surfaces.scale_m
+    index, where, share = index[close], where[close], share[close]
+    face, away_m = nearest_faces(surfaces, crossed[index], where)
+    closed = away_m < ENLARGED * surfaces.scale_m
+    index = index[closed]
+    return _Crossings(row[index], leg[index], face[closed], share[closed], where[closed])
 
 
-def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray, near_m: float) -> tuple[IntArray, IntArray]:
-    """Pairs of points [n, 3] on planes [n] and other planes within a distance, whose faces touch those of the first."""
+def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Points [n, 3] on planes [n] that are within `NEAR` of another plane whose faces touch those of the first: the
+    point's index, the other plane, and the point, for each pair.
+    """
     tree, boxes = surfaces.boxes
     groups = list(_by_value(plane))
     mirrors = np.array([mirror for mirror, _ in groups], np.int64)
@@ -199,10 +225,10 @@ def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray, near
         others = touching[first[number] : first[number + 1]]
         for part in np.array_split(rows, -(-len(rows) * max(len(others), 1) // PAIRS_TOGETHER)):
             height = points_m[part] @ surfaces.normal[others].T - surfaces.offset[others]
-            row, other = np.nonzero(np.abs(height) < near_m)
+            row, other = np.nonzero(np.abs(height) < NEAR * surfaces.scale_m)
             parts.append((part[row], others[other]))
     point, other = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return point, other
+    return point, other, points_m[point]
 
 
 def _by_value(values: IntArray) -> Iterator[tuple[int, IntArray]]:
@@ -220,6 +246,4 @@ def _unrecorded(surfaces: Surfaces, legs: int, met: Met, crossings: _Crossings) 
     columns = [(path, leg, surfaces.plane[met.face[path, slot]])]
     columns += [(crossings.path, crossings.leg, surfaces.plane[crossings.face])]
     known, new = ((row * legs + at) * len(surfaces.normal) + crossed for row, at, crossed in columns)
-    unknown = ~np.isin(new, known)
-    path, leg, face, at_start = crossings
-    return _Crossings(path[unknown], leg[unknown], face[unknown], at_start[unknown])
+    return crossings.select(~np.isin(new, known))

@@ -20,7 +20,7 @@ from ..core.types import IntArray
 from .buffer import Legs, join
 from .devices import before_surfaces, check_devices, from_behind
 from .estimate import check_search
-from .fields import path_gains, scattering_materials
+from .fields import COINCIDENT_M, path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
@@ -315,9 +315,16 @@ def _paths(
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
     legs, gain, length = legs.select(order), gain[order], length[order]
     tx, rx, vertices = tx_pos_m[legs.source], rx_pos_m[legs.target], legs.vertices_m
-    bounces = np.count_nonzero(legs.interactions, axis=1)
-    first = np.where(bounces[:, None] > 0, vertices[:, 0], rx)
-    last = np.where(bounces[:, None] > 0, vertices[np.arange(len(legs)), np.maximum(bounces - 1, 0)], tx)
+    # Nearest points that tell a direction: an antenna may be within a sheet that its path passes.
+    first, last = rx, tx
+    for level in range(vertices.shape[1]):
+        for ends, back in ((tx, vertices.shape[1] - 1 - level), (rx, level)):
+            point, used = vertices[:, back], legs.interactions[:, back] != 0
+            used = (used & (np.linalg.norm(np.nan_to_num(point) - ends, axis=1) > COINCIDENT_M))[:, None]
+            if ends is tx:
+                first = np.where(used, point, first)
+            else:
+                last = np.where(used, point, last)
     objects = np.where(legs.interactions != 0, surfaces.object_of(np.maximum(legs.face, 0)), -1)
     paths = Paths(
         tx=legs.source,

@@ -90,18 +90,21 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
         place = mi.UInt32(MOST_CLUSTERED)  # of the plane in the cluster, whose other faces are found afterwards
         for k in reversed(range(MOST_CLUSTERED)):
             place = dr.select(there & (here == expected[k]) & (k < cluster), mi.UInt32(k), place)
-        reflects: Any = (place < MOST_CLUSTERED) & (count + cluster <= slots)
+        mirrors: Any = place < MOST_CLUSTERED
+        # Rays do not tell a plane that ends at the point of reflection from the one that reflects: either is the end.
+        at_end: Any = there & ~arriving & (at > length - window) & (at < length + window)
+        reflects: Any = (mirrors | at_end) & (count + cluster <= slots)
         # A plane beyond the end is not met: the target is reached, or the plane that reflects has no face there.
         ends = active & ~reflects & (~there | (at >= length + dr.select(arriving, -skip, window)))
         again: Any = (here == last[0]) | (here == last[1]) | (here == last[2])  # a straight line meets a plane once
-        beside: Any = (at < dr.select(leg == 0, 0, window)) | (at > length - dr.select(arriving, 0, window))
+        beside: Any = at < dr.select(leg == 0, 0, window)
         crosses = there & ~reflects & ~ends & ~again & ~beside
         passes = crosses & through & (count < slots)
+        told = (reflects & mirrors) | passes
         slot = lane * slots + count + dr.select(reflects, place, mi.UInt32(0))
-        dr.scatter(
-            codes, hit.prim_index + dr.select(reflects, mi.UInt32(REFLECTS), mi.UInt32(0)), slot, reflects | passes
-        )
-        dr.scatter(points, met, slot, reflects | passes)
+        code = hit.prim_index + dr.select(reflects, mi.UInt32(REFLECTS), mi.UInt32(0))
+        dr.scatter(codes, code, slot, told)
+        dr.scatter(points, met, slot, told)
         none, zero = mi.UInt32(NO_PLANE), mi.UInt32(0)
         # The next leg begins on the planes of the cluster.
         turned = [dr.select(k < cluster, expected[k], none) for k in range(MOST_CLUSTERED)]
