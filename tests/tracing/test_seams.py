@@ -255,25 +255,29 @@ def test_displacement_is_that_of_the_pair_in_both_directions():
     assert np.linalg.norm(there[0] - a, axis=1).max() < 5 * 1.5 * 1e-5
 
 
+SCALE_M = 5.0
+"""Scale of a room of four metres."""
+
+
 def test_faces_are_enlarged_at_free_and_sharp_edges_alone():
     """A rectangle grows on each side; a ball of many facets does not; a sliver does not become long."""
     rectangle = sheet(2, 1.0, (0.0, 3.0), (0.0, 2.0)).triangles
-    margin = ENLARGED * scale_m(rectangle)
-    grown = enlarged(rectangle)
+    margin = ENLARGED * SCALE_M
+    grown = enlarged(rectangle, SCALE_M)
     # At the diagonal corners slide along it, a little farther than the margin.
     for excess in (-grown.min(axis=(0, 1))[:2], grown.max(axis=(0, 1))[:2] - [3, 2]):
         assert (excess > 0.99 * margin).all()
         assert (excess < 2.5 * margin).all()
     np.testing.assert_array_equal(grown[..., 2], 1)
     ball = trimesh.creation.icosphere(4).triangles
-    np.testing.assert_allclose(enlarged(ball), ball, atol=5 * OVERLAP * scale_m(ball))
+    np.testing.assert_allclose(enlarged(ball, SCALE_M), ball, atol=5 * OVERLAP * SCALE_M)
     cube = trimesh.creation.box((1, 1, 1)).triangles
-    assert (np.ptp(enlarged(cube), axis=(0, 1)) > 1 + 1.99 * ENLARGED * scale_m(cube)).all()
+    assert (np.ptp(enlarged(cube, SCALE_M), axis=(0, 1)) > 1 + 1.99 * ENLARGED * SCALE_M).all()
     sliver = np.array([[[0.0, 0, 0], [1, 0, 0], [1, 1e-5, 0]]])
-    assert np.abs(enlarged(sliver) - sliver).max() < 10 * ENLARGED * scale_m(sliver)
+    assert np.abs(enlarged(sliver, SCALE_M) - sliver).max() < 10 * ENLARGED * SCALE_M
     point = np.ones((1, 3, 3))
-    np.testing.assert_array_equal(enlarged(point), point)
-    assert enlarged(point[:0]).shape == (0, 3, 3)
+    np.testing.assert_array_equal(enlarged(point, SCALE_M), point)
+    assert enlarged(point[:0], SCALE_M).shape == (0, 3, 3)
 
 
 def test_no_ray_passes_at_an_edge_within_a_surface():
@@ -287,7 +291,7 @@ def test_no_ray_passes_at_an_edge_within_a_surface():
         a, b = np.round(rng.uniform(0.5, 5, 2), 1)
         corner = np.round(rng.uniform(-3, 3, 3), 1)
         outline = corner + np.array([0 * u, a * u, a * u + b * v, b * v])
-        scene = screens(outline[[[0, 1, 2], [0, 2, 3]]])
+        scene = screens(outline[[[0, 1, 2], [0, 2, 3]]], 2 * SCALE_M)
         at = outline[0] + rng.uniform(0, 1, (count, 1)) * (outline[2] - outline[0])
         away = rng.normal(size=(count, 3))
         away = away[np.abs(away @ normal) > 0.2]
@@ -360,3 +364,23 @@ def test_halls_of_round_sizes_do_not_leak(tmp_path: Path):
         for a, b in ((source, target), (target, source)):
             paths = trace_paths(scene, [a], receiver(b), TraceOptions(max_depth=3), gains=False, check=False).paths
             assert not len(paths)
+
+
+def test_scale_is_bounded_far_from_the_origin():
+    """By the size of the scene, so that a room in a national grid keeps its doors."""
+    corners = trimesh.creation.box(bounds=[(0, 0, 0), (6, 4, 3)]).triangles
+    for away_m, expected in ((0.0, 7.0), (50.0, 57.0), (1e4, 100.0)):
+        moved = corners + away_m
+        assert scale_m(moved, moved.reshape(-1, 3).mean(axis=0)) == pytest.approx(expected)
+
+
+def test_reflections_in_edges_of_turned_rooms_count_once(tmp_path: Path):
+    """Corners of files in single precision are not quite square: by less than displacements."""
+    matrix = trimesh.transformations.rotation_matrix(np.radians(29), [1, 1, 3])
+    matrix[:3, 3] = [20, -10, 3]
+    box = trimesh.creation.box(bounds=[(0, 0, 0), (6, 4, 3)])
+    scene = room(tmp_path, {"room": ("itu_metal", box.apply_transform(matrix))})
+    for source, target in (([1, 1, 0.75], [3, 1, 0.75]), ([1, 1, 0.75], [2, 2, 1.5]), ([2, 1, 1.5], [3, 2, 1.5])):
+        ends = trimesh.transform_points(np.array([source, target], float), matrix)
+        options = TraceOptions(max_depth=3)
+        assert len(trace_paths(scene, ends[:1], receiver(ends[1]), options, gains=False).paths) == 63

@@ -23,32 +23,38 @@ by which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""
+FARTHEST = 25.0
+"""Largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors."""
 MOST_AT_CORNER = 8.0
 """Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
 infinity."""
 
 
-def scale_m(triangles: FloatArray) -> float:
-    """Largest coordinate of triangles [f, 3, 3] plus 1 m: rounding in single precision grows in proportion to it."""
-    return 1.0 + float(np.abs(triangles).max(initial=0.0))
+def scale_m(triangles: FloatArray, centre_m: FloatArray) -> float:
+    """Largest coordinate of triangles [f, 3, 3] plus 1 m: the rounding of their corners in files grows with it.
+
+    Far from the origin it is bounded by `FARTHEST` times the same about the middle [3] of the scene.
+    """
+    stated, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in (triangles, triangles - centre_m))
+    return min(stated, FARTHEST * centred)
 
 
-def screens(triangles: FloatArray) -> Any:
-    """A Mitsuba scene of one mesh for rays, whose primitives are the triangles [f, 3, 3] in their order."""
+def screens(triangles: FloatArray, scale_m: float) -> Any:
+    """A Mitsuba scene of one mesh for rays, whose primitives are the triangles [f, 3, 3] in their order, enlarged."""
     import mitsuba as mi
 
     from ..backend.device import on_device
 
     mesh: Any = mi.Mesh("screens", 3 * len(triangles), len(triangles))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = on_device(enlarged(triangles), mi.Float)
+    parameters["vertex_positions"] = on_device(enlarged(triangles, scale_m), mi.Float)
     parameters["faces"] = on_device(np.arange(3 * len(triangles)), mi.UInt32)
     parameters.update()
     # Embree's robust mode loses fewer rays at edges; OptiX is watertight as it is.
     return mi.load_dict({"type": "scene", "mesh": mesh, "embree_use_robust_intersections": True})
 
 
-def enlarged(triangles: FloatArray) -> FloatArray:
+def enlarged(triangles: FloatArray, scale_m: float) -> FloatArray:
     """Triangles [f, 3, 3] enlarged in their planes by `ENLARGED` at edges that are free, sharp or of three faces.
 
     At other edges they overlap by rounding. Degenerate triangles stay as they are.
@@ -60,7 +66,7 @@ def enlarged(triangles: FloatArray) -> FloatArray:
     along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
     incoming = np.roll(along, 1, axis=1)
     sine = np.linalg.norm(np.cross(incoming, along), axis=2, keepdims=True)
-    margin = np.where(_smooth(triangles), OVERLAP, ENLARGED)[..., None] * scale_m(triangles)
+    margin = np.where(_smooth(triangles), OVERLAP, ENLARGED)[..., None] * scale_m
     # Both edges at a corner are shifted outwards by their margins: the corner moves to where the shifted lines meet.
     moved = np.roll(margin, 1, axis=1) * -along + margin * incoming
     moved = np.divide(moved, sine, out=np.zeros_like(moved), where=sine > 0)

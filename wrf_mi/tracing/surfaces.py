@@ -94,12 +94,12 @@ class Surfaces:
     @cached_property
     def scale_m(self) -> float:
         """Length by which distances that single precision does not resolve grow, see `wrf_mi.tracing.screens`."""
-        return scale_m(self.triangles - self.centre_m)
+        return scale_m(self.triangles, self.centre_m)
 
     @cached_property
     def screens(self) -> Any:
         """Mitsuba scene of the faces about `centre_m`, closed at their seams, see `wrf_mi.tracing.screens.screens`."""
-        return screens(self.triangles - self.centre_m)
+        return screens(self.triangles - self.centre_m, self.scale_m)
 
     @cached_property
     def boxes(self) -> tuple[shapely.STRtree, FloatArray]:
