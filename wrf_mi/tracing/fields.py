@@ -22,7 +22,7 @@ from .surfaces import Surfaces
 
 PATHS_PER_CHUNK = 1 << 19
 """Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
-COINCIDENT_M = 1e-9
+AT_ANTENNA_M = 1e-9
 """Distance within which an interaction is at the antenna, or at its image, so that it tells no direction."""
 SHORT = 1e-4
 """Distance to which coinciding points are moved apart, as a share of `Surfaces.scale_m`: single precision gives the
@@ -186,7 +186,7 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     size = np.linalg.norm(direction, axis=2, keepdims=True)
     direction /= np.maximum(size, 1e-30)
     for leg in reversed(range(direction.shape[1] - 1)):  # an antenna within a sheet that its path passes
-        at_image = size[:, leg] < COINCIDENT_M
+        at_image = size[:, leg] < AT_ANTENNA_M
         direction[:, leg] = np.where(at_image, direction[:, leg + 1], direction[:, leg])
     moved = np.zeros_like(points[row])
     for leg in range(short.shape[1]):  # forwards from a point that stays

@@ -20,7 +20,7 @@ from ..core.types import IntArray
 from .buffer import Legs, join
 from .devices import before_surfaces, check_devices, from_behind
 from .estimate import check_search
-from .fields import COINCIDENT_M, path_gains, scattering_materials
+from .fields import AT_ANTENNA_M, path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
@@ -320,7 +320,7 @@ def _paths(
     for level in range(vertices.shape[1]):
         for ends, back in ((tx, vertices.shape[1] - 1 - level), (rx, level)):
             point, used = vertices[:, back], legs.interactions[:, back] != 0
-            used = (used & (np.linalg.norm(np.nan_to_num(point) - ends, axis=1) > COINCIDENT_M))[:, None]
+            used = (used & (np.linalg.norm(np.nan_to_num(point) - ends, axis=1) > AT_ANTENNA_M))[:, None]
             if ends is tx:
                 first = np.where(used, point, first)
             else:
