@@ -29,9 +29,10 @@ from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.loop import Progress
 from wrf_mi.training.trainer import Trainer
 
-PARALLEL_TOLERANCE = 1e-3
-"""Greys of two runs on several threads after 40 steps: sums of gradients differ in their last digit, 1e-7, and Adam
-divides by their size; what was seen is 3e-7."""
+PARALLEL_TOLERANCE = 3e-3
+"""Mean difference of greys of two runs on several threads after 40 steps. Sums of gradients differ in their last digit,
+which is 1e-7 in most runs; where a gradient is but that digit, Adam makes a whole step of it: one run in six, by 5e-4
+(6e-3 in single cells). Four steps fewer are 7e-3, another seed is 5e-2."""
 FLOAT32_TOLERANCE = 1e-4
 """Greys of one field computed on two ways: float32 rounding, and footprints' cut-off, which is worth 0.01."""
 
@@ -116,7 +117,7 @@ def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -
     train(folder, tmp_path / "whole", settings=config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
     greys = [stored(tmp_path / name)["prediction"] for name in ("whole", "resumed")]
-    np.testing.assert_allclose(greys[0], greys[1], atol=PARALLEL_TOLERANCE)
+    assert np.abs(greys[0] - greys[1]).mean() < PARALLEL_TOLERANCE
 
 
 class PowerCut(BaseException):
