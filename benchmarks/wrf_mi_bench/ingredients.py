@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.folder import CONFIG, is_finished

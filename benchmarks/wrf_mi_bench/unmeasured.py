@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from wrf_mi.models.hybrid.ingredients import TRANSMISSION
 
 from wrf_mi.core import Record, Split
 from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.datasets import make_splits
-from wrf_mi.models.hybrid.ingredients import TRANSMISSION
 from wrf_mi.runs.api import train
 from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.results import Observations, Results, read_run

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from calling import call, refused
-
 from wrf_mi.models.hybrid.ingredients import INGREDIENTS, problems
+
 from wrf_mi.models.model import Problem
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train

@@ -1,9 +1,9 @@
 """Choice of the likelihood's form and of k nearest neighbours by training rows that are held out in space.
 
-The run's model is fitted again to the rest of each fold (`wrf_mi.models.held_out.hold_out_folds`), predicts at all
-candidate positions, and locates the fold's held-out rows. The form with the greatest mean logarithm of the posterior
-density at the true positions is chosen: a proper score (Gneiting and Raftery, "Strictly proper scoring rules,
-prediction, and estimation" (2007), JASA 102), which regions that are too narrow or too wide lower.
+The run's model is fitted again to the rest of each fold (`folds_of`), predicts at all candidate positions, and locates
+the fold's held-out rows. The form with the greatest mean logarithm of the posterior density at the true positions is
+chosen: a proper score (Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007), JASA
+102), which regions that are too narrow or too wide lower.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from scipy.stats import t as student_t
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
-from ..core import InputError, Record
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..models import Fitted, Session
-from ..models.held_out import fit_fold, hold_out_folds, labelled
+from ..models.held_out import fit_fold, hold_out, labelled
 from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
@@ -50,6 +50,8 @@ MOST_ROWS = 300
 """Most held-out rows that are located."""
 LEVEL = 0.9
 """Probability of a region by default, and of those whose held-out coverage is stated."""
+FOLDS = 3
+"""Hold-outs with other seeds: one alone has few positions, near each other."""
 FOLDER, FILE = "locate", "locate.json"
 """Folder of finished folds in the run folder, and file of the choice."""
 
@@ -143,7 +145,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
             if stored.pop("key") == key:
                 return _restored(stored)
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
-    folds = hold_out_folds(record, split) if len(run.problem.rows(split)) else []
+    folds = folds_of(record, split) if len(run.problem.rows(split)) else []
     if not folds:
         return Calibration(Likelihood())
     parts, headings, place = [], headings_of(run), run.folder / FOLDER
@@ -176,6 +178,12 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
     write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
     shutil.rmtree(place)
     return chosen
+
+
+def folds_of(record: Record, split: Split) -> list[Split]:
+    """Hold-outs of other seeds (`hold_out`), whose likelihoods are compared; none where no rows can be held out."""
+    folds = [hold_out(record, replace(split, seed=split.seed + number)) for number in range(FOLDS)]
+    return [fold for fold in folds if fold is not None]
 
 
 def _restored(stored: dict[str, Any]) -> Calibration:

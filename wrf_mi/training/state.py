@@ -15,8 +15,10 @@ from ..backend.device import to_float, to_tensor
 from ..gaussians.density import DensityChange
 
 Arrays = dict[str, NDArray[Any]]
-KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m", "surface", "baseline")
+KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m", "surface")
 """Attributes that a checkpoint stores under their names."""
+OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")
+"""Further ones that belong to a fit, not to one of its states."""
 
 
 class FitState:
@@ -35,7 +37,11 @@ class FitState:
         reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
         searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
         surface: whether Gaussians on surfaces are trained.
-        baseline: scores of the held-out rows by paths alone, [rows]; empty where there are none.
+        baseline: scores of the held-out rows by the best state before the present stage, [rows]; empty where there is
+            none.
+        best_scores: those by the best state.
+        stage_scores: best mean score of the held-out rows in each stage so far; empty where none is chosen.
+        held_out: reports of the held-out rows by the chosen state; empty where none is chosen.
         chosen: step from which the fit went on (`LoopConfig.patience`); 0: none was chosen.
         best: arrays of the state with the best validation score, or None.
         best_score: its score, the higher the better; kept once the fit went on from it.
@@ -49,6 +55,7 @@ class FitState:
         self.step = self.chosen = 0
         self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
         self.surface, self.baseline = False, np.zeros(0)
+        self.best_scores, self.stage_scores, self.held_out = np.zeros(0), np.zeros(0), np.zeros(0)
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0
         self._reset_view_gradient()
@@ -121,7 +128,8 @@ class FitState:
         """The best state, with its score."""
         if self.best is None:
             return self
-        return FitState.from_arrays(self.best | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
+        of_fit = {name: np.asarray(getattr(self, name)) for name in OF_FIT}
+        return FitState.from_arrays(self.best | of_fit | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
 
     def next_stage(self) -> FitState:
         """The best state so far as the start of another stage, at the present step, without moments."""
@@ -140,7 +148,7 @@ class FitState:
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        own = {name: np.array(getattr(self, name)) for name in KEPT}
+        own = {name: np.array(getattr(self, name)) for name in (*KEPT, *OF_FIT)}
         return flat | own | {"adam_step": np.asarray(count)}
 
     @classmethod
@@ -156,7 +164,9 @@ class FitState:
         state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
         state.view_gradient_steps, state.reach_m = int(arrays["view_gradient_steps"]), float(arrays["reach_m"])
         state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
-        state.searched_m, state.baseline = np.array(arrays["searched_m"]), np.array(arrays["baseline"])
+        state.searched_m = np.array(arrays["searched_m"])
+        for name in OF_FIT:
+            setattr(state, name, np.array(arrays[name]))
         state.surface = bool(arrays["surface"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))

@@ -6,7 +6,7 @@ import logging
 import resource
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -37,9 +37,27 @@ from .predictor import Predictor
 from .reach import Reach, choose_reach, hold_out_groups, improves
 from .state import FitState
 from .step import Loss, TrainingData, device_pose, evaluated, make_step
-from .targets import form_of, plan_rows, targets_of
+from .targets import FIELD, SURFACES, form_of, plan_rows, stage_names, targets_of
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HeldOutReports:
+    """Reports of training rows that a fit had not seen when it chose its state.
+
+    Attributes:
+        receiver: number of the receiver of each [q].
+        row: row of the record [q].
+        report: reports [q, ...] as observations.
+        score: best mean score of these rows by the stages' names.
+    """
+
+    receiver: IntArray
+    row: IntArray
+    report: NDArray[Any]
+    score: Mapping[str, float]
+
 
 CHUNK_SIZE = 64
 """Observations of a receiver from which its starting level is estimated."""
@@ -121,12 +139,14 @@ class Trainer(TrainingLoop):
         )
         self._shape = self.targets.truth.shape[2:]
         self._loss = loss or partial(self.task.loss, ssim_weight=config.loss.ssim_weight)
-        # Gaussians that correct paths are chosen also on rows far from the training rows.
-        self._chooses_reach = self.graph.corrects and config.patience > 0 and config.holdout_steps_fraction > 0
-        self._choosing = hold_out_groups(split, record.tx_pos_m) if self._chooses_reach else split
-        self._unjudged = self._chooses_reach and self._choosing is split
-        joint = self.graph.field is not None and scene is not None
-        self.schedule = plan_rows(config, self.targets, self._choosing, joint)
+        self.stages = stage_names(config, field is not None, scene is not None)
+        # What corrects paths is chosen also on rows far from the training rows.
+        self._in_groups = self.graph.corrects or len(self.stages) > 1
+        self._in_groups &= config.patience > 0 and config.holdout_steps_fraction > 0
+        self.choosing = hold_out_groups(split, record.tx_pos_m) if self._in_groups else split
+        self._in_groups &= self.choosing is not split or self.graph.corrects
+        self._unjudged = self._in_groups and self.choosing is split
+        self.schedule = plan_rows(config, self.targets, self.choosing, self.stages)
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
@@ -233,9 +253,7 @@ class Trainer(TrainingLoop):
         state = self.state
         if side is not None and side.refresh({name: state.adam[name] for name in state.adam}):
             state.searched_m[port] = side.searched_at_m
-        learned = side is None or (
-            self._stage == len(self.schedule.stages) and not (state.chosen and state.reach_m == 0)
-        )
+        learned = side is None or (self.stages[self._stage] == FIELD and not (state.chosen and state.reach_m == 0))
         arrays = self.graph.arrays(port, side)
         key = None if side is None and not arrays else (port, side and side.searches, learned, state.surface)
         if key not in self._steps:
@@ -259,7 +277,7 @@ class Trainer(TrainingLoop):
     def _begin_stage(self) -> None:
         """Go on from the best state so far; Gaussians on surfaces are trained from the second stage on."""
         self.state = self.state.next_stage()
-        if self._stage == 1 and self.graph.surface and not self._unjudged:
+        if self.stages[self._stage] == SURFACES and self.graph.surface and not self._unjudged:
             self.state.surface = True
         self._restore_paths()
         self.record_functions()
@@ -293,16 +311,20 @@ class Trainer(TrainingLoop):
         if not self.graph.corrects:
             return None
         joined = self.state.chosen and self.schedule.joined < self.config.steps
-        rows = self.split.all_train if joined else self._choosing.train
+        rows = self.split.all_train if joined else self.choosing.train
         known = [self.record.tx_pos_m[self.targets.received(port, rows)] for port in range(self.targets.ports)]
         every = [np.concatenate([known[port] for port in self._ports(r)]) for r in range(len(self.record.receivers))]
         return Reach(tuple(every), self.state.reach_m)
 
+    def _held_out(self) -> list[IntArray]:
+        """Conditions of each port that are held out now."""
+        chosen = self.choosing if self._in_groups and not self.state.chosen else self.split
+        return [self.targets.received(port, chosen.validation) for port in range(self.targets.ports)]
+
     def _corrected_scores(self) -> NDArray[np.float64]:
         """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
         predict, record, reach, state = self.predictor(), self.record, self.reach(), self.state
-        chosen = self._choosing if self._chooses_reach and not state.chosen else self.split
-        rows = [self.targets.received(port, chosen.validation) for port in range(self.targets.ports)]
+        rows, judged = self._held_out(), self._in_groups and not state.chosen
         assert reach is not None
         reach = reach.of_ports(self.graph.carriers)
 
@@ -311,61 +333,102 @@ class Trainer(TrainingLoop):
 
         held = [record.tx_pos_m[chosen_rows] for chosen_rows in rows]
         lengths = [reach.length_m]
-        if chosen is not self.split:
+        if judged:
             # Before the last stage the field has not been trained.
             trained = self.schedule.stage(state.step - 1) == len(self.schedule.stages)
             lengths = reach.lengths(held) if trained else [0.0]
         state.reach_m, found = choose_reach(reach, lengths, held, score, self.task.higher_is_better)
-        if chosen is not self.split and self.schedule.stages and state.step == self.schedule.stages[0]:
-            state.baseline = found
         return found
 
+    def _traced(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
+        """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
+        slots = np.searchsorted(self._known[port], rows)
+        return predict.of_side(self.record.tx_pos_m[rows], port, self._sides[port], slots, weight)
+
     def _traced_scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
-        """Scores of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
-        record, slots = self.record, np.searchsorted(self._known[port], rows)
-        found = predict.of_side(record.tx_pos_m[rows], port, self._sides[port], slots, weight)
-        return self.task.training_score(found, record.observation[port // self.graph.carriers, rows])
+        """Scores of `_traced`."""
+        found = self._traced(predict, port, rows, weight)
+        return self.task.training_score(found, self.record.observation[port // self.graph.carriers, rows])
+
+    def held_out_reports(self) -> HeldOutReports | None:
+        """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
+        if not self._in_groups or self.graph.scene is None or not len(self.state.held_out):
+            return None
+        rows = [self.targets.received(port, self.choosing.validation) for port in range(self.targets.ports)]
+        receiver = [np.full(len(some), port // self.graph.carriers) for port, some in enumerate(rows)]
+        best = {name: float(score) for name, score in zip(self.stages, self.state.stage_scores, strict=True)}
+        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), self.state.held_out, best)
+
+    def _reports(self) -> NDArray[Any]:
+        """Reports of all held-out rows, port by port, by the present state and reach."""
+        predict, reach, rows = self.predictor(), self.reach(), self._held_out()
+        found = []
+        for port, some in enumerate(rows):
+            receiver = port // self.graph.carriers
+            weight = None if reach is None else reach.weight(self.record.tx_pos_m[some], receiver)
+            found.append(self._traced(predict, port, some, weight))
+        return np.concatenate(found)
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
         if self.graph.corrects:
             self._held_scores = self._corrected_scores()
-            return float(np.nanmedian(self._held_scores)) if len(self._held_scores) else float("nan")
-        rows, record = self.split.validation, self.record
-        if not len(rows):
-            return float("nan")
-        predict = self.predictor()
-        if self.graph.scene is not None:
-            known = [self.targets.received(port, rows) for port in range(self.targets.ports)]
-            scores = [self._traced_scores(predict, port, some) for port, some in enumerate(known)]
-        else:
+        elif self.graph.scene is not None:
+            predict, known = self.predictor(), self._held_out()
             scores = [
-                self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows])
+                np.ravel(self._traced_scores(predict, port, some)) for port, some in enumerate(known) if len(some)
+            ]
+            self._held_scores = np.concatenate([np.zeros(0), *scores])
+        else:
+            rows, record = self.split.validation, self.record
+            if not len(rows):
+                return float("nan")
+            predict = self.predictor()
+            scores = [
+                np.ravel(self.task.training_score(predict.of_rows(record, rows, r), record.observation[r, rows]))
                 for r in range(len(record.receivers))
             ]
-        return float(np.nanmedian(np.concatenate([score.ravel() for score in scores])))
+            return float(np.nanmedian(np.concatenate(scores)))
+        return float(np.nanmedian(self._held_scores)) if len(self._held_scores) else float("nan")
 
     def choose(self, score: float) -> bool:
         """Early stopping (`TrainingLoop`).
 
         Beside paths, means decide, which have less variance than medians. A state of a later stage has to improve on
-        paths alone (`improves`), and only the last stage ends early.
+        the best of the stages before it (`improves`), and only the last stage ends early.
         """
-        if self.graph.corrects and len(self._held_scores):
+        stages, state = self.schedule.stages, self.state
+        if self._in_groups and len(self._held_scores):
             score = float(np.nanmean(self._held_scores))
-            first = self.schedule.stages and self.state.step == self.schedule.stages[0]
-            baseline = self.state.baseline
-            if len(baseline) and not first and not improves(self._held_scores, baseline, self.higher_is_better):
+            self._note_stage(score)
+            baseline = state.baseline
+            if len(baseline) and not improves(self._held_scores, baseline, self.higher_is_better):
                 score = -np.inf if self.higher_is_better else np.inf
-        if self.schedule.stage(self.state.step) < len(self.schedule.stages):
-            self.state.waited = -1
+            if (score if self.higher_is_better else -score) > state.best_score:
+                state.best_scores = self._held_scores
+            if state.step in stages:
+                state.baseline = state.best_scores
+        if self.schedule.stage(state.step) < len(stages):
+            state.waited = -1
         chosen = super().choose(score)
         if chosen:
             self._restore_paths()
+            if self._in_groups and self.graph.scene is not None:
+                self.state.chosen, now = 0, self.state.chosen  # the rows are still held out
+                self.state.held_out = self._reports()
+                self.state.chosen = now
         if chosen and self.state.reach_m == 0 and self.graph.scene is None:
             logger.warning("at no distance from training rows do the Gaussians predict held-out rows better than zero")
             self.state.step = self.config.steps
         return chosen
+
+    def _note_stage(self, score: float) -> None:
+        """Keep the best mean score of the present stage, for the report."""
+        if not len(self.state.stage_scores):
+            self.state.stage_scores = np.full(len(self.stages), np.nan)
+        # A score right at the end of a stage is that of its last state.
+        stage, better = self.schedule.stage(self.state.step - 1), np.fmax if self.higher_is_better else np.fmin
+        self.state.stage_scores[stage] = better(self.state.stage_scores[stage], score)
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from calling import refused
 from made_channels import channels
+from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 
 import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.models import Interrupted
 from wrf_mi.models.held_out import HeldOut
-from wrf_mi.models.hybrid.ingredients import INGREDIENTS
 from wrf_mi.tasks.scores import cea_db
 
 EXACT_DB = 30.0
@@ -66,8 +66,9 @@ def test_two_rows_are_interpolated_by_kriging(flat_folder: Path, tmp_path: Path)
 def test_ingredients_that_do_not_serve_the_data_are_left_out_or_refused(
     one_gateway: Record, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    from wrf_mi.models import Problem
     from wrf_mi.models.hybrid.ingredients import problems
+
+    from wrf_mi.models import Problem
     from wrf_mi.models.hybrid.model import HybridSettings
 
     assert list(problems(Problem(one_gateway, HybridSettings()), None)) == ["kriging", "physics-no-mesh", "idw"]

@@ -18,6 +18,7 @@ import numpy as np
 from ...core import Antenna, InputError, Prediction, Split, receiver_arrays, stored_receivers
 from ...graph.graph import Graph
 from ...graph.receivers import GAPS, Form
+from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
@@ -29,8 +30,8 @@ from ...training.packed import PACKED, pack_params, unpack_params
 from ...training.predictor import Predictor
 from ...training.reach import Reach
 from ...training.state import FitState
-from ...training.targets import form_of, plan_rows, targets_of
-from ...training.trainer import Trainer
+from ...training.targets import form_of, plan_rows, stage_names, targets_of
+from ...training.trainer import HeldOutReports, Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
@@ -56,13 +57,18 @@ class FittedField(Fitted):
         params: parameters by name.
         form: form of the observations.
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
+        held_out: reports of training rows on which its stages were chosen; None after loading, or where none were.
     """
+
+    held_out: HeldOutReports | None = None
 
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
         self._arrays, self._problem, self._store = arrays, problem, store
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
-        self.field = field_of(config, self.form)
         self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
+        # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
+        used = problem.scene is None or "position" in self.params
+        self.field = field_of(config, self.form) if used else None
         check_params(self.field, self.params, str(store / "model.npz"))
         self.uses_heading = self.form.headings
         self.carriers_hz = np.zeros(0) if self.form.carriers_hz is None else self.form.carriers_hz
@@ -149,7 +155,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     if not trainer.run(on_progress, lambda: write_checkpoint(folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
     receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
-    params, reach = of_all_receivers(trainer.state.mean_params(), trainer.reach(), receivers, without_rows(split))
+    params, reach = of_all_receivers(*_used(trainer), receivers, without_rows(split))
     arrays: Arrays = {
         **keyed(PARAM, params),
         **trainer.graph.form.arrays(),
@@ -158,8 +164,20 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
         **_reach_arrays(reach),
     }
     fitted = load(arrays, problem, folder)
-    fitted.train_seconds = trainer.seconds
+    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.held_out_reports()
     return fitted
+
+
+def _used(trainer: Trainer) -> tuple[Params, Reach | None]:
+    """Parameters and reach of a fit, beside paths without the Gaussians that are not used."""
+    params, reach, graph = trainer.state.mean_params(), trainer.reach(), trainer.graph
+    if graph.scene is None:
+        return params, reach
+    if not trainer.state.surface:
+        params = {name: values for name, values in params.items() if not name.startswith("surface.")}
+    if graph.field is not None and reach is not None and reach.length_m == 0:
+        return {name: values for name, values in params.items() if name.startswith(TRACED_NAMES)}, None
+    return params, reach
 
 
 def _scene(problem: Problem, split: Split) -> Any | None:
@@ -193,7 +211,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         if field is not None:
             check_memory(config, field)
         Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
-        plan_rows(config, targets, rows, field is not None and scene is not None)
+        plan_rows(config, targets, rows, stage_names(config, field is not None, scene is not None))
         drawn = np.random.default_rng([config.seed, 0])
         initial_gaussians(config.initial, replace(record, receivers=receivers), rows.train, drawn)
 

@@ -1,11 +1,10 @@
-"""The model ``hybrid``: a mixture of other models, weighted by the distance to the nearest training row.
+"""The model ``hybrid``: one fit in stages, from a scene's paths to interpolation of what they leave.
 
-Interpolation is best next to training rows, ray tracing far from them. Ingredients are fitted to parts of the training
-rows and predict the others, some near and some far (`wrf_mi.models.held_out`); weights that are best there, as a
-function of the distance, mix ingredients that are fitted to all training rows. The same held-out predictions give
-the standard deviations (`wrf_mi.models.intervals`).
+Stages 1 to 5 (`wrf_mi.models.hybrid.paths`) predict from the scene, the last one interpolates: their residuals and the
+observations themselves, weighted by the distance to the nearest training row. One hold-out
+(`wrf_mi.models.held_out.hold_out`) chooses stages, weights and standard deviations (`wrf_mi.models.intervals`).
 
-ingredients/  in the run folder: files of the ingredients
+parts/  in the run folder: files of the parts
 """
 
 from __future__ import annotations
@@ -13,28 +12,32 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
-from ...core.settings import CheckedSettings
 from ...core.types import IntArray
+from ...datasets.observations import LEAST_ROWS
 from ...tasks import task_of
 from .. import MODELS
 from ..held_out import (
     HeldOut,
     RowDistance,
+    as_unseen,
     fit_model,
     held_out_predictions,
-    hold_out_folds,
+    hold_out,
     labelled,
     predicted_rows,
 )
+from ..interpolation.kriging import Kriged, Kriging
 from ..intervals import GAPS, Intervals, expected_size, fit_intervals
 from ..model import (
     Arrays,
@@ -50,38 +53,74 @@ from ..model import (
     known_positions,
     under,
 )
-from .ingredients import INGREDIENTS, from_uplink, most_trusted, problems, serving, uses_scene
 from .mixture import Mixture, choose, constant
+from .parts import KRIGING, PATHS_PART, TRACED, UPLINK_PARTS, HybridSettings, parts_of, stored_parts
+from .paths import PATHS, RESIDUAL, FittedPaths, StageReport, stated_reports
 
 logger = logging.getLogger(__name__)
-FOLDER = "ingredients"
+FOLDER = "parts"
 NEGLIGIBLE = 1e-3
-"""Weight below which an ingredient is not evaluated: its share of the prediction."""
+"""Weight below which a part is not evaluated: its share of the prediction."""
+LEAST_RESIDUALS = 3
+"""Fewest rows of a receiver whose residuals are interpolated."""
 
 
-@dataclass(frozen=True)
-class HybridSettings(CheckedSettings):
-    """Settings of the hybrid.
+class Residuals:
+    """Kriging of what the scene's side leaves at the training rows, by receiver.
 
-    Attributes:
-        ingredients: names of the mixed models, separated by commas: idw, kriging, trees, mri, physics-no-mesh, learned
-            (wrf-gs+), or a model's name; with an uplink r2f2, optml, fire and linear; with a scene ray-tracing, surface
-            (its gain, materials and Gaussians on its surfaces trained), physics, joint (wrf-gs+ with the scene) and,
-            with an uplink, r2f2-scene. null: all of them that serve the data, but learned and joint, each fit of which
-            takes minutes.
+    Args:
+        by_receiver: interpolation of each receiver that has enough rows, by its number.
     """
 
-    ingredients: str | None = None
+    def __init__(self, by_receiver: Mapping[int, Kriged]) -> None:
+        self.by_receiver = dict(by_receiver)
+
+    @classmethod
+    def of(cls, fitted: Fitted, record: Record, split: Split, seed: int) -> Residuals:
+        """Residuals of a fitted model at the training rows of a split."""
+        known: dict[int, Kriged] = {}
+        rows = split.all_train
+        for receiver in range(len(record.receivers)):
+            observed = record.observation[receiver, rows]
+            seen = rows[np.isfinite(observed).reshape(len(rows), -1).all(axis=1)]
+            if receiver in split.held_receivers:
+                seen = np.intersect1d(seen, split.left[split.left[:, 0] == receiver, 1])
+            if len(seen) >= max(LEAST_RESIDUALS, LEAST_ROWS):
+                left = record.observation[receiver, seen] - predicted_rows(fitted, record, seen, receiver).mean
+                known[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[seen], left)
+        return cls(known)
+
+    def __call__(self, tx_pos_m: FloatArray, receiver: int, shape: tuple[int, ...]) -> NDArray[Any] | float:
+        """Expected residuals of a receiver at positions [m, 3], [m, *shape]; 0 without any rows."""
+        kriged = self.by_receiver.get(receiver)
+        return 0.0 if kriged is None else kriged.predict(tx_pos_m).reshape(len(tx_pos_m), *shape)
+
+    def arrays(self) -> Arrays:
+        """Arrays of a run file."""
+        found: Arrays = {}
+        for receiver, kriged in self.by_receiver.items():
+            found |= keyed(f"{receiver}/", kriged.arrays())
+        return found
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, record: Record) -> Residuals:
+        """The residuals that `arrays` described."""
+        numbers = sorted({int(name.partition("/")[0]) for name in arrays})
+        found = {
+            number: Kriged.from_arrays(under(f"{number}/", arrays), record.receivers[number]) for number in numbers
+        }
+        return cls(found)
 
 
 class FittedHybrid(Fitted):
-    """A fitted mixture.
+    """A fitted hybrid.
 
     Args:
         problem: problem of the hybrid.
         known: training rows that determine distances [n].
-        fitted: fitted ingredients with a weight, by name.
-        mixture: weights of these ingredients.
+        parts: fitted parts with a weight, by name.
+        mixture: weights of these parts, and, if there are ``residuals``, of the scene's side with them as the last.
+        residuals: what the scene's side leaves; None: it has no weight.
         intervals: standard deviations; None: none are stated.
         facts: further entries of ``metrics.json``.
     """
@@ -90,17 +129,18 @@ class FittedHybrid(Fitted):
         self,
         problem: Problem,
         known: IntArray,
-        fitted: Mapping[str, Fitted],
+        parts: Mapping[str, Fitted],
         mixture: Mixture,
+        residuals: Residuals | None,
         intervals: Intervals | None,
         facts: dict[str, Any],
     ) -> None:
         self._problem, self._known, self._facts = problem, known, facts
         self._distance = RowDistance(problem.record, known)
-        self.ingredients, self.mixture, self.intervals = dict(fitted), mixture, intervals
+        self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Weighted mean of the ingredients' predictions, [m, ...], with its standard deviation."""
+        """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
         self._check(inputs)
 
         def predicted(one: Fitted, some: IntArray) -> Decomposition:
@@ -109,7 +149,7 @@ class FittedHybrid(Fitted):
         return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
-        """Predictions of rows of the record; ingredients use what they have stored."""
+        """Predictions of rows of the record; parts use what they have stored."""
         record = self._problem.record
 
         def stored(one: Fitted, some: IntArray) -> Decomposition:
@@ -118,32 +158,28 @@ class FittedHybrid(Fitted):
         return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """The prediction; the weighted means of the ingredients with the scene and of those without, each of weights
-        of sum one; and the traced paths of the first ingredient that knows them, where it has a weight.
+        """The prediction; what the scene's side and the others predict alone, NaN where they have no weight; and the
+        traced paths.
         """
         self._check(inputs)
 
         def decomposed(one: Fitted, some: IntArray) -> Decomposition:
             return one.decompose(inputs.rows(some), receiver, std=False)
 
-        return self._mixed(inputs.tx_pos_m, receiver, decomposed, sides=True)
+        return self._mixed(inputs.tx_pos_m, receiver, decomposed)
 
     @property
     def depends_on_heading(self) -> bool:
-        """Whether an ingredient's predictions do."""
-        return any(fitted.depends_on_heading for fitted in self.ingredients.values())
+        """Whether a part's predictions do."""
+        return any(fitted.depends_on_heading for fitted in self.parts.values())
 
     def _check(self, inputs: Inputs) -> None:
-        needed = [name for name in self.ingredients if inputs.uplink is None and from_uplink(name)]
-        if needed:
+        needed = [name for name in self.parts if name.partition("-")[0] in UPLINK_PARTS]
+        if needed and inputs.uplink is None:
             raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
 
     def _mixed(
-        self,
-        tx_pos_m: FloatArray,
-        receiver: int,
-        predict: Callable[[Fitted, IntArray], Decomposition],
-        sides: bool = False,
+        self, tx_pos_m: FloatArray, receiver: int, predict: Callable[[Fitted, IntArray], Decomposition]
     ) -> Decomposition:
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
@@ -152,117 +188,154 @@ class FittedHybrid(Fitted):
         weights = np.where(weights < NEGLIGIBLE, 0, weights)
         weights /= weights.sum(axis=1, keepdims=True)
         observed = self._problem.record.observation
-        traced = np.array([uses_scene(name) for name in self.ingredients])
-        both = sides and traced.any() and not traced.all()
-        # The mean, or the share of each side, whose sum it is.
-        sums = np.zeros((1 + both, len(tx_pos_m), *observed.shape[2:]), np.result_type(observed, np.float64))
-        paths = None
+        shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
+        names = list(self.parts)
+        with_residual = weights[:, len(names)] if self.residuals is not None else np.zeros(len(tx_pos_m))
+        sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
+        mean, paths = np.zeros((len(tx_pos_m), *shape), kind), None
 
-        def spread(weight: FloatArray) -> FloatArray:
-            return weight.reshape(-1, *[1] * (sums.ndim - 2))
+        def spread(values: FloatArray) -> FloatArray:
+            return values.reshape(-1, *[1] * len(shape))
 
-        for fitted, weight, with_scene in zip(self.ingredients.values(), weights.T, traced, strict=True):
-            rows = np.flatnonzero(weight)
-            if len(rows):
-                found = predict(fitted, rows)
-                sums[int(both and with_scene), rows] += spread(weight[rows]) * found.whole.mean
-                if paths is None and found.paths is not None:
-                    paths = found.paths.placed(rows, len(tx_pos_m))
-        mean = sums.sum(axis=0) if both else sums[0]
+        for name, fitted, weight in zip(names, self.parts.values(), weights.T, strict=False):
+            share = weight + with_residual if name == PATHS_PART else weight
+            rows = np.flatnonzero(share)
+            if not len(rows):
+                continue
+            found = predict(fitted, rows)
+            traced = int(name in TRACED)
+            sides[traced, rows] += spread(share[rows]) * found.whole.mean
+            totals[traced, rows] += share[rows]
+            if paths is None and found.paths is not None:
+                paths = found.paths.placed(rows, len(tx_pos_m))
+        mean += sides.sum(axis=0)
+        rows = np.flatnonzero(with_residual)
+        if len(rows) and self.residuals is not None:
+            mean[rows] += spread(with_residual[rows]) * self.residuals(tx_pos_m[rows], receiver, shape)
+        if task_of(self._problem.record).image:
+            mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         whole = Prediction(mean)
         if self.intervals is not None:
             whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance_m)
-        if not both:
+        if not (totals[0].any() and totals[1].any()):
             return Decomposition(whole, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
-            learned, scene = (sums[k] / spread(weights[:, traced == k].sum(axis=1)) for k in (0, 1))
+            learned, scene = (sides[k] / spread(totals[k]) for k in (0, 1))
         return Decomposition(whole, scene, learned, paths)
 
     def arrays(self) -> Arrays:
-        """Weights, intervals, training rows, and the arrays of the ingredients."""
-        arrays: Arrays = {"known": self._known, "names": np.asarray(list(self.ingredients))}
+        """Weights, residuals, intervals, training rows, and the arrays of the parts."""
+        arrays: Arrays = {"known": self._known, "names": np.asarray(list(self.parts))}
         arrays["facts"] = np.asarray(json.dumps(self._facts))
         arrays |= field_arrays(self.mixture, "mixture/")
         if self.intervals is not None:
             arrays |= field_arrays(self.intervals, "intervals/")
-        for name, fitted in self.ingredients.items():
+        if self.residuals is not None:
+            arrays |= keyed("residuals/", self.residuals.arrays())
+        for name, fitted in self.parts.items():
             arrays |= keyed(f"{name}/", fitted.arrays())
         return arrays
 
     def facts(self) -> dict[str, Any]:
-        """Form and weights of the mixture, and held-out scores of the ingredients."""
+        """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
         return self._facts
 
 
 def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
-    """Predict held-out training rows by every ingredient, choose weights, and fit ingredients with weight to all rows.
+    """Fit all parts, and choose weights and standard deviations by held-out rows.
 
     Raises:
-        InputError: unknown positions, or an ingredient that cannot be fitted.
-        Interrupted: stopped; finished folds are kept.
+        InputError: unknown positions, or no part that can be fitted.
+        Interrupted: stopped; finished parts are kept.
     """
     record, rows = problem.record, problem.rows(split)
     known_positions(record, rows, "hybrid")
-    asked = _names(problem.settings)
-    found = serving(problems(problem, asked), split, required=asked is not None)
-    folder = session.folder / FOLDER
-    folds = hold_out_folds(record, split)
-    held = HeldOut.of(record, folds, problem.seed) if folds else None
+    fold = hold_out(record, split)
+    held = None if fold is None else HeldOut.of(record, fold, problem.seed)
+    fitted: dict[str, Fitted] = {}
     predictions: dict[str, Prediction] = {}
-    if held is not None:
-        for name, (entry, inner) in list(found.items()):
-            place = replace(session, folder=folder / name, run=folder / name)
-            try:
-                predictions[name] = held_out_predictions(entry, inner, folds, held, place, name)
-            except InputError as error:
-                if asked is not None:
-                    raise
-                logger.info("hybrid without %s: %s", name, error)
-                del found[name]
+    reports: list[StageReport] = []
+    residuals, begun = None, time.perf_counter()
+    for name, (entry, inner) in parts_of(problem, split).items():
+        place = replace(session, folder=session.folder / FOLDER / name, run=session.folder / FOLDER / name)
+        place.folder.mkdir(parents=True, exist_ok=True)
+        fitted[name], _ = fit_model(entry, inner, split, labelled(place, name))
+        one = fitted[name]
+        if isinstance(one, FittedPaths):
+            reports += one.stages
+        if fold is None or held is None:
+            continue
+        reports_at = one.held_out_at(held.receiver, held.row) if isinstance(one, FittedPaths) else None
+        if isinstance(one, FittedPaths) and reports_at is not None:
+            predictions[name] = Prediction(as_unseen(reports_at, one.problem, held))
+        else:
+            predictions[name] = held_out_predictions(entry, inner, fold, held, _inside(place, "held"), name)
+        if name == PATHS_PART and RESIDUAL in problem.settings.wanted and record.carriers_hz is None:
+            residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
+    names = [*predictions] if predictions else [*fitted]
+    interpolating = time.perf_counter()
     form, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
-    if held is None:
-        mixture = constant(np.eye(len(found))[0])
-    names = [name for name, most in zip(found, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
-    places = [list(found).index(name) for name in names]
-    fitted = {}
-    for name in names:
-        entry, inner = found[name]
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        place = labelled(replace(session, folder=folder / name, run=folder / name), name)
-        fitted[name], _ = fit_model(entry, inner, split, place)
-    for name in set(found) - set(names):
-        shutil.rmtree(folder / name, ignore_errors=True)
-    kept = Mixture(mixture.distance_m, mixture.weights[:, places])
-    facts = {"form": form, "held_out": scores, "weights": _stated(kept, names)}
-    return FittedHybrid(problem, rows, fitted, kept, intervals, facts)
+    if not predictions:
+        mixture = constant(np.eye(len(fitted))[0])
+    used = [name for name, most in zip(names, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
+    if RESIDUAL in used and PATHS_PART not in used:
+        used.insert(0, PATHS_PART)
+    used = [*(name for name in used if name != RESIDUAL), *([RESIDUAL] if RESIDUAL in used else [])]
+    kept = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
+    for name in set(fitted) - set(used):
+        shutil.rmtree(session.folder / FOLDER / name, ignore_errors=True)
+    if KRIGING in names and len(names) > 1:
+        gained = KRIGING in used or RESIDUAL in used
+        reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), interpolating - begun))
+    facts = {
+        "stages": stated_reports(reports),
+        "form": form,
+        "held_out": scores,
+        "weights": _stated(kept, used),
+    }
+    parts = {name: fitted[name] for name in used if name != RESIDUAL}
+    return FittedHybrid(problem, rows, parts, kept, residuals if RESIDUAL in used else None, intervals, facts)
 
 
-def _names(settings: HybridSettings) -> list[str] | None:
-    return None if settings.ingredients is None else [name.strip() for name in settings.ingredients.split(",")]
+def _inside(session: Session, name: str) -> Session:
+    return replace(session, folder=session.folder / name, run=session.folder / name)
+
+
+def _residuals(
+    fitted: Fitted, record: Record, split: Split, fold: Split, held: HeldOut, before: Prediction, problem: Problem
+) -> tuple[Residuals, Prediction]:
+    """Residuals of the training rows, and predictions of held-out rows with those of the others.
+
+    Both are residuals of the final parameters: to keep those of the chosen state would take the other rows' reports,
+    too, and residuals of rows that both have been fitted to hardly differ.
+    """
+    among_known, mean = Residuals.of(fitted, record, fold, problem.seed), np.array(before.mean)
+    for receiver in np.unique(held.receiver):
+        places = held.receiver == receiver
+        mean[places] += among_known(record.tx_pos_m[held.row[places]], int(receiver), mean.shape[1:])
+    if task_of(record).image:
+        mean = np.clip(mean, 0, 1)
+    return Residuals.of(fitted, record, split, problem.seed), Prediction(mean)
 
 
 def _weights(
     record: Record, predictions: Mapping[str, Prediction], held: HeldOut | None, by_receiver: bool, session: Session
 ) -> tuple[str, Mixture, Intervals | None, dict[str, float]]:
-    """Form of the weights, weights, intervals, and mean held-out scores of the ingredients.
+    """Form of the weights, weights, intervals, and mean held-out scores of the parts.
 
     Errors are independent between rows; ``by_receiver``: between receivers, which are held out.
     """
-    if held is None or not len(held):
+    if held is None or not len(held) or not predictions:
         return "alone", constant(np.ones(1)), None, {}
     task, observed = task_of(record), held.observed(record)
     means = np.stack([one.mean for one in predictions.values()])
-    score = task.mixtures(means, observed)
-    every = np.arange(len(held))
-    form, mixture = choose(
-        score,
-        held.distance_m,
-        held.fold,
-        held.receiver if by_receiver else held.row,
-        len(means),
-        lambda share: session.report("choosing weights", share),
-        None if task.image else most_trusted(list(predictions)),
-    )
+    score, every = task.mixtures(means, observed), np.arange(len(held))
+    unit = held.receiver if by_receiver else held.row
+
+    def on_group(share: float) -> None:
+        session.report("choosing weights", share)
+
+    form, mixture = choose(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
     mean = np.einsum("qk,kq...->q...", mixture(held.distance_m), means)
     size = expected_size(task, Prediction(mean))
     sign = 1 if task.higher_is_better else -1
@@ -283,32 +356,30 @@ def _stated(mixture: Mixture, names: Sequence[str]) -> list[dict[str, float]]:
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
-    """The mixture that `FittedHybrid.arrays` described."""
-    names = [str(name) for name in arrays["names"]]
-    found = problems(problem, names)
-    fitted = {}
-    for name, (entry, inner) in found.items():
-        fitted[name] = entry.load(under(f"{name}/", arrays), inner, folder / FOLDER / name)
+    """The hybrid that `FittedHybrid.arrays` described."""
+    parts: dict[str, Fitted] = {}
+    for name, (entry, inner) in stored_parts(problem, [str(name) for name in arrays["names"]]).items():
+        parts[name] = entry.load(under(f"{name}/", arrays), inner, folder / FOLDER / name)
     mixture = from_field_arrays(Mixture, under("mixture/", arrays))
-    stored = under("intervals/", arrays)
+    stored, left = under("intervals/", arrays), under("residuals/", arrays)
+    residuals = Residuals.from_arrays(left, problem.record) if left else None
     intervals = from_field_arrays(Intervals, stored) if stored else None
     facts = json.loads(str(arrays["facts"]))
-    return FittedHybrid(problem, arrays["known"], fitted, mixture, intervals, facts)
+    return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts)
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse unknown positions, and ingredients that none of the splits can be fitted with."""
-    asked = _names(problem.settings)
+    """Refuse unknown positions, and data that no part can be fitted to."""
     for split in splits:
         known_positions(problem.record, split.all_train, "hybrid")
-        serving(problems(problem, asked), split, required=asked is not None)
+        parts_of(problem, split)
 
 
 def _by_data(task: str, with_scene: bool) -> Model:
-    """The entry, whose arrays have the gaps of the ingredients' arrays."""
-    served = ((MODELS[one.model], one.scene) for one in INGREDIENTS.values() if MODELS[one.model].serves(task))
-    gaps = (name for entry, scene in served for name in entry.serving(task, scene).gaps)
-    return replace(MODEL, by_data=None, gaps=(*GAPS, *gaps))
+    """The entry, whose arrays have the gaps of the parts' arrays."""
+    entries = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
+    gaps = {name for entry in entries for name in entry.serving(task, with_scene).gaps}
+    return replace(MODEL, by_data=None, gaps=(*GAPS, *PATHS.gaps, *sorted(gaps)))
 
 
 MODEL = Model(
@@ -323,6 +394,7 @@ MODEL = Model(
     headings=True,
     several_carriers=True,
     new_receivers=True,
+    given=("deterministic",),
     check=check,
     by_data=_by_data,
 )
