@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
+from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
@@ -100,6 +101,8 @@ def default_options(record: Record) -> CorrectionOptions:
     return STRENGTHS if task_of(record).in_decibel else DEFAULTS
 
 
+# Products are of a few rows: threads that share them wait for each other, on a busy machine ten times as long.
+@threadpool_limits.wrap(1, "blas")
 def correct_scene(
     scene: str | Path,
     record: Record,
