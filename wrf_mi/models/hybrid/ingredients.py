@@ -41,7 +41,6 @@ PHASE_ERROR = "phase_error=1.25"
 INGREDIENTS = {
     "kriging": Ingredient("kriging"),
     "physics": Ingredient("physics", scene=True),
-    "physics-no-mesh": Ingredient("physics"),
     "ray-tracing": Ingredient("ray-tracing", scene=True, settings=TRANSMISSION, of_spectra=(PHASE_ERROR,)),
     "surface": Ingredient("ray-tracing", scene=True, settings=("calibration=gain,materials,surface", *TRANSMISSION)),
     "trees": Ingredient("trees"),
@@ -55,9 +54,8 @@ INGREDIENTS = {
 """Ingredients by name, the first of which is used where held-out rows do not tell them apart; any other name is that of
 a model without the scene."""
 
-TRUSTED = ("physics", "physics-no-mesh", "kriging")
-"""Ingredients to which few rows are left, the first that is present: two with prior knowledge of propagation, and
-interpolation."""
+TRUSTED = ("physics", "kriging")
+"""Ingredients to which few rows are left, the first that is present: both have prior knowledge of propagation."""
 
 
 def most_trusted(names: Sequence[str]) -> int:

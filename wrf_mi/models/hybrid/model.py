@@ -64,7 +64,7 @@ class HybridSettings(CheckedSettings):
     """Settings of the hybrid.
 
     Attributes:
-        ingredients: names of the mixed models, separated by commas: idw, kriging, trees, mri, physics-no-mesh, learned
+        ingredients: names of the mixed models, separated by commas: idw, kriging, trees, mri, learned
             (wrf-gs+), or a model's name; with an uplink r2f2, optml, fire and linear; with a scene ray-tracing, surface
             (its gain, materials and Gaussians on its surfaces trained), physics, joint (wrf-gs+ with the scene) and,
             with an uplink, r2f2-scene. null: all of them that serve the data, but learned and joint, each fit of which
