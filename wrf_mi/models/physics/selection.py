@@ -138,8 +138,6 @@ def physics_entry(
 
     def check(problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse antennas in solids; warn of antennas near surfaces, crossed polarisations and ignored antennas."""
-        if problem.scene is None:
-            raise InputError("physics needs a scene; give --scene SCENE, or choose --model kriging, which takes none")
         record, scene = problem.record, problem.opened_scene
         if task_of(record).is_complex and record.observation.ndim != 3:
             text = f"channels of {record.observation.shape[2]} antennas; the physics model serves receivers with one"
@@ -158,7 +156,7 @@ def physics_entry(
         fit,
         lambda arrays, problem, folder: load(arrays),
         "docs/joint.md",
-        scene="optional",
+        scene="required",
         uses_antennas=uses_antennas,
         scene_alone=True,
         headings=True,
