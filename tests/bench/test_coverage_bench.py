@@ -24,7 +24,7 @@ def test_runs_are_stored_and_those_outside_are_counted(tmp_path: Path, monkeypat
     monkeypatch.setattr(coverage, "scene_of_cell", lambda cell, _: cell.dataset if cell.dataset == "meshed" else None)
     monkeypatch.setattr(coverage, "measured", measured)
     found = coverage.main()
-    assert asked == [("open-official-all", name) for name in ("kriging", "physics", "hybrid")] + [
+    assert asked == [("open-official-all", name) for name in ("kriging", "hybrid")] + [
         ("meshed-blocked-400", name) for name in coverage.MODELS
     ]
     assert (found["inside"], found["runs"]) == (6, 7)

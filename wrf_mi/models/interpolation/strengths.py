@@ -39,9 +39,7 @@ WIDER = 2.0
 SKEW_DB = 0.4
 """Shift of predictions a priori, as fades reach deeper than peaks."""
 OFFSET_SD_DB = 10.0
-"""Standard deviation of the common offset of all receivers: transmit power and gains of both antennas about 0 dBm."""
-IMPLAUSIBLE = 2.0
-"""Standard deviations of that offset beyond which the data's level replaces 0 dBm."""
+"""Standard deviation of the common offset of all receivers about the transmit power a priori."""
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
 TRACED_SD = (0.5, 0.2)
@@ -57,8 +55,8 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     """Settings of kriging of signal strengths; hyperparameters are those at the start of the search.
 
     Attributes:
-        transmit_dbm: transmit power a priori, gains of both antennas included; null: 0 dBm, or, where the data are far
-            from it, their level.
+        transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
+            or 0 dBm without any.
         receiver_sd_db: standard deviation of each receiver's offset from the common one.
         search_rows: least number of training rows with which held-out rows choose hyperparameters.
         stop_m: consecutive rows within that distance are joined.
@@ -270,16 +268,15 @@ def _prior(record: Record, measured: Measured, power_map: PowerMap | None, setti
 
 
 def _transmit_dbm(at_0_dbm: PriorMean, measured: Measured) -> float:
-    """Transmit power a priori: 0 dBm where that is plausible, else the median level of the data above 0 dBm."""
-    excess = np.concatenate(
-        [
-            measured.value_dbm[receiver] - at_0_dbm.columns(measured.poses, receiver)[0]
-            for receiver in range(len(measured.value_dbm))
-        ]
-    )
-    if not np.isfinite(excess).any():
-        return 0.0
-    level = float(np.nanmedian(excess))  # robust to receivers behind walls, which few rows may be at
-    # Near 0 dBm the prior knowledge is worth more than the level of few rows: a level that lies somewhat below free
-    # space says that the exponent is greater. Far from it, it would bend the law of distance instead.
-    return level if abs(level) > IMPLAUSIBLE * OFFSET_SD_DB else 0.0
+    """Median level of the data above what is expected for 0 dBm; 0 dBm without data.
+
+    Strengths may be of any transmit power, and in any unit of decibels. A prior about 0 dBm would bend the law of
+    distance to them where rows are few: 0.4 dB with 5 rows that are 40 dB lower (flat-ble, 2026-11-27), while the level
+    of 5 rows is as good a prior as 0 dBm where that is right. A median, as fades reach deep.
+    """
+    excess = [
+        measured.value_dbm[receiver] - at_0_dbm.columns(measured.poses, receiver)[0]
+        for receiver in range(len(measured.value_dbm))
+    ]
+    known = np.concatenate(excess)[np.isfinite(np.concatenate(excess))]
+    return float(np.median(known)) if len(known) else 0.0
