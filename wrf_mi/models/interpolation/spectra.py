@@ -168,8 +168,14 @@ class KrigedSpectra:
 
     def mixed(self, posterior: Posterior, nearby: Image, nearby_std: Image | None) -> tuple[Image, Image | None]:
         """Mean and standard deviation of the weighted estimates, [q, height, width]; None for a mean alone."""
-        expected, deviation = self.report(posterior)
-        weight = signal_weight(posterior.ignorance, self.half)[:, None, None]
+        return self.weighted(self.report(posterior), posterior.ignorance, nearby, nearby_std)
+
+    def weighted(
+        self, reported: tuple[Image, Image], ignorance: FloatArray, nearby: Image, nearby_std: Image | None
+    ) -> tuple[Image, Image | None]:
+        """`mixed` of reported spectra with deviations, and signals' shares of unknown variance [q]."""
+        expected, deviation = reported
+        weight = signal_weight(ignorance, self.half)[:, None, None]
         difference = expected - nearby
         mean = nearby + weight * difference
         if nearby_std is None:
@@ -326,7 +332,7 @@ def _fit_weights(
     """
     drawn = np.sort(np.random.default_rng([seed, 2]).permutation(len(observed))[:HELD_OUT])
     farthest = cdist(kriged.nearby.tx_pos_m[drawn], kriged.nearby.tx_pos_m).max(axis=1)
-    predictions: list[tuple[Image, Posterior, Image, Image]] = []
+    predictions: list[tuple[Image, tuple[Image, Image], FloatArray, Image, Image]] = []
     terms: list[tuple[Any, Any, Any]] = []
     for number, gap in enumerate(GAPS):
         rows = drawn[farthest > gap * wavelength]
@@ -334,10 +340,11 @@ def _fit_weights(
             break
         truth, posterior = observed[rows], kriged.signals.held_out(gap * wavelength, rows)
         nearby, nearby_std = kriged.nearby.held_out(gap * wavelength, rows)
-        difference = kriged.report(posterior)[0] - nearby
+        expected, deviation = (image.astype(np.float32) for image in kriged.report(posterior))
+        difference = expected - nearby
         products = (np.einsum("nhw,nhw->n", difference, other) for other in (difference, truth - nearby))
         terms.append((posterior.ignorance, *products))
-        predictions.append((truth, posterior, nearby, nearby_std))
+        predictions.append((truth, (expected, deviation), posterior.ignorance, nearby, nearby_std))
         on_progress((number + 1) / (2 * len(GAPS)))
     if not predictions:
         return
@@ -348,8 +355,8 @@ def _fit_weights(
     shares = ignorance**2 / (ignorance**2 + grid[:, None] ** 2)
     kriged.half = float(grid[((shares**2 * square) - 2 * shares * product).sum(axis=1).argmin()])
     ratios = []
-    for truth, posterior, nearby, nearby_std in predictions:
-        mean, std = kriged.mixed(posterior, nearby, nearby_std)
+    for truth, reported, unknown, nearby, nearby_std in predictions:
+        mean, std = kriged.weighted(reported, unknown, nearby, nearby_std)
         assert std is not None
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))
