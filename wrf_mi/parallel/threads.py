@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from contextlib import AbstractContextManager
+from functools import cache
+from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -19,8 +21,20 @@ def processors() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
+_controller = cache(ThreadpoolController)
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Context in which the BLAS has one thread.
+
+    Its threads wait for each other by spinning: with another process on a processor, products of small matrices take a
+    hundred times as long.
+    """
+    limit: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
+    return limit
+
+
 def on_threads(work: Callable[[Part], Result], parts: Iterable[Part]) -> list[Result]:
     """Results of ``work(part)`` in order, a thread for each processor, each with a BLAS of one thread."""
-    # Threads of the BLAS wait for each other by spinning: with another process on a processor, they take seconds.
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(processors()) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(processors()) as pool:
         return list(pool.map(work, parts))

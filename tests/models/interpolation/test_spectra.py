@@ -326,7 +326,7 @@ def test_deviations_of_generic_kriging_are_those_of_universal_kriging() -> None:
     process = AnisotropicKriging(where, observed.astype(np.float32), np.eye(3), np.full(3, 0.3), 0.05)
     np.testing.assert_allclose(estimate.mean, process.predict(asked), atol=SINGLE)
     np.testing.assert_allclose(estimate.std, process.std(asked), atol=SINGLE)
-    left = uncertain.left_out(observed)
+    left = uncertain.left_out()
     for row in (0, 7):
         others = np.arange(12) != row
         single = Kriging(length_m=0.3, noise=0.05).fit(where[others], observed[others]).predict(where[[row]])
@@ -366,6 +366,15 @@ def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPa
     assert sizes == [9, 9, 2]
     near = kriged.report(kriged.signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
     assert np.median(ssim(near, record.observation[0, record.official[0][:20]])) > 0.9
+
+
+def test_more_rows_than_the_memory_bears_are_kriged_generically_with_a_warning(
+    record: Record, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(spectra, "MOST_COVARIANCES", 9 * 11**2)
+    model = fit(record, np.arange(12))
+    assert all(isinstance(one, UncertainKriged) for one in model.models)
+    assert "the spectra themselves are kriged: 12 rows are too many" in caplog.text
 
 
 @pytest.mark.parametrize("settings", [QUICK, replace(QUICK, generic=True), replace(QUICK, length_m=0.2)])

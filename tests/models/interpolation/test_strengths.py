@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.models.interpolation import strengths
 from wrf_mi.models.interpolation.strength_fit import Part, PooledProcess, folds, shift_of, widening
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
@@ -248,6 +249,14 @@ def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
     stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
     model = fit_strengths(stated, np.arange(120), None, replace(FAST, search_rows=50, noise_db=1.0))
     assert model.facts()["fitted"]["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
+
+
+def test_stops_are_thinned_where_factors_would_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = made(200, noise_db=1.0, body_db=4.0)
+    monkeypatch.setattr(strengths, "MOST_COVARIANCES", 3 * 50**2)
+    model = fit_strengths(record, np.arange(150), None, FAST)
+    assert len(model.field.stops.poses) == 50
+    assert np.median(np.abs(errors(model, record, np.arange(150, 200)))) < 1.5
 
 
 def test_folds_exclude_neighbours_in_time() -> None:

@@ -185,7 +185,7 @@ def fit_channels(rows: ReceiverRows) -> Single:
         return generic
     k = np.broadcast_to(2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light, observed.shape[1])
     channels = KrigedChannels.fit(position_m, observed, rows.receiver.position_m, k)
-    left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(observed), channels.left_out())]
+    left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(), channels.left_out())]
     # Of logarithms, as accuracy is scored in decibels, and so that no strong row near the receiver decides alone. A
     # share of the power is added, below which an error no longer counts.
     generic_log, channels_log = np.log(np.array(left) + NEGLIGIBLE * np.square(np.abs(observed)).mean())

@@ -118,11 +118,6 @@ class Kriged:
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
 
-    def system(self, noise: float) -> KrigingSystem:
-        """Factored correlation of the rows and the trend's columns, of a trend by generalised least squares."""
-        coordinates = _coordinates(self.positions_m, self.circle, self.lengths)
-        return KrigingSystem(correlation(coordinates, coordinates, self.kernel), noise, self.trend(self.positions_m))
-
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
         circle = np.zeros((0, 2)) if self.circle is None else self.circle
@@ -144,7 +139,7 @@ class UncertainKriged:
     """Kriging with standard deviations, for data in which other receivers have them.
 
     Attributes:
-        kriged: the kriging, with a trend by generalised least squares.
+        kriged: the kriging over positions, with a trend by generalised least squares.
         noise: variance of the noise as a share of the field's.
         scale: standard deviation of the field of each component [q].
     """
@@ -158,20 +153,19 @@ class UncertainKriged:
         """The kriging of rows [n, ...], with the variance of greatest restricted likelihood."""
         values = observed.reshape(len(observed), -1)
         free = len(values) - kriged.coefficients.shape[0]
-        # A single row says nothing about the spread: it may be as great as what it observed.
-        square = np.square(np.abs(values)).sum(axis=0)
-        if free > 0:
-            square = np.einsum("nq,nq->q", values.conj(), kriged.system(kriged.noise).precision @ values).real / free
+        # y^H Q y / free, Q being the precision free of the trend, whose product with y the weights are. A single row
+        # says nothing about the spread: it may be as great as what it observed.
+        square = np.einsum("nq,nq->q", values.conj(), kriged.weights if free else values).real / max(free, 1)
         return cls(kriged, kriged.noise, np.sqrt(np.maximum(square, 0)))
 
     @cached_property
     def _system(self) -> KrigingSystem:
-        return self.kriged.system(self.noise)
+        rows, kriged = _coordinates(self.kriged.positions_m, None, self.kriged.lengths), self.kriged
+        return KrigingSystem(correlation(rows, rows, kriged.kernel), self.noise, kriged.trend(kriged.positions_m))
 
-    def left_out(self, observed: NDArray[Any]) -> NDArray[Any]:
-        """Errors of the rows [n, ...], each predicted from all others, [n, q]."""
-        precision = self._system.precision
-        return np.asarray(precision @ observed.reshape(len(observed), -1) / np.diag(precision)[:, None])
+    def left_out(self) -> NDArray[Any]:
+        """Errors of the rows, each predicted from all others, [n, q] (Dubrule, 1983)."""
+        return np.asarray(self.kriged.weights / np.diag(self._system.precision)[:, None])
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Observations [m, ...] at positions [m, 3], metres; headings are not used."""

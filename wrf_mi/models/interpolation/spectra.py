@@ -27,11 +27,11 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from scipy.special import i0e, i1e
-from threadpoolctl import threadpool_limits
 
 from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray, pixel_directions
 from ...core.settings import Count, Positive
+from ...parallel.threads import one_blas_thread
 from ...receivers.array import array_response
 from ...receivers.lags import Lags
 from ...receivers.retrieve import retrieve_signals, unscale
@@ -55,6 +55,10 @@ UNSCALED_PER_CHUNK = 256
 """Spectra whose element signals are retrieved together."""
 CHUNK = 16
 """Transmitters predicted together, which bounds the memory of images with draws."""
+MOST_COVARIANCES = 6.4e7
+"""Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
+Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
+"""
 STARTS = 60
 """Starts of the phase retrieval of one spectrum, at most."""
 LEAST_ROWS = 8
@@ -186,18 +190,22 @@ class KrigedSpectra:
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[np.float32]:
         """Spectra [m, height, width] at positions [m, 3], metres; headings are not used."""
         mean = np.empty((len(tx_pos), *self.report.shape), np.float32)
-        for begin in range(0, len(tx_pos), CHUNK):
-            at = tx_pos[begin : begin + CHUNK]
-            mean[begin : begin + CHUNK] = self.mixed(self.signals.predict(at), self.nearby.predict(at), None)[0]
+        with one_blas_thread():
+            for begin in range(0, len(tx_pos), CHUNK):
+                rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
+                mean[rows] = self.mixed(self.signals.predict(at), self.nearby.predict(at), None)[0]
         return np.clip(mean, 0, 1)
 
     def prediction(self, tx_pos: FloatArray) -> Prediction:
         """Spectra and standard deviations at positions [m, 3], metres."""
         # Filled chunk by chunk: joined chunks would take the memory twice.
         mean, std = np.empty((len(tx_pos), *self.report.shape), np.float32), np.empty((len(tx_pos), *self.report.shape))
-        for begin in range(0, len(tx_pos), CHUNK):
-            rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
-            mean[rows], std[rows] = self.mixed(self.signals.predict(at), self.nearby.predict(at), self.nearby.std(at))
+        with one_blas_thread():
+            for begin in range(0, len(tx_pos), CHUNK):
+                rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
+                mean[rows], std[rows] = self.mixed(
+                    self.signals.predict(at), self.nearby.predict(at), self.nearby.std(at)
+                )
         std *= self.spread
         return Prediction(np.clip(mean, 0, 1), std)
 
@@ -244,8 +252,9 @@ def signal_weight(ignorance: FloatArray, half: float) -> FloatArray:
 def fit_spectra(rows: ReceiverRows) -> Single:
     """Kriging of the spectra of one receiver.
 
-    Signals mixed with the spectra nearby where array and single carrier are known and the array's spectra determine its
-    signals; with fewer rows than `LEAST_ROWS` the generic kriging, with standard deviations; else without.
+    Signals mixed with the spectra nearby where array and single carrier are known, the array's spectra determine its
+    signals, and their covariances fit into the memory. Else the generic kriging, with standard deviations where array
+    and carrier are known.
 
     Raises:
         InputError: no row that was received.
@@ -254,9 +263,7 @@ def fit_spectra(rows: ReceiverRows) -> Single:
     if rows.problem.settings.is_generic or rows.receiver.array_m is None or record.frequencies_hz is None:
         return fit_generic(rows)
     position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
-    # Threads of the BLAS wait for each other by spinning, and these matrices are small: with another process on a
-    # processor, a fit takes minutes instead of seconds.
-    with threadpool_limits(1, "blas"):
+    with one_blas_thread():
         return _fit_known_array(rows, position_m, observed)
 
 
@@ -267,11 +274,13 @@ def _fit_known_array(rows: ReceiverRows, position_m: FloatArray, observed: NDArr
     if len(observed) >= LEAST_ROWS:
         try:
             lags = Lags(receiver.array_m, float(record.frequencies_hz[0]), *observed.shape[1:])
+            if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
+                raise InputError(f"{len(observed)} rows are too many for a process of element signals")
             signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
-        except InputError as error:  # a line of elements, or elements too far apart for the lags to be told apart
+        except InputError as error:  # or a line of elements, or elements too far apart for lags
             logger.warning("%s, receiver %s: the spectra themselves are kriged: %s", record.name, receiver.name, error)
         else:
-            return fit_signals_and_nearby(signals, position_m, observed, rows)
+            return _fit_signals_and_nearby(signals, position_m, observed, rows)
     return UncertainKriged.of(fit_generic(rows), observed)
 
 
@@ -285,7 +294,7 @@ def _retrieved(observed: NDArray[Any], lags: Lags, seed: int, on_progress: OnPro
     return np.concatenate(chunks)
 
 
-def fit_signals_and_nearby(
+def _fit_signals_and_nearby(
     signals: ComplexArray, position_m: FloatArray, observed: NDArray[Any], rows: ReceiverRows
 ) -> KrigedSpectra:
     """Fit both estimates and their weights to element signals and spectra of rows at positions [n, 3], metres."""
@@ -315,7 +324,7 @@ def load_spectra(receiver: Receiver, arrays: Arrays) -> Single:
     """The model of a receiver that `fit_spectra` made."""
     if FREQUENCY not in arrays:
         return load_generic(receiver, arrays)
-    with threadpool_limits(1, "blas"):  # factors to the last digit those of the fit
+    with one_blas_thread():  # factors to the last digit those of the fit
         return KrigedSpectra.from_arrays(arrays, receiver)
 
 
@@ -335,11 +344,11 @@ def _fit_weights(
     predictions: list[tuple[Image, tuple[Image, Image], FloatArray, Image, Image]] = []
     terms: list[tuple[Any, Any, Any]] = []
     for number, gap in enumerate(GAPS):
-        rows = drawn[farthest > gap * wavelength]
-        if not len(rows):
+        held_out = drawn[farthest > gap * wavelength]
+        if not len(held_out):
             break
-        truth, posterior = observed[rows], kriged.signals.held_out(gap * wavelength, rows)
-        nearby, nearby_std = kriged.nearby.held_out(gap * wavelength, rows)
+        truth, posterior = observed[held_out], kriged.signals.held_out(gap * wavelength, held_out)
+        nearby, nearby_std = kriged.nearby.held_out(gap * wavelength, held_out)
         expected, deviation = (image.astype(np.float32) for image in kriged.report(posterior))
         difference = expected - nearby
         products = (np.einsum("nhw,nhw->n", difference, other) for other in (difference, truth - nearby))

@@ -194,6 +194,13 @@ class Stops:
     count: FloatArray
     row: FloatArray
 
+    def thinned(self, most: int) -> Stops:
+        """At most ``most`` stops, evenly spaced."""
+        if len(self.poses) <= most:
+            return self
+        which = np.linspace(0, len(self.poses) - 1, most).round().astype(np.int64)
+        return Stops(self.poses.take(which), self.value_dbm[:, which], self.count[:, which], self.row[which])
+
 
 def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> Stops:
     """Join consecutive rows at one pose, at most ``most`` within ``reach_m`` and ``turn_rad`` of the first.

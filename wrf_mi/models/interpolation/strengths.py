@@ -33,6 +33,8 @@ HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""
 CHUNK = 1024
 """Transmitters predicted together, which bounds the memory of their covariances with the rows."""
+MOST_COVARIANCES = 2e8
+"""Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
 WIDER = 2.0
 """Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
@@ -227,7 +229,8 @@ def fit_strengths(
     hyperparameters = settings.hyperparameters
 
     def join(rows: Measured, factor: float = 1.0) -> Stops:
-        return stops_of(rows, factor * settings.stop_m, factor * settings.stop_rad, settings.stop_rows)
+        stops = stops_of(rows, factor * settings.stop_m, factor * settings.stop_rad, settings.stop_rows)
+        return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
 
     ratio, widen = np.ones((2, len(values)))
     shift, facts = SKEW_DB, {"rows": float(len(rows))}
