@@ -231,7 +231,7 @@ def test_models_of_trained_receivers_refuse(name: str, law: Record, tmp_path: Pa
 
 def test_kriging_of_each_receiver_alone_refuses_receivers_without_rows(law: Record, tmp_path: Path) -> None:
     for record, settings in ((replace(law, frequencies_hz=None), ()), (law, ("generic=true",))):
-        with pytest.raises(InputError, match="split receiver:3: kriging of each receiver alone.*; choose mri"):
+        with pytest.raises(InputError, match=r"split receiver:3: kriging of each receiver alone.*; choose mri"):
             train(record, tmp_path / "run", "kriging", split="receiver:3", settings=settings)
         assert not (tmp_path / "run").exists()
     few = train(law, tmp_path / "few", "kriging", split="receiver+5:3", settings=("generic=true",))
