@@ -31,8 +31,8 @@ MODELS = ("kriging", "physics", "joint", HYBRID)
 
 
 def models_of(cell: Cell, scene: str | None) -> list[str]:
-    """Models that serve a cell: without a scene physics has no mesh, and there is no joint field."""
-    return [name for name in MODELS if scene is not None or name != "joint"]
+    """Models that serve a cell: physics and the joint field need a scene."""
+    return [name for name in MODELS if scene is not None or name not in ("physics", "joint")]
 
 
 def measured(cell: Cell, name: str, folder: Path) -> dict[str, Any]:

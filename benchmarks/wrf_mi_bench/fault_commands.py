@@ -33,7 +33,6 @@ SETTINGS: Mapping[str, tuple[str, ...]] = {
     "vae": ("steps=4", "width=8", "last=8", "checkpoint_every=2"),
     "wrf-gs+": FIELD,
     "wrf-gs+ joint": (*FIELD, "traced.depth=1", "traced.reflections=1", "traced.rays=256"),
-    "physics": (),
 }
 """Settings of short trainings by model and, after a space, ``joint`` in a scene."""
 TIMES = ("train_seconds", "trace_seconds", "ms_per_sample", "peak_memory_mb")
@@ -104,8 +103,7 @@ class Training(Command):
         if (out / CONFIG).exists():
             return ["train", "--resume", str(out)]
         model, _, joint = self.name.partition(" ")
-        data = self._data / HOME / FLAT if model == "physics" else self._data / SPECTRA
-        call = ["train", str(data), "--model", model, "--deterministic", "--out", str(out)]
+        call = ["train", str(self._data / SPECTRA), "--model", model, "--deterministic", "--out", str(out)]
         scene = ["--scene", str(self._data / ROOM)] if joint else []
         return [*call, *scene, *(part for setting in SETTINGS[self.name] for part in ("--set", setting))]
 

@@ -37,7 +37,6 @@ LIMITS_DB = 0.0, 40.0
 SCAN, CORRECTED = "trace, scan", "trace, corrected"
 MODELS: Mapping[str, tuple[str, str]] = {
     "kriging": ("kriging", ""),
-    "physics, no scene": ("physics", ""),
     "physics, scan": ("physics", "scan"),
     "physics, corrected": ("physics", "corrected"),
 }

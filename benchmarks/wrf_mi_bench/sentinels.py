@@ -37,7 +37,7 @@ from .tables import FOLDER, measure
 
 STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
 TABLE_ROWS = (
-    *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "physics", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
+    *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
     *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "physics", "wrf-gs", "nerf2")),
     *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "optml", "wrf-gs")),

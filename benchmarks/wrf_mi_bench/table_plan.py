@@ -60,12 +60,11 @@ SHORT = _set("steps=400", "validate_every=200")
 SPECTRUM: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
-    "physics": Entry("physics", _model("physics"), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
     "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
     "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
     "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
-    "kriging": Entry("kriging", _model("kriging")),
+    "kriging": Entry("kriging", _model("kriging"), (), SEEDS),
     "idw": Entry("IDW", _model("idw")),
 }
 ROOM = _set("steps=18000")
@@ -112,7 +111,6 @@ RSSI: Mapping[str, Entry] = {
     "ray-tracing-offsets": Entry(
         "ray tracing, one offset a receiver", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
     ),
-    "physics-no-mesh": Entry("physics without a mesh, knows the heading", _model("physics")),
     "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
     "kriging": Entry("kriging, knows the heading", _model("kriging")),
     "idw": Entry("IDW", _model("idw")),
@@ -124,7 +122,6 @@ POSITION: Mapping[str, Entry] = {
     "wrf-gs+-joint": Entry("WRF-GS+ with the scanned room's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
     "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED)),
     "physics": Entry("physics, in the scanned room", _model("physics", "--scene", NAMED), (), SEEDS),
-    "physics-no-mesh": Entry("physics without a mesh", _model("physics")),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
     "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
     "ray-tracing-corrected": Entry(
@@ -161,7 +158,7 @@ NEW_RECEIVERS: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
     "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),
     "physics": Entry("physics, knows walls", _model("physics", "--scene", NAMED)),
-    "physics-no-mesh": Entry("physics without a mesh", _model("physics")),
+    "kriging": Entry("kriging, pooled over receivers", _model("kriging")),
     "ray-tracing": Entry(
         "ray tracing, mean offset of the receivers", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
     ),

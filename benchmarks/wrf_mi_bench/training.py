@@ -35,9 +35,9 @@ from .bench import run_command
 from .comparison import line
 
 DATA = "rfid-lab"
-TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "physics": "physics"}
+TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "kriging": "kriging"}
 ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Bounds on time and memory of the physics model and of WRF-GS+, on two cores."""
+"""Bounds on time and memory of kriging and of WRF-GS+, on two cores."""
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
 STEPS, ROUNDS = 10, 9
@@ -204,7 +204,7 @@ def main() -> dict[str, Any]:
     trainers = {
         f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)
         for model in TITLES
-        if model != "physics"
+        if model != "kriging"
         for batch in BATCHES
     }
     steps = {name: some_steps(of) for name, of in trainers.items()}
@@ -237,7 +237,7 @@ def rows(
             f"{one['seconds']:.0f} s, of processors {one['processor_seconds']:.0f} s; {one['peak_memory_mb']:.0f} MB; "
             f"median SSIM {one['ssim']['median']:.3f}"
         )
-        asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "physics") else ""
+        asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "kriging") else ""
         lines.append(line(f"{TITLES[model]}, fit to its final accuracy", value, asked))
     for name, one in steps.items():
         title, _, batch = name.rpartition(", ")

@@ -112,7 +112,7 @@ def test_hybrid_of_strengths_traces_without_a_phase_error(flat_folder: Path, roo
 def test_other_commands_refuse_or_name_options_without_effect(
     flat_folder: Path, room: Path, tmp_path: Path, capsys: Any, caplog: Any
 ) -> None:
-    run = train(flat_folder, tmp_path / "run", "kriging").folder
+    run = train(flat_folder, tmp_path / "run", "kriging", settings=("generic=true",)).folder
     positions = tmp_path / "positions.csv"
     positions.write_text("x,y,z\n1,1,1\n")
     predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]

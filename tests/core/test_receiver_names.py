@@ -51,14 +51,12 @@ def test_example() -> None:
 def public_functions() -> dict[str, Callable[..., Any]]:
     """Functions of the library that take a receiver from a user."""
     from wrf_mi.models.physics.csi import CsiPhysics
-    from wrf_mi.models.physics.measured_spectrum import MeasuredSpectrumPhysics
-    from wrf_mi.models.physics.rssi import RssiPhysics
     from wrf_mi.models.physics.selection import PhysicsModel
     from wrf_mi.models.physics.spectrum import SpectrumPhysics
     from wrf_mi.runs.api import Run
     from wrf_mi.training.predictor import Predictor
 
-    models = (CsiPhysics, MeasuredSpectrumPhysics, RssiPhysics, SpectrumPhysics, PhysicsModel, Run)
+    models = (CsiPhysics, SpectrumPhysics, PhysicsModel, Run)
     found = {model.__name__: model.predict for model in models}
     return {**found, "Predictor": Predictor.__call__}
 
@@ -73,11 +71,11 @@ def test_runs_predict_for_a_receiver_by_name(plain_flat_folder: Path, tmp_path: 
 
     at = [[1.0, 2.0, 0.5]]
     baseline = wrf_mi.train(plain_flat_folder, tmp_path / "mri", "mri")
-    physics = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, tmp_path / "physics", "physics").folder)
+    kriging = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, tmp_path / "kriging", "kriging").folder)
     np.testing.assert_array_equal(baseline.predict(at, "hall $_$").mean, baseline.predict(at, 1).mean)
-    np.testing.assert_array_equal(physics.predict(at, "hall $_$").mean, physics.predict(at, 1).mean)
-    assert physics.predict(at, "hall $_$").mean != physics.predict(at, "kitchen").mean
-    for model in (baseline, physics):
+    np.testing.assert_array_equal(kriging.predict(at, "hall $_$").mean, kriging.predict(at, 1).mean)
+    assert kriging.predict(at, "hall $_$").mean != kriging.predict(at, "kitchen").mean
+    for model in (baseline, kriging):
         for wrong in ("sensor10", 2, -1):
             with pytest.raises(InputError, match=r"no receiver .*; give one of kitchen, hall"):
                 model.predict(at, wrong)

@@ -48,7 +48,7 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
-@pytest.mark.parametrize("model", ["ray-tracing", "physics", "physics without a mesh", "mri"])
+@pytest.mark.parametrize("model", ["ray-tracing", "physics", "kriging", "mri"])
 def test_a_gateway_without_training_rows_is_left_out(
     model: str, silent: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -57,7 +57,7 @@ def test_a_gateway_without_training_rows_is_left_out(
         (room if model in ("ray-tracing", "physics") else None),
     )
     left_out, alone = (
-        train(data, tmp_path / name, model.split()[0], scene=scene, settings=settings)
+        train(data, tmp_path / name, model, scene=scene, settings=settings)
         for name, data in (("run", silent), ("alone", load(silent).at_receivers([0])))
     )
     assert left_out.metrics["receivers_left_out"] == {"far": 0}
@@ -76,7 +76,7 @@ def test_data_without_any_received_training_row_are_refused_before_anything_is_d
     split = Split("mine", 0, np.arange(3), np.zeros(0, np.int64), np.arange(3, 5))
     stages: list[str] = []
     message = r"nothing was received in the training rows by any receiver \(near, far\); use another split"
-    for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("physics", {})):
+    for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("kriging", {})):
         with pytest.raises(InputError, match=message):
             train(
                 record,

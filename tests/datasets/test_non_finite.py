@@ -104,7 +104,7 @@ def test_finite_and_missing_observations_stay(two_gateways: Record) -> None:
     assert count == 0
 
 
-@pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "physics"}], ids=str)
+@pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "kriging"}], ids=str)
 def test_a_sweep_is_refused_before_its_first_run(
     arguments: dict[str, str], two_gateways: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -179,12 +179,12 @@ def test_nearest_neighbours_are_those_of_scikit_learn() -> None:
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
-    """Run of the physics model on 40 rows, and its data."""
+    """Run of kriging on 40 rows, and its data."""
     folder, rng = tmp_path_factory.mktemp("locate"), np.random.default_rng(5)
     places = np.column_stack([rng.uniform(0.3, 5.7, (60, 2)), np.ones(60)])
     record = record_of(places, strengths(places) + rng.normal(0, 1, (3, 60)), 40)
     data = write_ble_folder(folder / "data", record)
-    return train(data, folder / "run", "physics").folder, record
+    return train(data, folder / "run", "kriging").folder, record
 
 
 def observations(

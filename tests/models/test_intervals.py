@@ -134,7 +134,7 @@ def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: P
     record = load(flat_folder)
     _, folds = folds_of(record)
     held = HeldOut.of(record, folds, 0)
-    entry, observed = MODELS["kriging"], held.observed(record)
+    entry, observed = MODELS["kriging"].serving("rssi", True), held.observed(record)
 
     def errors(scene: Path) -> np.ndarray:
         problem = Problem(record, default_settings(entry, (), {}), scene=str(scene))
@@ -154,8 +154,8 @@ def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: P
 
 
 def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder: Path, tmp_path: Path):
-    plain = wrf_mi.train(flat_folder, tmp_path / "plain", "kriging")
-    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", intervals=True)
+    plain = wrf_mi.train(flat_folder, tmp_path / "plain", "kriging", settings=("generic=true",))
+    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", settings=("generic=true",), intervals=True)
     asked: dict[str, Any] = {"tx_pos_m": [[2.0, 1.0, 1.3]], "tx_heading_rad": [0.5]}
     found = wrf_mi.open_run(run.folder).predict(**asked)
     assert found.mean == pytest.approx(plain.predict(**asked).mean)

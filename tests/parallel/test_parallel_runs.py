@@ -25,7 +25,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 
 PRODUCTS = 1e-5
-"""Share of the largest value by which physics models and operators may differ: a product of matrices adds in an order
+"""Share of the largest value by which kriging and operators may differ: a product of matrices adds in an order
 that depends on how many columns it has. Splatted fields and traces are bit-identical."""
 POSITIONS = 12
 
@@ -134,11 +134,11 @@ def test_parallel_trace_of_random_paths_equals_serial(
         assert_same_bits(arrays, stored(parallel / "paths.npz"))
 
 
-def test_parallel_prediction_of_physics_models_equals_serial(flat: Path, two: Scheduler, tmp_path: Path) -> None:
+def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler, tmp_path: Path) -> None:
     waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
     for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
         folder = tmp_path / name
-        run = train(data, folder / "run", "physics", settings=given).folder
+        run = train(data, folder / "run", "kriging", settings=given).folder
         places = positions(load(data))
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)

@@ -54,7 +54,7 @@ def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
 @pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
 def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: Path, tmp_path: Path) -> None:
     """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
-    few = ("trees=20",) if name == "trees" else ()
+    few = {"trees": ("trees=20",), "kriging": ("generic=true",)}.get(name, ())
     out = train(flat_folder, tmp_path / "run", name, settings=few).folder
     record, arrays, opened = load(flat_folder), stored(out), open_run(out)
     assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
@@ -254,7 +254,7 @@ def test_bad_calls_are_refused(
         (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
         (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
         (
-            ["train", flat_folder, "--model", "kriging", *out, "--n-train", 1],
+            ["train", flat_folder, "--model", "kriging", *out, "--n-train", 1, "--set", "generic=true"],
             "training rows received: 1; its trend needs 2, so give",
         ),
         ([*train, "--scene", "x"], "mri on .*flat: takes no scene; omit --scene"),

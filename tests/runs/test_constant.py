@@ -97,7 +97,7 @@ def test_folds_are_scored_together() -> None:
     assert all(one[CONSTANT]["beaten"] for one in metrics)
 
 
-@pytest.mark.parametrize("model", ["idw", "kriging", "mri", "trees", "physics"])
+@pytest.mark.parametrize("model", ["idw", "kriging", "mri", "trees"])
 def test_a_model_of_strengths_without_place_says_so(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

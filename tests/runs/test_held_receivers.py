@@ -58,7 +58,7 @@ def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: 
     assert pooled["n_test"] == 80
 
 
-@pytest.mark.parametrize("name", ["mri", "physics"])
+@pytest.mark.parametrize("name", ["mri", "kriging"])
 def test_what_held_out_receivers_observed_changes_no_fit(name: str, law: Record, tmp_path: Path) -> None:
     broken = law.observation.copy()
     broken[3, :40] = 1e6 * np.arange(40)
@@ -75,11 +75,11 @@ def test_what_held_out_receivers_observed_changes_no_fit(name: str, law: Record,
 
 def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, tmp_path: Path) -> None:
     """The model's receivers share a law, and each has an offset of 4 dB a priori: 9 dB lie inside 90 % hardly."""
-    run = train(law, tmp_path / "run", "physics", split="receiver:3")
-    inner, outer = (read_run(r.folder) for r in (train(law, tmp_path / "in", "physics"), run))
+    run = train(law, tmp_path / "run", "kriging", split="receiver:3")
+    inner, outer = (read_run(r.folder) for r in (train(law, tmp_path / "in", "kriging"), run))
     stds = [np.load(one.path / "predictions.npz")["std"][3] for one in (inner, outer)]
     assert stds[1].mean() > stds[0].mean() + 1
-    near = train(law, tmp_path / "near", "physics", split="receiver:1").metrics
+    near = train(law, tmp_path / "near", "kriging", split="receiver:1").metrics
     assert near["inside_90"] == 1
     assert near["abs_error_db"]["median"] < run.metrics["abs_error_db"]["median"]
 
@@ -87,7 +87,7 @@ def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, t
 def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path: Path) -> None:
     """Offsets of the receivers are unlike: a law with an offset of each is as good as one law at a new receiver."""
     run = train(law, tmp_path / "run", "hybrid", split="receiver:1")
-    assert set(run.metrics["held_out"]) == {"physics-no-mesh", "mri", "hybrid"}
+    assert set(run.metrics["held_out"]) == {"kriging", "mri", "hybrid"}
     assert run.metrics["held_out"]["hybrid"] < 7
     assert run.metrics["inside_90"] == 1
     found = read_run(run.folder)
@@ -99,12 +99,12 @@ def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path:
 
 def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path) -> None:
     """Five rows: the offset of 9 dB is known; the distances, from the rows of the others."""
-    none, few = (train(law, tmp_path / name, "physics", split=name).metrics for name in ("receiver:3", "receiver+5:3"))
+    none, few = (train(law, tmp_path / name, "kriging", split=name).metrics for name in ("receiver:3", "receiver+5:3"))
     assert few["abs_error_db"]["median"] < 1 < 5 < none["abs_error_db"]["median"]
     assert few["receivers"]["anchor3"]["n_test"] == 20
     hybrid = train(law, tmp_path / "hybrid", "hybrid", split="receiver+5:3").metrics
     assert hybrid["abs_error_db"]["median"] < 1
-    assert {"kriging", "physics-no-mesh"} < set(hybrid["held_out"])  # kriging serves a receiver with rows of its own
+    assert {"kriging", "idw"} < set(hybrid["held_out"])  # idw serves a receiver with rows of its own
 
 
 def test_rows_left_to_new_receivers_are_held_out_in_turn(law: Record) -> None:
@@ -123,7 +123,7 @@ def test_rows_left_to_new_receivers_are_held_out_in_turn(law: Record) -> None:
     assert sorted(own) == sorted(split.left[:, 1])  # each of them once
 
 
-@pytest.mark.parametrize("name", ["kriging", "mri", "physics", "hybrid"])
+@pytest.mark.parametrize("name", ["kriging", "mri", "hybrid"])
 def test_rows_that_are_not_left_change_no_fit(name: str, law: Record, tmp_path: Path) -> None:
     split = make_splits(law, "receiver+12:3")[0]
     broken = law.observation.copy()
@@ -227,6 +227,15 @@ def test_models_of_trained_receivers_refuse(name: str, law: Record, tmp_path: Pa
         with pytest.raises(InputError, match=f"receiver:0: {name.replace('+', '.')} predicts for the receivers it is"):
             train(law, tmp_path / "run", name, split="receiver")
         assert not (tmp_path / "run").exists()
+
+
+def test_kriging_of_each_receiver_alone_refuses_receivers_without_rows(law: Record, tmp_path: Path) -> None:
+    for record, settings in ((replace(law, frequencies_hz=None), ()), (law, ("generic=true",))):
+        with pytest.raises(InputError, match=r"split receiver:3: kriging of each receiver alone.*; choose mri"):
+            train(record, tmp_path / "run", "kriging", split="receiver:3", settings=settings)
+        assert not (tmp_path / "run").exists()
+    few = train(law, tmp_path / "few", "kriging", split="receiver+5:3", settings=("generic=true",))
+    assert few.metrics["receivers"]["anchor3"]["n_test"] == 20
 
 
 def test_receivers_of_spectra_are_not_held_out(tmp_path: Path) -> None:

@@ -26,8 +26,7 @@ FITS: dict[str, tuple[str, ...]] = {
     "kriging": (),
     "mri": (),
     "trees": (),
-    "physics": (),
-    "hybrid": ("ingredients=idw,physics-no-mesh",),
+    "hybrid": ("ingredients=idw,kriging",),
     "wrf-gs": tuple(SMALL),
     "wrf-gs+": tuple(SMALL),
     "nerf2": ("steps=2", "validate_every=2"),
@@ -109,7 +108,7 @@ def test_held_out_receivers_of_a_given_split_keep_their_place(tmp_path: Path) ->
     assert run.metrics["receivers"]["hall"]["n_test"] == 0
 
 
-@pytest.mark.parametrize("model", ["kriging", "mri", "trees", "physics"])
+@pytest.mark.parametrize("model", ["kriging", "mri", "trees"])
 def test_two_and_three_training_rows_are_enough_also_for_intervals(model: str, tmp_path: Path) -> None:
     """Parts of the training rows that are held out leave the receivers one row or none, and them out."""
     record = building(attic=(3, 7, 45), cellar=(5, 6, 9))
@@ -131,14 +130,14 @@ def test_kriging_of_a_trend_through_every_row_is_the_trend(tmp_path: Path) -> No
     """Residuals of two rows from a level and a slope are zero, which leaves nothing to interpolate."""
     record = building(attic=(3, 4))
     record.observation[3, 3:5] = [-60.0, -70.0]
-    run = train(record, tmp_path / "run", "kriging")
+    run = train(record, tmp_path / "run", "kriging", settings=("generic=true",))
     np.testing.assert_allclose(run.predict(record.tx_pos_m[3:5], "attic").mean, [-60, -70], atol=1e-3)  # float32
 
 
 def test_a_receiver_with_few_rows_at_one_carrier_is_interpolated_between_its_other_carriers(tmp_path: Path) -> None:
     record = building(attic=(*range(1, 52, 2), 4))
     record = replace(record, frequencies_hz=None, carriers_hz=np.where(np.arange(len(record)) % 2, 9e8, 2.4e9))
-    run = train(record, tmp_path / "run", "kriging")
+    run = train(record, tmp_path / "run", "kriging", settings=("generic=true",))
     assert "receivers_left_out" not in run.metrics
     low, high = (
         open_run(run.folder, record).predict([[1, 2, 1.3]], "attic", carriers_hz=[hz]).mean for hz in (9e8, 2.4e9)
@@ -159,7 +158,7 @@ def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_commands_take_a_run_without_them(office: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
-    asked: list[Any] = ["train", office, "--model", "physics", "--out", run, "--json"]
+    asked: list[Any] = ["train", office, "--model", "kriging", "--out", run, "--json"]
     status, out, _ = call(asked, capsys)
     assert status == 0
     assert json.loads(out)["receivers_left_out"] == {"attic": 1, "cellar": 0}

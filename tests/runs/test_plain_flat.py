@@ -18,7 +18,7 @@ from wrf_mi.runs.compare import compare
 from wrf_mi.runs.prediction_file import read_inputs, write_prediction_file
 
 NAMES = list(NAMED_ANCHORS_M)
-MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": (), "physics": ()}
+MODELS = {"kriging": (), "trees": ("--set", "trees=20"), "mri": ()}
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_models_work_without_headings(
         np.testing.assert_allclose(found["prediction"], before["prediction"], atol=1e-4)
 
 
-@pytest.mark.parametrize("model", ["kriging", "trees", "physics"])
+@pytest.mark.parametrize("model", ["kriging", "trees"])
 def test_models_use_the_height(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -57,11 +57,11 @@ def test_models_use_the_height(
         assert (np.abs(np.diff(found["prediction"], axis=1)) > 1e-3).any()
 
 
-@pytest.mark.parametrize("model", ["mri", "physics"])
+@pytest.mark.parametrize("model", ["mri", "kriging"])
 def test_csv_predictions_equal_npz_predictions(
     model: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    turned = model != "physics"  # The physics model was trained without headings, so it refuses them.
+    turned = model != "kriging"  # Strengths were kriged without headings, so they are refused.
     columns = ["x", "y", "z", "heading_rad"] if turned else ["x", "y", "z"]
     rows = [["0.1", "2", "0.5", "0.3"], ["3", "1", "1.75", "-1"]]
     text = "\n".join(",".join(row[: len(columns)]) for row in [columns, *rows]) + "\n"
@@ -74,7 +74,7 @@ def test_csv_predictions_equal_npz_predictions(
     table = read_csv(tmp_path / "out.CSV")
     with np.load(tmp_path / "out.npz") as found:
         arrays = dict(found)
-    assert ("std" in arrays) == (model == "physics")
+    assert ("std" in arrays) == (model == "kriging")
     values = {"prediction": "dbm"} | ({"std": "std_db"} if "std" in arrays else {})
     names = [f"{name}_{unit}" for unit in values.values() for name in NAMES]
     assert table.header == [*columns, *names]

@@ -30,7 +30,7 @@ DEAD = 2**22 + 1
 @pytest.fixture(scope="module")
 def kriging(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(
-        flat_folder, tmp_path_factory.mktemp("runs") / "kriging", "kriging", settings=("heading=false",)
+        flat_folder, tmp_path_factory.mktemp("runs") / "kriging", "kriging", settings=("heading=false", "generic=true")
     ).folder
 
 

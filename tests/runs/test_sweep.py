@@ -133,8 +133,8 @@ def test_bad_input_is_refused_before_anything_starts(
         (folder, ["split=official,blocked:9"], "blocked"),
         (folder, ["initial.points=nowhere.ply"], "nowhere.ply"),
         (folder, ["scene=a,b"], "carrier frequency unknown"),
-        (folder, ["model=physics", "steps=1"], "steps"),
-        (folder, ["model=physics", "n-train=0,4"], "nothing to predict from"),
+        (folder, ["model=kriging", "steps=1"], "steps"),
+        (folder, ["model=kriging", "n-train=0,4"], "n_train 0; choose 1"),
         (
             flat_folder,
             ["model=vae", "seed=0,1"],

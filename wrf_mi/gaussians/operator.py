@@ -11,22 +11,20 @@ depend on the number of Gaussians. Products are SciPy's (sparse) and NumPy's (de
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
-from threadpoolctl import ThreadpoolController
 
 from ..backend.device import on_device
 from ..core import InputError
+from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
 from .footprint import Footprints, Pose, depth_order, project
 from .parameters import Gaussians
@@ -197,14 +195,7 @@ def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: fl
     return whole
 
 
-_blas = cache(ThreadpoolController)
-
-
-def _workers() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-_POOL = ThreadPoolExecutor(_workers(), "wrf-mi-operator")  # without a thread until its first use
+_POOL = ThreadPoolExecutor(processors(), "wrf-mi-operator")  # without a thread until its first use
 
 
 class _Operator(ABC):
@@ -237,8 +228,8 @@ class _Operator(ABC):
             np.sqrt(to, out=to)
 
         blocks = range(0, len(rows), BLOCK)
-        with _blas().limit(limits=1, user_api="blas"):
-            list(_POOL.map(compute, blocks) if len(blocks) > 1 and _workers() > 1 else map(compute, blocks))
+        with one_blas_thread():
+            list(_POOL.map(compute, blocks) if len(blocks) > 1 and processors() > 1 else map(compute, blocks))
         return out.reshape(len(rows), self.height, self.width)
 
 

@@ -140,7 +140,7 @@ def locate(
     >>> record = wrf_mi.Record("made-up", "rssi", tx_pos_m, tuple(receivers), rssi_dbm, **known)
     >>> folder = Path(tempfile.mkdtemp())
     >>> data = write_ble_folder(folder / "data", record)
-    >>> run = wrf_mi.train(data, folder / "run", "physics")
+    >>> run = wrf_mi.train(data, folder / "run", "kriging")
     >>> found = wrf_mi.locate(run.folder, rssi_dbm[:, 50:], level=0.9)
     >>> bool(np.median(found.error_m(tx_pos_m[50:])) < 1)
     True

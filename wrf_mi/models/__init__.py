@@ -20,7 +20,7 @@ _OWN: Mapping[str, Model | str] = {
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
     "hybrid": "wrf_mi.models.hybrid.model:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:MODEL",
-    "kriging": "wrf_mi.models.interpolation.kriging:MODEL",
+    "kriging": "wrf_mi.models.interpolation.by_task:MODEL",
     "trees": "wrf_mi.models.interpolation.trees:MODEL",
     "mri": "wrf_mi.models.interpolation.mri:MODEL",
     "vae": "wrf_mi.models.networks.vae:MODEL",

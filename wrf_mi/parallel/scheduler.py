@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import sys
 import uuid
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ..core import InputError
 from ..core.files import one_line
+from .threads import processors
 from .worker import run_part, worker_environment
 
 CONNECT_S = 10.0
@@ -247,7 +247,7 @@ def _local_workers(text: str) -> int | None:
     if name != "local":
         return None
     if not colon:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return processors()
     if not number.isdecimal() or int(number) < 1:
         raise InputError(f"--scheduler {text}: give the number of workers, 1 or more, such as local:2")
     return int(number)

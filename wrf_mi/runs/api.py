@@ -176,7 +176,7 @@ def _check_scene(
 ) -> None:
     if scene is None:
         if model.scene == "required":
-            raise InputError(f"{model.name} needs a scene; give --scene SCENE")
+            raise InputError(f"{model.name} needs a scene; give --scene SCENE, or choose kriging, which takes none")
         if material is not None or antennas:
             raise InputError("--material and antenna options belong to a scene that is traced; give --scene")
     elif model.scene == "none":

@@ -80,13 +80,6 @@ class Walls:
         return result, nearest
 
 
-def no_walls() -> Walls:
-    """Walls of empty space."""
-    none, flat = np.zeros((0, 3)), np.zeros((0, 2))
-    axes, edges = np.zeros((0, 2, 3)), np.zeros((0, 2, 2))
-    return Walls(none, np.zeros(0), none, axes, np.zeros(0), flat, flat, edges, np.zeros(1, np.int64))
-
-
 def moved_planes(
     normal: FloatArray, axes: FloatArray, centre_m: FloatArray, change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

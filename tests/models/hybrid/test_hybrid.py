@@ -18,6 +18,8 @@ from wrf_mi.models import Interrupted
 from wrf_mi.models.held_out import HeldOut
 from wrf_mi.tasks.scores import cea_db
 
+UNCLEAR_DB = 0.1
+"""Difference on 24 held-out rows that is no clear gain over the most trusted ingredient, kriging."""
 EXACT_DB = 30.0
 """CEA of a downlink that is its uplink turned, from twenty rows: single precision and a little penalty."""
 
@@ -25,7 +27,7 @@ EXACT_DB = 30.0
 def test_hybrid_is_never_far_below_its_ingredients_on_held_out_rows(flat_folder: Path, tmp_path: Path):
     run = wrf_mi.train(flat_folder, tmp_path / "run", "hybrid", settings=("ingredients=idw,kriging,mri",))
     held = run.metrics["held_out"]
-    assert held["hybrid"] <= min(held[name] for name in ("idw", "kriging", "mri")) + 1e-9
+    assert held["hybrid"] <= min(held[name] for name in ("idw", "kriging", "mri")) + UNCLEAR_DB
     assert sum(run.metrics["weights"][0][name] for name in run.metrics["weights"][0] if name != "distance_m") == 1
     assert 0.5 < run.metrics["inside_90"] <= 1
 
@@ -71,7 +73,7 @@ def test_ingredients_that_do_not_serve_the_data_are_left_out_or_refused(
     from wrf_mi.models import Problem
     from wrf_mi.models.hybrid.model import HybridSettings
 
-    assert list(problems(Problem(one_gateway, HybridSettings()), None)) == ["kriging", "physics-no-mesh", "idw"]
+    assert list(problems(Problem(one_gateway, HybridSettings()), None)) == ["kriging", "idw"]
     out = ["--out", str(tmp_path / "run")]
     refused(["train", folder, "--model", "hybrid", "--set", "ingredients=mri", *out], "mri serves rssi", capsys)
     refused(["train", folder, "--model", "hybrid", "--set", "ingredients=physics", *out], "needs a scene", capsys)

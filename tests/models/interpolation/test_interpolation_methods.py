@@ -48,10 +48,10 @@ def test_entries_of_the_registry_are_consistent() -> None:
 def test_settings_are_listed_and_accept_null(flat_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = call(["train", "--help-settings"], capsys)
     assert status == 0
-    for line in ("idw:", "neighbours=null", "kriging:", "length_m=null", "mri:", "shared=False"):
+    for line in ("idw:", "neighbours=null", "kriging, spectra:", "length_m=null", "mri:", "shared=False"):
         assert line in out.splitlines(), line
     given = wrf_mi.with_settings(
-        MODELS["kriging"].settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
+        MODELS["kriging"].serving("rssi", False).settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
     )
     assert (given.length_m, given.noise, given.trend) == (None, 1.0, "constant")
     assert isinstance(given.noise, float)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from ...core.angles import FloatArray
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...datasets.observations import LEAST_ROWS, rows_received
-from ...training.session import FitSession
+from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
 HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
@@ -34,9 +34,53 @@ class Single(Protocol):
         """Arrays of a run file."""
 
 
-FitSingle = Callable[[Problem, Split, Receiver, FloatArray, NDArray[Any], "FloatArray | None"], Single]
-"""From a problem, its split, a receiver, positions [n, 3] in metres, observations [n, ...] and headings [n] to the
-receiver's model."""
+@runtime_checkable
+class Probabilistic(Single, Protocol):
+    """The model of one receiver that states standard deviations."""
+
+    def prediction(self, tx_pos: FloatArray) -> Prediction:
+        """Observations [m, ...] at positions [m, 3], and their standard deviations."""
+
+    def facts(self) -> dict[str, Any]:
+        """Fitted parameters and choices as plain numbers and strings."""
+
+
+@dataclass(frozen=True)
+class ReceiverRows:
+    """Training rows of one receiver, some of which it may not have received, and what they belong to.
+
+    Attributes:
+        problem: data and settings.
+        split: split of the data.
+        receiver: the receiver.
+        tx_pos_m: positions [n, 3], metres.
+        observation: observations [n, ...]; NaN where nothing was received.
+        tx_heading_rad: headings [n], or None to leave them out.
+        on_progress: progress callback.
+    """
+
+    problem: Problem
+    split: Split
+    receiver: Receiver
+    tx_pos_m: FloatArray
+    observation: NDArray[Any]
+    tx_heading_rad: FloatArray | None
+    on_progress: OnProgress
+
+
+FitSingle = Callable[[ReceiverRows], Single]
+"""From the rows of a receiver to its model."""
+
+
+def finite_positions(inputs: Inputs, name: str) -> FloatArray:
+    """Positions of the rows to predict [m, 3], metres.
+
+    Raises:
+        InputError: unknown positions, from which the model ``name`` predicts.
+    """
+    if not np.isfinite(inputs.tx_pos_m).all():
+        raise InputError(f"{name}: predicts from positions; give finite x, y, z in metres for every row")
+    return inputs.tx_pos_m
 
 
 def observed_rows(
@@ -74,8 +118,13 @@ class ByReceiver(Fitted):
     heading: bool
     carriers_hz: FloatArray | None = None
 
+    @property
+    def states_std(self) -> bool:
+        """Whether predictions have standard deviations: those of all receivers, or none."""
+        return self.carriers_hz is None and all(isinstance(model, Probabilistic) for model in self.models)
+
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Observations of a receiver, [m, ...].
+        """Observations of a receiver, [m, ...], with standard deviations where `states_std`.
 
         At a carrier without a model of the receiver they are linear in the logarithm of the frequency between the two
         next carriers with one, and beyond all of them those of the nearest.
@@ -83,8 +132,14 @@ class ByReceiver(Fitted):
         Raises:
             InputError: positions, headings or carriers that are not known.
         """
-        if not np.isfinite(inputs.tx_pos_m).all():
-            raise InputError(f"{self.name}: predicts from positions; give finite x, y, z in metres for every row")
+        return self._predict(inputs, receiver, std=True)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, without the time that standard deviations take."""
+        return self._predict(inputs, receiver, std=False).mean
+
+    def _predict(self, inputs: Inputs, receiver: int, std: bool) -> Prediction:
+        tx_pos_m = finite_positions(inputs, self.name)
         if self.heading and inputs.tx_heading_rad is None:
             raise InputError(
                 f"{self.name}: fitted with the transmitter's headings; give heading_rad, or train with heading=false"
@@ -92,7 +147,10 @@ class ByReceiver(Fitted):
         heading = inputs.tx_heading_rad if self.heading else None
         if self.carriers_hz is None:
             (model,) = self._of(receiver).values()
-            return Prediction(model.predict(inputs.tx_pos_m, heading))
+            if std and self.states_std:
+                assert isinstance(model, Probabilistic)
+                return model.prediction(tx_pos_m)
+            return Prediction(model.predict(tx_pos_m, heading))
         if inputs.carriers_hz is None:
             known = carriers_text(self.carriers_hz)
             raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
@@ -104,7 +162,7 @@ class ByReceiver(Fitted):
             turned = None if heading is None else heading[rows]
 
             def at(number: int) -> NDArray[Any]:
-                return np.asarray(fitted[number].predict(inputs.tx_pos_m[rows], turned))
+                return np.asarray(fitted[number].predict(tx_pos_m[rows], turned))
 
             below, share = int(place), place % 1
             return at(below) if share == 0 else (1 - share) * at(below) + share * at(below + 1)
@@ -121,6 +179,12 @@ class ByReceiver(Fitted):
     def depends_on_heading(self) -> bool:
         """Whether the models use headings."""
         return self.heading
+
+    def facts(self) -> dict[str, Any]:
+        """Fitted parameters and choices of each receiver, where its model states them."""
+        if not self.states_std:
+            return {}
+        return {"fitted": [model.facts() for model in self.models if isinstance(model, Probabilistic)]}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of all models, use of headings, and carriers."""
@@ -163,6 +227,7 @@ def model_by_receiver(
         carriers = None if stated is None else np.unique(stated[rows])
         parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
         models: list[Single | None] = []
+        fits_in_all = len(parts) * len(record.receivers)
         counts = np.stack([rows_received(record, part) for part in parts])
         # A receiver with few rows at one carrier is interpolated between its other carriers.
         enough = counts >= np.minimum(counts.max(axis=0), LEAST_ROWS)
@@ -172,12 +237,18 @@ def model_by_receiver(
                 if not fit_it:
                     models.append(None)
                     continue
+
+                def report(
+                    stage: str, share: float, _: object = None, /, *, done: int = len(models), who: str = receiver.name
+                ) -> None:
+                    session.report(f"{who}: {stage}", (done + share) / fits_in_all)
+
                 try:
                     rows_of = record.tx_pos_m[part], observed[part], turned
-                    models.append(fit_single(problem, split, receiver, *rows_of))
+                    models.append(fit_single(ReceiverRows(problem, split, receiver, *rows_of, report)))
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-                session.report(f"{name}: receivers", len(models) / (len(parts) * len(record.receivers)))
+                session.report(f"{name}: receivers", len(models) / fits_in_all)
         return ByReceiver(name, models, headings is not None, carriers)
 
     def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError, Receiver, Split
-from ...core.angles import FloatArray
+from ...core import InputError
 from ...tasks import task_of
-from ..model import Problem
-from .by_receiver import model_by_receiver, observed_rows
+from .by_receiver import ReceiverRows, model_by_receiver, observed_rows
 
 
 class InverseDistance:
@@ -95,14 +93,12 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def _fit(
-    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
-) -> InverseDistance:
-    settings: IdwSettings = problem.settings
-    task = task_of(problem.record)
+def _fit(rows: ReceiverRows) -> InverseDistance:
+    settings: IdwSettings = rows.problem.settings
+    task = task_of(rows.problem.record)
     k = task.neighbours if settings.neighbours is None else settings.neighbours
     softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
-    return InverseDistance(k, settings.power, softening_m).fit(tx_pos, observed)
+    return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
 
 
 MODEL = model_by_receiver(

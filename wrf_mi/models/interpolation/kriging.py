@@ -8,7 +8,8 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Receiver, Split
+from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from ..model import Problem
-from .by_receiver import model_by_receiver, observed_rows
+from .by_receiver import ReceiverRows, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
@@ -66,6 +66,8 @@ def log_distance(receiver_m: ArrayLike) -> Trend:
     return Trend(np.asarray(receiver_m, float))
 
 
+SCALE = "scale"
+"""Key of the arrays that kriging without standard deviations has not."""
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
 """Attributes of `Kriged` that are stored as they are."""
 
@@ -130,6 +132,59 @@ class Kriged:
         trend = _trend(str(arrays["trend"]), receiver)
         kept: dict[str, Any] = {name: arrays[name] for name in KEPT}
         return cls(kernel=str(arrays["kernel"]), circle=circle, trend=trend, **kept)
+
+
+@dataclass(frozen=True)
+class UncertainKriged:
+    """Kriging with standard deviations, for data in which other receivers have them.
+
+    Attributes:
+        kriged: the kriging over positions, with a trend by generalised least squares.
+        noise: variance of the noise as a share of the field's.
+        scale: standard deviation of the field of each component [q].
+    """
+
+    kriged: Kriged
+    noise: float
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, kriged: Kriged, observed: NDArray[Any]) -> UncertainKriged:
+        """The kriging of rows [n, ...], with the variance of greatest restricted likelihood."""
+        values = observed.reshape(len(observed), -1)
+        free = len(values) - kriged.coefficients.shape[0]
+        # y^H Q y / free, Q being the precision free of the trend, whose product with y the weights are. A single row
+        # says nothing about the spread: it may be as great as what it observed.
+        square = np.einsum("nq,nq->q", values.conj(), kriged.weights if free else values).real / max(free, 1)
+        return cls(kriged, kriged.noise, np.sqrt(np.maximum(square, 0)))
+
+    @cached_property
+    def _system(self) -> KrigingSystem:
+        rows, kriged = _coordinates(self.kriged.positions_m, None, self.kriged.lengths), self.kriged
+        return KrigingSystem(correlation(rows, rows, kriged.kernel), self.noise, kriged.trend(kriged.positions_m))
+
+    def left_out(self) -> NDArray[Any]:
+        """Errors of the rows, each predicted from all others, [n, q] (Dubrule, 1983)."""
+        return np.asarray(self.kriged.weights / np.diag(self._system.precision)[:, None])
+
+    def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
+        """Observations [m, ...] at positions [m, 3], metres; headings are not used."""
+        return self.kriged.predict(tx_pos)
+
+    def prediction(self, tx_pos: FloatArray) -> Prediction:
+        """Observations and standard deviations at positions [m, 3], metres."""
+        mean, length_m = self.predict(tx_pos), self.kriged.lengths[0]
+        cross = correlation(tx_pos / length_m, self.kriged.positions_m / length_m, self.kriged.kernel)
+        unknown = self.noise + self._system.variance(1.0, cross, self.kriged.trend(tx_pos))
+        return Prediction(mean, (np.sqrt(unknown)[:, None] * self.scale).reshape(mean.shape))
+
+    def facts(self) -> dict[str, Any]:
+        """Form, correlation length and noise."""
+        return {"parts": "generic", "length_m": float(self.kriged.lengths[0]), "noise": self.noise}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a run file."""
+        return self.kriged.arrays() | {"noise": np.array(self.noise), SCALE: self.scale}
 
 
 @dataclass(frozen=True)
@@ -276,22 +331,34 @@ class KrigingSettings(CovarianceSettings):
     Attributes:
         trend: constant, log-distance, or null: log-distance for signal strengths, else constant.
         trend_fit: gls (jointly with the field) or ols (before it), or null: ols for log-distance, else gls.
+        generic: whether the observations themselves are kriged, each receiver alone, whatever they are; so they are,
+            too, where a covariance or a trend is stated.
         heading: whether headings count, where the data have them and hold signal strengths.
     """
 
     trend: str | None = None
     trend_fit: str | None = None
+    generic: bool = False
     heading: bool = True
+
+    @property
+    def is_generic(self) -> bool:
+        """Whether `generic` or any setting that only generic kriging has differs from its default."""
+        only = [one for one in fields(KrigingSettings) if one.name != "heading"]
+        return any(getattr(self, one.name) != one.default for one in only)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
     return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
 
 
-def _fit(
-    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
-) -> Kriged:
-    s, record = problem.settings, problem.record
+def fit_generic(rows: ReceiverRows) -> Kriged:
+    """Kriging of the observations of one receiver.
+
+    Raises:
+        InputError: settings that do not fit the data, or as `Kriging.fit`.
+    """
+    s, record = rows.problem.settings, rows.problem.record
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
@@ -299,15 +366,14 @@ def _fit(
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-    return Kriging(*given, _trend(name, receiver), how, problem.seed).fit(tx_pos, observed, heading)
+    kriging = Kriging(*given, _trend(name, rows.receiver), how, rows.problem.seed)
+    return kriging.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)
 
 
-MODEL = model_by_receiver(
-    "kriging",
-    None,
-    KrigingSettings,
-    _fit,
-    lambda receiver, arrays: Kriged.from_arrays(arrays, receiver),
-    "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4",
-    lambda record, settings: settings.heading and task_of(record).in_decibel,
-)
+SOURCE = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
+
+
+def load_generic(receiver: Receiver, arrays: dict[str, NDArray[Any]]) -> Kriged | UncertainKriged:
+    """The kriging of a receiver from its arrays."""
+    kriged = Kriged.from_arrays(arrays, receiver)
+    return UncertainKriged(kriged, float(arrays["noise"]), arrays[SCALE]) if SCALE in arrays else kriged

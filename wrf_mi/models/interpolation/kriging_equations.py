@@ -8,7 +8,7 @@ where K serves all components of an observation (columns of y). Simple kriging h
 unknown mean, universal kriging any columns B. K and y may be complex (Hermitian covariance), B is real.
 
 Waves that reach one receiver leave the transmitter within a cone around the line of sight
-(`wrf_mi.models.physics.signals`), so a step along it changes their relative phases less than a step across it: on
+(`wrf_mi.models.interpolation.signals`), so a step along it changes their relative phases less than a step across it: on
 measured spectra half as fast. `AnisotropicKriging` has an exponential correlation with a length for each of three axes,
 and one unknown mean.
 

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import Problem
-from .by_receiver import model_by_receiver
+from .by_receiver import ReceiverRows, model_by_receiver
 from .kriging import log_distance
 
 
@@ -58,19 +57,19 @@ class PathLoss:
         return {"law": self.law}
 
 
-def _fit(
-    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
-) -> PathLoss:
-    columns = log_distance(receiver.position_m)(tx_pos)
-    if problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
-        return PathLoss(receiver.position_m, _shared_law(problem.record, split.all_train))
+def _fit(rows: ReceiverRows) -> PathLoss:
+    record, train, observed = rows.problem.record, rows.split.all_train, rows.observation
+    receiver_m = rows.receiver.position_m
+    columns = log_distance(receiver_m)(rows.tx_pos_m)
+    if rows.problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
+        return PathLoss(receiver_m, _shared_law(record, train))
     received = ~np.isnan(observed)
-    if np.ptp(tx_pos, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
+    if np.ptp(rows.tx_pos_m, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
         # Rows at a single distance state a level but no exponent, which is that of all receivers.
-        _, slope = _shared_law(problem.record, split.all_train)
+        _, slope = _shared_law(record, train)
         level = float(np.mean(observed[received] - slope * columns[received, 1]))
-        return PathLoss(receiver.position_m, np.array([level, slope]))
-    return PathLoss(receiver.position_m, _law(columns, observed))
+        return PathLoss(receiver_m, np.array([level, slope]))
+    return PathLoss(receiver_m, _law(columns, observed))
 
 
 def _shared_law(record: Record, rows: IntArray) -> FloatArray:

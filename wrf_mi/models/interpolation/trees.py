@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Receiver, Split
+from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from ..model import Problem
-from .by_receiver import model_by_receiver, observed_rows
+from .by_receiver import ReceiverRows, model_by_receiver, observed_rows
 
 
 @dataclass(frozen=True)
@@ -147,10 +146,9 @@ class TreesSettings:
     heading: bool = True
 
 
-def _fit(
-    problem: Problem, split: Split, receiver: Receiver, tx_pos: FloatArray, observed: Any, heading: FloatArray | None
-) -> GrownTrees:
-    return Trees(problem.settings.trees, problem.settings.leaf_rows, problem.seed).fit(tx_pos, observed, heading)
+def _fit(rows: ReceiverRows) -> GrownTrees:
+    trees = Trees(rows.problem.settings.trees, rows.problem.settings.leaf_rows, rows.problem.seed)
+    return trees.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)
 
 
 MODEL = model_by_receiver(

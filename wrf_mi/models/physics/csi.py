@@ -2,8 +2,7 @@
 
 With measured channels three steps alternate: the probability of each path is inferred from a row's channel (`csi_fit`),
 planes are shifted and tilted until all phases fit (`csi_paths`), and visibility elsewhere is learned from these paths
-(`csi_visibility`). Without measurements this is the image method on the mesh; without a mesh the line of sight and the
-diffuse field, which is useful within half a wavelength of measurements.
+(`csi_visibility`). Without measurements this is the image method on the mesh.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
-from scipy.spatial import KDTree
 
 from ...core import InputError, Receiver, Record, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
@@ -23,86 +21,18 @@ from ...core.types import IntArray
 from ...tasks import require
 from ...tracing.search import shoot
 from ...tracing.surfaces import scene_surfaces
-from ...tracing.walls import Walls, no_walls, walls_of
+from ...tracing.walls import Walls, walls_of
 from ...training.session import OnProgress, quiet
+from ..interpolation.diffuse import DiffuseField, fit_diffuse
 from ..model import Arrays, field_arrays, from_field_arrays
 from .csi_fit import SHARPNESS, CsiSettings, Fit, Rows, mixed, paths_of_rows
-from .csi_paths import MOUNTED_M, NUMBERS, Complex, Model, images_of
+from .csi_paths import MOUNTED_M, NUMBERS, Model, images_of
 from .csi_visibility import Visibility
 from .selection import PhysicsModel, physics_model
 
 DEFAULTS = CsiSettings()
-NEIGHBOURS = 32
-SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
-"""Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
-CERTAIN = 3.0
-"""Standard errors by which predictions with the field must be better than without."""
 CLEAR_M = 0.05
 """Distance from a wall with an antenna mounted on it at which the search by rays begins."""
-
-
-@dataclass(frozen=True)
-class DiffuseField:
-    """Complex Gaussian field with covariance sin(k d) / (k d): waves from all directions with equal power.
-
-    Source: Cook et al., "Measurement of correlation coefficients in reverberant sound fields" (1955), J. Acoust. Soc.
-    Am. 27; the same holds for scalar waves of any kind.
-
-    Attributes:
-        position_m, value: residual channels [n, subcarriers] at positions [n, 3].
-        k: mean wave number, rad/m.
-        power, share: mean of abs(value)^2, and the field's share of it; the rest is noise of each row.
-    """
-
-    position_m: FloatArray
-    value: Complex
-    k: float
-    power: float
-    share: float
-
-    def predict(self, position_m: FloatArray, skip: int = 0) -> tuple[Complex, FloatArray]:
-        """Mean [m, subcarriers] and variance [m] of residuals, noise included, at positions [m, 3] in metres.
-
-        The ``skip`` nearest rows are not used: 1 leaves out the row at the position itself.
-        """
-        count = len(position_m)
-        if self.share == 0 or len(self.position_m) <= skip:
-            return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
-        near = min(NEIGHBOURS, len(self.position_m) - skip)
-        distance, index = KDTree(self.position_m).query(position_m, k=list(range(1 + skip, near + skip + 1)))
-        between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
-        matrix = self.share * np.sinc(self.k * between / np.pi) + (1 - self.share) * np.eye(near)
-        across = self.share * np.sinc(self.k * distance / np.pi)
-        weight = np.linalg.solve(matrix, across[..., None])[..., 0]
-        mean = np.einsum("mn,mnf->mf", weight, self.value[index])
-        return mean, self.power * np.maximum(1 - (weight * across).sum(axis=-1), 1e-6)
-
-
-def fit_diffuse(position_m: FloatArray, value: Complex, k: float) -> DiffuseField:
-    """The field whose share predicts each row best from the others (logarithmic score).
-
-    ``value`` [n, subcarriers] holds residual channels at positions [n, 3] in metres, ``k`` the mean wave number, rad/m.
-    """
-    power = float(np.square(np.abs(value)).mean()) if len(value) else 0.0
-    best = DiffuseField(position_m, value, k, power, 0.0)
-    if power == 0 or len(value) <= 2:
-        return best
-    lowest = _scores(best)
-    for share in SHARES:
-        field = replace(best, share=share)
-        scores = _scores(field)
-        gain = lowest - scores
-        # A spurious field adds its neighbours' errors to correct predictions: only a certain gain is accepted.
-        if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
-            lowest, best = scores, field
-    return best
-
-
-def _scores(field: DiffuseField) -> FloatArray:
-    """Score of each row predicted from the others [n]; robust to rows that lack a path."""
-    mean, variance = field.predict(field.position_m, skip=1)
-    error = np.square(np.abs(field.value - mean)).mean(axis=1)
-    return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
 
 
 @dataclass(eq=False, repr=False)
@@ -129,7 +59,7 @@ class CsiPhysics(PhysicsModel):
     covariance: FloatArray
     fit_facts: dict[str, float]
 
-    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int) -> tuple[Any, Any]:
         rows = Rows(np.zeros((len(tx_pos_m), 0), complex), tx_pos_m, np.full(len(tx_pos_m), receiver))
         paths = paths_of_rows(self.model, rows)
         odds = self.visibility.log_odds(self.model.walls, self.model.images, paths)
@@ -188,25 +118,22 @@ class CsiPhysics(PhysicsModel):
 def fit_csi(
     record: Record,
     rows: IntArray,
-    scene: Any | None,
+    scene: Any,
     settings: CsiSettings = DEFAULTS,
     seed: int = 0,
     on_progress: OnProgress = quiet,
 ) -> CsiPhysics:
     """Fit a CSI physics model to ``rows`` of a record; arguments as ``fit`` of `physics_model`.
 
-    Without rows it is the image method on the scene as given, without a scene the line of sight and a diffuse field.
-    ``seed`` is that of rays, folds and grids of cells.
+    Without rows it is the image method on the scene as given. ``seed`` is that of rays, folds and grids of cells.
 
     Raises:
-        InputError: a record of another task, without frequencies, or neither rows nor a scene.
+        InputError: a record of another task, or without frequencies.
     """
     require(record, "csi", why="this physics model predicts channels")
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: frequencies unknown, which the physics model needs; state them in the data")
     rows = np.asarray(rows, np.int64)
-    if not len(rows) and scene is None:
-        raise InputError(f"{record.name}: neither training rows nor a scene; give one of them")
     on_progress("searching for paths", 0.0)
     model = _start(record, scene, settings, seed)
     measured = _measured(record, rows)
@@ -238,20 +165,18 @@ def _measured(record: Record, rows: IntArray) -> Rows:
     return Rows(values[source, row], record.tx_pos_m[rows[row]], source)
 
 
-def _start(record: Record, scene: Any | None, settings: CsiSettings, seed: int) -> Model:
+def _start(record: Record, scene: Any, settings: CsiSettings, seed: int) -> Model:
     """Planes of the scene as given, and the chains that rays from each receiver find."""
     assert record.frequencies_hz is not None
     source_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     depth = settings.reflections
     line_of_sight = np.full((1, depth), -1)
-    walls, chains = no_walls(), [line_of_sight] * len(source_m)
-    if scene is not None:
-        surfaces = scene_surfaces(scene)
-        walls = walls_of(surfaces)
-        for index, antenna_m in enumerate(source_m):
-            found = shoot(scene, surfaces, _off_walls(walls, antenna_m), settings.rays, depth, depth, seed)
-            found = found.reshape(len(found), depth)
-            chains[index] = np.concatenate([line_of_sight, found[~_mounted(walls, antenna_m, found)]])
+    surfaces, chains = scene_surfaces(scene), []
+    walls = walls_of(surfaces)
+    for antenna_m in source_m:
+        reached = shoot(scene, surfaces, _off_walls(walls, antenna_m), settings.rays, depth, depth, seed)
+        reached = reached.reshape(len(reached), depth)
+        chains.append(np.concatenate([line_of_sight, reached[~_mounted(walls, antenna_m, reached)]]))
     source = np.repeat(np.arange(len(source_m)), [len(chain) for chain in chains])
     k = 2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light
     subcarriers = record.observation.shape[2]

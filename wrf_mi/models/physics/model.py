@@ -1,4 +1,4 @@
-"""The model ``physics``: planes, materials and kriging, by the task of the data and with or without a scene."""
+"""The model ``physics``: planes, materials and kriging, by the task of the data, in a scene."""
 
 from __future__ import annotations
 
@@ -8,21 +8,14 @@ from typing import Any
 
 from ..model import Model
 
-MODULES = {"spectrum": ("measured_spectrum", "spectrum"), "rssi": ("rssi", "rssi"), "csi": ("csi", "csi")}
-"""Modules of the physics models without and with a scene, by task; each has its entry as ``MODEL``."""
-SETTINGS = {
-    "spectra with --scene": ("spectrum", True),
-    "spectra without": ("spectrum", False),
-    "signal strengths": ("rssi", True),
-    "channel coefficients": ("csi", True),
-}
-"""Headings of the settings in the help, with task and whether there is a scene."""
+TASKS = {"spectrum": "spectra", "rssi": "signal strengths", "csi": "channel coefficients"}
+"""Tasks, each with a module that has its entry as ``MODEL``, and headings of their settings in the help."""
 
 
 def _by_data(task: str, with_scene: bool) -> Model:
-    entry: Model = import_module(f".{MODULES[task][with_scene]}", __package__).MODEL
+    entry: Model = import_module(f".{task}", __package__).MODEL
     return entry
 
 
-_settings: dict[str, Any] = {name: _by_data(*data).settings for name, data in SETTINGS.items()}
-MODEL = replace(_by_data("rssi", True), tasks=tuple(MODULES), settings=_settings, by_data=_by_data)
+_settings: dict[str, Any] = {name: _by_data(task, True).settings for task, name in TASKS.items()}
+MODEL = replace(_by_data("rssi", True), tasks=tuple(TASKS), settings=_settings, by_data=_by_data)

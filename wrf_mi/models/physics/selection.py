@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
@@ -35,32 +35,26 @@ class PhysicsModel(ABC):
     chunk_size: ClassVar[int] = 1024
     receivers: tuple[Receiver, ...]
 
-    @property
-    def uses_heading(self) -> bool:
-        """Whether predictions depend on the heading of the transmitter."""
-        return False
-
-    def predict(
-        self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
-    ) -> Prediction:
+    def predict(self, tx_pos_m: ArrayLike, receiver: int | str = 0) -> Prediction:
         """Observations of one receiver and their standard deviations.
 
         Args:
             tx_pos_m: transmitters [m, 3], metres, world frame.
             receiver: name, or number from 0.
-            tx_heading_rad: yaw of each transmitter [m]; None: unknown, averaged over where `uses_heading`.
 
         Returns:
             Mean and standard deviation [m, ...], shaped as in `wrf_mi.core.Record`; both may be read-only.
 
         Raises:
-            InputError: positions or headings of another shape or not finite, or no such receiver.
+            InputError: positions of another shape or not finite, or no such receiver.
         """
-        positions, index, heading = self._checked(tx_pos_m, receiver, tx_heading_rad)
+        positions, index = np.atleast_2d(np.asarray(tx_pos_m, float)), receiver_index(self.receivers, receiver)
+        if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
+            raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
         mean, std = np.empty(0), np.empty(0)  # filled chunk by chunk: joined chunks would take the memory twice
         for begin in range(0, max(len(positions), 1), self.chunk_size):
             rows = slice(begin, begin + self.chunk_size)
-            values, deviation = self._predict(positions[rows], index, None if heading is None else heading[rows])
+            values, deviation = self._predict(positions[rows], index)
             shared = deviation.ndim < values.ndim
             if not begin:
                 mean = np.empty((len(positions), *values.shape[1:]), values.dtype)
@@ -70,29 +64,8 @@ class PhysicsModel(ABC):
                 std[rows] = deviation
         return Prediction(mean, np.broadcast_to(std, mean.shape))
 
-    def predict_mean(
-        self, tx_pos_m: ArrayLike, receiver: int | str = 0, tx_heading_rad: ArrayLike | None = None
-    ) -> NDArray[Any]:
-        """The mean of `predict`, by subclasses that save time without standard deviations."""
-        return self.predict(tx_pos_m, receiver, tx_heading_rad).mean
-
-    def _checked(
-        self, tx_pos_m: ArrayLike, receiver: int | str, tx_heading_rad: ArrayLike | None
-    ) -> tuple[FloatArray, int, FloatArray | None]:
-        """Positions [m, 3], number of the receiver, and headings [m] where they are used."""
-        positions = np.atleast_2d(np.asarray(tx_pos_m, float))
-        if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-            raise InputError(f"transmitters: shape {positions.shape}; give finite positions [m, 3] in metres")
-        heading = None
-        if self.uses_heading and tx_heading_rad is not None:
-            heading = np.atleast_1d(np.asarray(tx_heading_rad, float))
-            if heading.shape != (len(positions),) or not np.isfinite(heading).all():
-                raise InputError(f"predict: {len(positions)} positions and headings {heading.shape}; give one for each")
-        index = receiver_index(self.receivers, receiver)
-        return positions, index, heading
-
     @abstractmethod
-    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int) -> tuple[Any, Any]:
         """Mean and standard deviation of one chunk; a deviation without the first axis is that of all transmitters."""
 
     @abstractmethod
@@ -107,16 +80,14 @@ class PhysicsModel(ABC):
 class FittedPhysics(Fitted):
     """A fitted physics model as the registry's interface."""
 
+    uses_heading = False
+
     def __init__(self, model: PhysicsModel) -> None:
-        self.model, self.receivers, self.uses_heading = model, model.receivers, model.uses_heading
+        self.model, self.receivers = model, model.receivers
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction with standard deviations, see `Fitted`."""
-        return self.model.predict(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
-
-    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """Mean of the prediction, see `Fitted`."""
-        return self.model.predict_mean(inputs.tx_pos_m, receiver, inputs.tx_heading_rad)
+        return self.model.predict(inputs.tx_pos_m, receiver)
 
     def arrays(self) -> Arrays:
         """Arrays of the fitted model, see `Fitted`."""
@@ -141,8 +112,8 @@ def physics_model(
         task: task of the data.
         settings: dataclass of its settings.
         fit: ``fit(record, rows, scene, settings, seed, on_progress)``: a record of the task with frequencies, numbers
-            of its training rows, ``sionna.rt.Scene`` at the carrier or None, settings, seed, progress callback (stage
-            and fraction done).
+            of its training rows, ``sionna.rt.Scene`` at the carrier, settings, seed, progress callback (stage and
+            fraction done).
         load: ``load(arrays)``, from `PhysicsModel.arrays`.
         uses_antennas: whether its paths have the antennas' patterns and polarisations; else all are isotropic.
         gaps: arrays that may hold NaN, see `Model.gaps`.
@@ -152,14 +123,25 @@ def physics_model(
         given = problem.record, problem.rows(split), problem.opened_scene
         return FittedPhysics(fit(*given, problem.settings, problem.seed, session.report))
 
+    return physics_entry(task, settings, fit_problem, lambda arrays: FittedPhysics(load(arrays)), uses_antennas, gaps)
+
+
+def physics_entry(
+    task: str,
+    settings: type,
+    fit: Callable[[Problem, Split, Session], Fitted],
+    load: Callable[[Arrays], Fitted],
+    uses_antennas: bool = True,
+    gaps: tuple[str, ...] = (),
+) -> Model:
+    """Entry of the physics model for a task from its ``fit`` and ``load``; arguments as those of `physics_model`."""
+
     def check(problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse antennas in solids; warn of antennas near surfaces, crossed polarisations and ignored antennas."""
         record, scene = problem.record, problem.opened_scene
         if task_of(record).is_complex and record.observation.ndim != 3:
             text = f"channels of {record.observation.shape[2]} antennas; the physics model serves receivers with one"
             raise InputError(f"{record.name}: {text}")
-        if scene is None:
-            return
         positions = np.asarray(record.tx_pos_m, float)
         Prepared(scene).check(positions, record.receivers)
         if uses_antennas:
@@ -171,10 +153,10 @@ def physics_model(
         "physics",
         (task,),
         settings,
-        fit_problem,
-        lambda arrays, problem, folder: FittedPhysics(load(arrays)),
+        fit,
+        lambda arrays, problem, folder: load(arrays),
         "docs/joint.md",
-        scene="optional",
+        scene="required",
         uses_antennas=uses_antennas,
         scene_alone=True,
         headings=True,

@@ -70,7 +70,7 @@ class SpectrumPhysics(PhysicsModel):
         """Name the receivers."""
         self.receivers = tuple(model.instrument.receiver for model in self.models)
 
-    def _predict(self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None) -> tuple[Any, Any]:
+    def _predict(self, tx_pos_m: FloatArray, receiver: int) -> tuple[Any, Any]:
         model = self.models[receiver]
         mean = model.spectra(tx_pos_m)
         return mean, mean.std(axis=(1, 2), keepdims=True) if model.error is None else model.error.astype(float)
@@ -150,7 +150,7 @@ def fit_spectrum(
     """Fit the physics model to ``rows`` of spectra; arguments as ``fit`` of `physics_model`.
 
     Fewer rows than `FEW_ROWS` fit planes, materials and the mix with kriging alone; without rows, or with rows at fewer
-    than `LEAST_POSITIONS` positions, the room is traced as given. Without a scene: free space and learned surfaces.
+    than `LEAST_POSITIONS` positions, the room is traced as given.
     ``seed`` is that of validation rows and of the rays.
 
     Raises:

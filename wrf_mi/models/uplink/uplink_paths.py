@@ -12,17 +12,15 @@ orthogonal matching pursuit" (2016) (refinement after each path); Schwarz, "Esti
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ...parallel.threads import on_threads
 from .uplink_waves import SINGULAR, Complex, Mask, Solved, Waves, products, strongest
 
 T = TypeVar("T")
@@ -113,12 +111,7 @@ def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, ste
 
 def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
     """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use."""
-    # Threads of the BLAS wait for each other by spinning: with another process on a processor, a row takes seconds.
-    parts = [slice(start, start + ROWS) for start in range(0, count, ROWS)]
-    affinity = getattr(os, "sched_getaffinity", None)
-    workers = len(affinity(0)) if affinity else os.cpu_count() or 1
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(workers, len(parts)))) as pool:
-        return list(pool.map(work, parts))
+    return on_threads(work, [slice(start, start + ROWS) for start in range(0, count, ROWS)])
 
 
 def join_paths(parts: list[Paths]) -> Paths:

@@ -32,10 +32,11 @@ from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray, fibonacci_sphere
 from ...core.types import IntArray
+from ...parallel.threads import on_threads
 from ...receivers.array import mirror_order
 from ...receivers.retrieve import align_signals
-from ..interpolation.kriging_equations import KrigingSystem, chosen_rows, left_out
 from ..model import field_arrays, from_field_arrays
+from .kriging_equations import KrigingSystem, chosen_rows, left_out
 
 ComplexArray = NDArray[np.complex128]
 LEAST_NOISE = 3e-3
@@ -53,7 +54,7 @@ SWEEPS = 3
 LEAST_POWER = 1e-6
 """Least power of a component, a row's being 1: with fewer rows than elements some are only rounding."""
 MOST_ROWS = 320
-"""Rows of the fit of shares at most; a dictionary of 200 covariances of them takes 300 MB."""
+"""Rows of the fit of shares at most: its time grows with their cube."""
 STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
 
 
@@ -72,10 +73,6 @@ class Covariances:
         """Number of covariances."""
         return len(self.lengths_m) * len(self.turns)
 
-    def __call__(self, tx_pos_m: FloatArray) -> ComplexArray:
-        """All covariances between positions [n, 3] (metres), shape [count, n, n], length slowest."""
-        return self.mixed(tx_pos_m, tx_pos_m, np.eye(self.count))
-
     def mixed(self, a_m: FloatArray, b_m: FloatArray, weight: FloatArray) -> ComplexArray:
         """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m].
 
@@ -93,6 +90,45 @@ class Covariances:
         return total
 
 
+class RowCovariances:
+    """The dictionary's covariances between n rows, as products with a matrix, never as ``count`` matrices [n, n].
+
+    Each covariance is a decay times the outer product of one wave with itself, so a sum over turns is a product of two
+    thin matrices.
+
+    Args:
+        covariances: the dictionary.
+        tx_pos_m: positions of the rows [n, 3], metres.
+    """
+
+    def __init__(self, covariances: Covariances, tx_pos_m: FloatArray) -> None:
+        distance = cdist(tx_pos_m, tx_pos_m)
+        self.lengths, self.count = len(covariances.lengths_m), covariances.count
+        self._decay: FloatArray = np.exp(-distance / covariances.lengths_m[:, None, None])
+        self._wave: ComplexArray = np.exp(1j * (tx_pos_m @ covariances.turns.T))
+        # Traces are sums of n^2 terms for a step that tends to its fixed point anyway: single precision is enough.
+        self._coarse = self._decay.astype(np.float32), self._wave.astype(np.complex64)
+
+    def mixed(self, weight: FloatArray) -> ComplexArray:
+        """Sum of the covariances times weights [count], [n, n]."""
+        total = np.zeros(self._decay.shape[1:], complex)
+        for decay, shares in zip(self._decay, weight.reshape(self.lengths, -1), strict=True):
+            used = np.flatnonzero(shares)
+            if len(used):
+                waves = self._wave[:, used]
+                total += decay * ((waves * shares[used]) @ waves.conj().T)
+        return total
+
+    def traces(self, matrix: NDArray[Any], weight: FloatArray) -> FloatArray:
+        """Trace of each covariance times a Hermitian matrix [n, n], [count]; 0 where its weight is."""
+        traces, single = np.zeros((self.lengths, self.count // self.lengths)), matrix.astype(np.complex64)
+        for trace, decay, shares in zip(traces, self._coarse[0], weight.reshape(self.lengths, -1), strict=True):
+            used = np.flatnonzero(shares)
+            waves = self._coarse[1][:, used]
+            trace[used] = np.einsum("nt,nt->t", waves.conj(), (decay * single) @ waves).real
+        return traces.ravel()
+
+
 def departures(towards: FloatArray, wavenumber: float, cone_deg: float, count: int) -> FloatArray:
     """Turns [t, 3], rad/m, of waves that leave within a cone around the line of sight; the first is zero.
 
@@ -104,29 +140,31 @@ def departures(towards: FloatArray, wavenumber: float, cone_deg: float, count: i
 
 
 def fit_shares(
-    signal: ComplexArray, covariances: ComplexArray, steps: int, least_power: float = 0.0
+    signal: ComplexArray, covariances: RowCovariances, steps: int, least_power: float = 0.0, used: slice = slice(None)
 ) -> tuple[FloatArray, float, float]:
-    """Shares of greatest likelihood of a complex Gaussian signal [n] with covariances [c, n, n].
+    """Shares of greatest likelihood of a complex Gaussian signal [n] with a dictionary of covariances.
 
-    Each of the ``steps`` raises the likelihood; a signal below ``least_power`` is taken to have that power.
+    Each of the ``steps`` raises the likelihood; a signal below ``least_power`` is taken to have that power. ``used``
+    are the covariances that may have shares.
 
     Returns:
-        Share of each covariance [c], >= 0; variance of the noise; twice the negative logarithm of the likelihood
+        Share of each covariance [count], >= 0; variance of the noise; twice the negative logarithm of the likelihood
         without its constant.
     """
-    count, n = len(covariances), len(signal)
-    flat = covariances.reshape(count, -1)
     power = max(float(np.mean(np.abs(signal) ** 2)), least_power, TINY)
-    weight, noise = np.full(count, power / count), 0.1 * power
+    weight, noise = np.zeros(covariances.count), 0.1 * power
+    weight[used] = 1.0
+    weight *= power / weight.sum()
     for step in range(steps + 1):
-        system = KrigingSystem((weight @ flat).reshape(n, n), noise)
+        system = KrigingSystem(covariances.mixed(weight), noise)
         solved = system.solve(signal)
         if step == steps:
             break
         inverse = system.precision
-        explained = (flat @ np.outer(solved.conj(), solved).ravel()).real
-        expected = (flat @ inverse.T.ravel()).real
-        weight = weight * np.sqrt(np.maximum(explained, 0) / np.maximum(expected, TINY))
+        # Numbers that float32 holds, whatever the signal's power: both traces are scaled by it.
+        explained = covariances.traces(np.outer(solved, solved.conj()) * power, weight)
+        expected = covariances.traces(inverse * power, weight)
+        weight *= np.sqrt(np.maximum(explained, 0) / np.maximum(expected, TINY))
         weight[weight < NEGLIGIBLE * weight.max()] = 0
         noise *= np.sqrt(float((np.abs(solved) ** 2).sum()) / float(np.trace(inverse).real))
         noise = max(noise, LEAST_NOISE * power)
@@ -241,7 +279,7 @@ def fit_signals(
     opposite = mirror_order(elements_m)
     aligned = align_signals(unit, tx_pos_m, elements_m)
     chosen = chosen_rows(len(unit), MOST_ROWS, seed)
-    dictionary = covariances(tx_pos_m[chosen])
+    dictionary = RowCovariances(covariances, tx_pos_m[chosen])
     exchanges = [aligned] if opposite is None else [aligned, aligned[:, opposite].conj()]
     fits = []
     for turn, exchange in enumerate(exchanges):
@@ -261,17 +299,18 @@ def fit_signals(
 
 
 def _fit(
-    rows: ComplexArray, tx_pos_m: FloatArray, covariances: Covariances, dictionary: ComplexArray
+    rows: ComplexArray, tx_pos_m: FloatArray, covariances: Covariances, dictionary: RowCovariances
 ) -> tuple[float, SignalProcess]:
     """Fit of the shares of each principal component, and its cost."""
     basis = np.linalg.eigh(rows.T @ rows.conj() / len(rows))[1][:, ::-1]
-    straight = np.arange(len(covariances.lengths_m)) * len(covariances.turns)
-    weight, noise, cost = np.zeros((basis.shape[1], covariances.count)), np.zeros(basis.shape[1]), 0.0
-    for c, signal in enumerate((rows @ basis.conj()).T):
-        which = slice(None) if c < RICH else straight
-        weight[c, which], noise[c], each = fit_shares(signal, dictionary[which], STEPS, LEAST_POWER)
-        cost += each
-    return cost, SignalProcess(tx_pos_m, rows, covariances, basis, weight, noise)
+    straight = slice(None, None, len(covariances.turns))
+    components = (rows @ basis.conj()).T
+
+    def fit_component(c: int) -> tuple[FloatArray, float, float]:
+        return fit_shares(components[c], dictionary, STEPS, LEAST_POWER, slice(None) if c < RICH else straight)
+
+    weight, noise, costs = zip(*on_threads(fit_component, range(len(components))), strict=True)
+    return sum(costs), SignalProcess(tx_pos_m, rows, covariances, basis, np.stack(weight), np.array(noise))
 
 
 def realigned(process: SignalProcess, opposite: IntArray | None) -> ComplexArray:

@@ -13,16 +13,17 @@ from scipy.stats import rice
 
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.physics import signals as module
-from wrf_mi.models.physics.measured_spectrum import ExpectedSpectrum, rician
-from wrf_mi.models.physics.signals import (
+from wrf_mi.models.interpolation import signals as module
+from wrf_mi.models.interpolation.signals import (
     Covariances,
     Posterior,
+    RowCovariances,
     SignalProcess,
     departures,
     fit_shares,
     fit_signals,
 )
+from wrf_mi.models.interpolation.spectra import ExpectedSpectrum, rician
 from wrf_mi.receivers.array import bartlett_spectrum, minmax_scale
 from wrf_mi.receivers.retrieve import mirror_order
 
@@ -37,6 +38,11 @@ def drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     value, vector = np.linalg.eigh(covariance)
     pair = rng.normal(size=(2, len(value))) / np.sqrt(2)
     return vector @ (np.sqrt(np.maximum(value, 0)) * (pair[0] + 1j * pair[1]))
+
+
+def each_covariance(dictionary: Covariances, where: np.ndarray) -> np.ndarray:
+    """All covariances between positions, [count, n, n], length slowest."""
+    return dictionary.mixed(where, where, np.eye(dictionary.count))
 
 
 def some_process(rows: int = 30, seed: int = 1, noise: float = 1e-3) -> SignalProcess:
@@ -58,7 +64,7 @@ def test_each_covariance_is_positive_semidefinite() -> None:
     """Hermitian, one on the diagonal, positive semidefinite, and what its formula says."""
     where = positions(12)
     where[3] = where[7]
-    each = DICTIONARY(where)
+    each = each_covariance(DICTIONARY, where)
     assert each.shape == (DICTIONARY.count, 12, 12)
     np.testing.assert_allclose(each, each.conj().swapaxes(1, 2), atol=ROUNDING)
     np.testing.assert_allclose(np.diagonal(each, axis1=1, axis2=2), 1, atol=ROUNDING)
@@ -73,10 +79,23 @@ def test_mixed_equals_sums_over_the_dictionary() -> None:
     here, there = positions(7, 1), positions(5, 2)
     weight = np.random.default_rng(0).uniform(size=(2, DICTIONARY.count))
     weight[:, ::3] = 0
-    block = DICTIONARY(np.concatenate([here, there]))[:, :7, 7:]
+    block = each_covariance(DICTIONARY, np.concatenate([here, there]))[:, :7, 7:]
     np.testing.assert_allclose(
         DICTIONARY.mixed(here, there, weight), np.tensordot(weight, block, 1), rtol=0, atol=ROUNDING * weight.sum()
     )
+
+
+def test_sums_and_traces_equal_those_over_the_dictionary() -> None:
+    where, rng = positions(9, 1), np.random.default_rng(0)
+    each, rows = each_covariance(DICTIONARY, where), RowCovariances(DICTIONARY, where)
+    weight = rng.uniform(size=DICTIONARY.count)
+    weight[::3] = 0
+    np.testing.assert_allclose(rows.mixed(weight), np.tensordot(weight, each, 1), rtol=0, atol=ROUNDING * weight.sum())
+    root = rng.normal(size=(9, 9)) + 1j * rng.normal(size=(9, 9))
+    matrix = root @ root.conj().T
+    expected = np.where(weight > 0, np.einsum("cij,ji->c", each, matrix).real, 0)
+    # Single precision, of 81 terms of the size of the matrix's trace.
+    np.testing.assert_allclose(rows.traces(matrix, weight), expected, rtol=0, atol=1e-5 * np.trace(matrix).real)
 
 
 def test_departures_lie_in_the_cone() -> None:
@@ -101,13 +120,14 @@ def test_sphere_is_covered_evenly() -> None:
 
 def test_each_step_raises_the_likelihood() -> None:
     rng = np.random.default_rng(0)
-    each = DICTIONARY(positions(25))
+    where = positions(25)
+    each, rows = each_covariance(DICTIONARY, where), RowCovariances(DICTIONARY, where)
     signal = drawn(each[40] + 0.3 * each[0] + 0.01 * np.eye(25), rng)
-    costs = [fit_shares(signal, each, steps)[2] for steps in range(12)]
+    costs = [fit_shares(signal, rows, steps)[2] for steps in range(12)]
     # Shares of a ten-thousandth are dropped on the way, which may cost as much.
     assert np.diff(costs).max() < 1e-4 * abs(costs[0])
     assert costs[-1] < costs[0] - 5
-    weight, noise, cost = fit_shares(signal, each, 7)
+    weight, noise, cost = fit_shares(signal, rows, 7)
     covariance = np.tensordot(weight, each, 1) + noise * np.eye(25)
     quadratic = (signal.conj() @ np.linalg.solve(covariance, signal)).real
     # Of a circular complex vector the logarithm of the determinant counts whole, not half.
@@ -119,12 +139,12 @@ def test_fit_recovers_the_shares() -> None:
     rng = np.random.default_rng(1)
     where = rng.uniform(-1.5, 1.5, (120, 3)) * WAVELENGTH_M * [1, 1, 0.3]
     few = Covariances(np.array([6.0, 0.6]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, 60.0, 16))
-    each, truth = few(where), np.zeros(few.count)
+    each, truth = each_covariance(few, where), np.zeros(few.count)
     turned, short = 2, slice(len(few.turns), None)
     truth[turned], truth[short.start] = 2.0, 1.0
     covariance = np.tensordot(truth, each, 1) + 0.1 * np.eye(120)
     signal = drawn(covariance, rng)
-    weight, noise, cost = fit_shares(signal, each, 40)
+    weight, noise, cost = fit_shares(signal, RowCovariances(few, where), 40)
     quadratic = (signal.conj() @ np.linalg.solve(covariance, signal)).real
     assert cost < quadratic + np.linalg.slogdet(covariance)[1]
     assert weight.argmax() == turned
@@ -136,11 +156,11 @@ def test_fit_recovers_the_shares() -> None:
 
 def test_likelihood_ignores_components_of_rounding() -> None:
     """Components of fewer rows than elements: their likelihood says nothing, and is the same for all of them."""
-    each = DICTIONARY(positions(6))
+    rows = RowCovariances(DICTIONARY, positions(6))
     rng = np.random.default_rng(0)
-    costs = [fit_shares(1e-17 * scale * rng.normal(size=6).astype(complex), each, 10, 1e-6)[2] for scale in (1, 30)]
+    costs = [fit_shares(1e-17 * scale * rng.normal(size=6).astype(complex), rows, 10, 1e-6)[2] for scale in (1, 30)]
     assert costs[0] == pytest.approx(costs[1], abs=1e-6)
-    assert np.isfinite(fit_shares(np.zeros(6, complex), each, 10)[2])
+    assert np.isfinite(fit_shares(np.zeros(6, complex), rows, 10)[2])
 
 
 # The process
@@ -152,7 +172,7 @@ def test_prediction_is_that_of_a_gaussian_process() -> None:
     every = np.concatenate([process.tx_pos_m, where])
     components = process.signals @ process.basis.conj()
     for c in range(3):
-        whole = np.tensordot(process.weight[c], DICTIONARY(every), 1)
+        whole = np.tensordot(process.weight[c], each_covariance(DICTIONARY, every), 1)
         own = whole[:30, :30] + process.noise[c] * np.eye(30)
         cross = whole[30:, :30]
         mean = cross @ np.linalg.solve(own, components[:, c])

@@ -1,26 +1,27 @@
-"""The RSSI physics model: its posterior, its terms, and that it learns what was put into made-up strengths."""
+"""Kriging of signal strengths: its posterior, its terms, and that it learns what was put into made-up strengths."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.models.physics.rssi import RssiPhysics, RssiSettings, fit_rssi
-from wrf_mi.models.physics.rssi_fit import Part, PooledProcess, folds, shift_of, widening
-from wrf_mi.models.physics.rssi_terms import Hyperparameters, Measured, Poses, PowerMap, stops_of, trace_map
+from wrf_mi.models.interpolation import strengths
+from wrf_mi.models.interpolation.strength_fit import Part, PooledProcess, folds, shift_of, widening
+from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
+from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
+from wrf_mi.models.model import Inputs
+from wrf_mi.tracing.power_map import trace_map
 
 FREQUENCY_HZ = 2.44e9
 AT_1M_DBM = -40.2
 """Free space at 2.44 GHz."""
 UP = np.array([0.0, 0.0, 0.0, 1.0])
-FAST = RssiSettings(search_rounds=0)
+FAST = StrengthSettings()
 
 
 def made(rows: int, noise_db: float, seed: int = 0, body_db: float = 0.0) -> Record:
@@ -51,10 +52,26 @@ def made(rows: int, noise_db: float, seed: int = 0, body_db: float = 0.0) -> Rec
     )
 
 
-def errors(model: RssiPhysics, record: Record, rows: np.ndarray) -> np.ndarray:
+def errors(model: Strengths, record: Record, rows: np.ndarray) -> np.ndarray:
     assert record.tx_heading_rad is not None
-    predicted = [model.predict(record.tx_pos_m[rows], k, record.tx_heading_rad[rows]).mean for k in range(3)]
+    predicted = [model.predict(Inputs(record.tx_pos_m[rows], record.tx_heading_rad[rows]), k).mean for k in range(3)]
     return np.array(predicted) - record.observation[:, rows]
+
+
+@pytest.mark.parametrize("level_db", [-60.0, 30.0])
+@pytest.mark.parametrize("rows", [1, 5, 60])
+def test_predictions_are_equivariant_to_the_level_of_the_data(level_db: float, rows: int) -> None:
+    """Transmitters of 30 dBm, or strengths in other units."""
+    record = made(60, noise_db=1.0)
+    shifted = replace(record, observation=record.observation + np.float32(level_db))
+    plain, moved = (fit_strengths(one, np.arange(rows)) for one in (record, shifted))
+    inputs = Inputs(record.tx_pos_m, record.tx_heading_rad)
+    for receiver in range(3):
+        before, after = (model.predict(inputs, receiver) for model in (plain, moved))
+        np.testing.assert_allclose(after.mean, before.mean + level_db, atol=1e-3)  # float32 observations
+        np.testing.assert_allclose(after.std, before.std, atol=1e-3)
+    known = replace(FAST, transmit_dbm=0.0)
+    assert fit_strengths(shifted, np.arange(rows), None, known).field.prior.transmit_dbm == 0
 
 
 def test_posterior_equals_dense_gaussian_conditioning() -> None:
@@ -122,7 +139,7 @@ def test_stated_noise_lowers_the_error() -> None:
     std = rng.choice([0.5, 9.0], record.observation.shape)
     noisy = replace(record, observation=(record.observation + std * rng.normal(size=std.shape)).astype(np.float32))
     train, test = np.arange(200), np.arange(200, 300)
-    plain, weighted = (fit_rssi(one, train, None, FAST) for one in (noisy, replace(noisy, std=std)))
+    plain, weighted = (fit_strengths(one, train, None, FAST) for one in (noisy, replace(noisy, std=std)))
     # Half of the rows have a noise of 9 dB.
     assert np.median(np.abs(errors(weighted, record, test))) < 0.75 * np.median(np.abs(errors(plain, record, test)))
 
@@ -130,11 +147,11 @@ def test_stated_noise_lowers_the_error() -> None:
 def test_learns_offsets_exponent_and_pattern() -> None:
     record = made(300, noise_db=1.0, body_db=4.0)
     train, test = np.arange(200), np.arange(200, 300)
-    model = fit_rssi(record, train, None, FAST)
+    model = fit_strengths(record, train, None, FAST)
     # Noise of 1 dB alone has a median of 0.67 dB.
     assert np.median(np.abs(errors(model, record, test))) < 0.95
-    blind = fit_rssi(replace(record, tx_heading_rad=None), train, None, FAST)
-    without = [blind.predict(record.tx_pos_m[test], k).mean for k in range(3)] - record.observation[:, test]
+    blind = fit_strengths(replace(record, tx_heading_rad=None), train, None, FAST)
+    without = [blind.predict(Inputs(record.tx_pos_m[test]), k).mean for k in range(3)] - record.observation[:, test]
     assert np.median(np.abs(without)) > 1.5
 
 
@@ -143,7 +160,7 @@ def test_receivers_share_the_transmitters_pattern() -> None:
     record = made(300, noise_db=0.5, body_db=6.0)
     observation = record.observation.copy()
     observation[2, 4:] = np.nan
-    model = fit_rssi(replace(record, observation=observation), np.arange(200), None, FAST)
+    model = fit_strengths(replace(record, observation=observation), np.arange(200), None, FAST)
     record_errors = errors(model, record, np.arange(200, 300))[2]
     # The pattern's own spread is 6 / sqrt(2) dB, and a median of 2.9.
     assert np.median(np.abs(record_errors)) < 2.0
@@ -151,10 +168,10 @@ def test_receivers_share_the_transmitters_pattern() -> None:
 
 def test_interval_covers_90_percent() -> None:
     record = made(400, noise_db=3.0)
-    model = fit_rssi(record, np.arange(250), None, FAST)
+    model = fit_strengths(record, np.arange(250), None, FAST)
     test = np.arange(250, 400)
     assert record.tx_heading_rad is not None
-    std = np.array([model.predict(record.tx_pos_m[test], k, record.tx_heading_rad[test]).std for k in range(3)])
+    std = np.array([model.predict(Inputs(record.tx_pos_m[test], record.tx_heading_rad[test]), k).std for k in range(3)])
     inside = np.abs(errors(model, record, test)) < 1.645 * std
     # 450 values: the standard deviation of the share is 0.014.
     assert 0.84 < inside.mean() < 0.96
@@ -162,20 +179,28 @@ def test_interval_covers_90_percent() -> None:
 
 def test_few_rows_fall_back_on_the_law_of_distance() -> None:
     record = made(60, noise_db=1.0)
-    model = fit_rssi(record, np.array([3]), None, FAST)
+    model = fit_strengths(record, np.array([3]), None, FAST)
     far = np.array([[40.0, 0.0, 1.3], [80.0, 0.0, 1.3]])
-    near, double = model.predict(far, 0, np.zeros(2)).mean
+    near, double = model.predict(Inputs(far, np.zeros(2)), 0).mean
     # 10 n log10 2 with n = 2 +- 1 is 6.02 +- 3.01 dB; one row moves n by less than half of that.
     assert near - double == pytest.approx(6.02, abs=1.5)
-    assert (model.predict(far, 0, np.zeros(2)).std > 5).all()
+    assert (model.predict(Inputs(far, np.zeros(2)), 0).std > 5).all()
+
+
+def test_headings_are_left_out_where_asked() -> None:
+    record = made(60, noise_db=0.5, body_db=6.0)
+    model = fit_strengths(record, np.arange(60), None, replace(FAST, heading=False))
+    assert not model.uses_heading
+    inputs = Inputs(record.tx_pos_m, record.tx_heading_rad)
+    np.testing.assert_array_equal(model.predict_mean(inputs, 0), model.predict_mean(Inputs(record.tx_pos_m), 0))
 
 
 def test_unknown_heading_is_averaged_over() -> None:
     record = made(300, noise_db=0.5, body_db=6.0)
-    model = fit_rssi(record, np.arange(300), None, FAST)
+    model = fit_strengths(record, np.arange(300), None, FAST)
     place = record.tx_pos_m[:3]
-    turns = [model.predict(place, 0, np.full(3, h)) for h in 2 * np.pi * np.arange(32) / 32]
-    average = model.predict(place, 0)
+    turns = [model.predict(Inputs(place, np.full(3, h)), 0) for h in 2 * np.pi * np.arange(32) / 32]
+    average = model.predict(Inputs(place), 0)
     np.testing.assert_allclose(average.mean, np.mean([one.mean for one in turns], axis=0), atol=0.1)
     assert (average.std > turns[0].std + 1).all()
 
@@ -183,33 +208,34 @@ def test_unknown_heading_is_averaged_over() -> None:
 @pytest.mark.parametrize("repeated", [True, False])
 def test_mean_alone_equals_that_with_deviations(repeated: bool) -> None:
     record = made(200, noise_db=1.0, body_db=6.0)
-    model = fit_rssi(record, np.arange(200), None, FAST)
+    model = fit_strengths(record, np.arange(200), None, FAST)
     assert record.tx_heading_rad is not None
     position, heading = record.tx_pos_m[:40], record.tx_heading_rad[:40]
     if repeated:
         position, heading = np.repeat(position, 4, axis=0), np.tile(heading[:4], 40)
     for turn in (heading, None):
-        np.testing.assert_allclose(model.predict_mean(position, 1, turn), model.predict(position, 1, turn).mean)
+        inputs = Inputs(position, turn)
+        np.testing.assert_allclose(model.predict_mean(inputs, 1), model.predict(inputs, 1).mean)
 
 
 def test_model_is_restored_from_arrays() -> None:
     record = made(80, noise_db=2.0)
     record.observation[1, ::3] = np.nan
-    model = fit_rssi(record, np.arange(70), None, FAST)
-    again = RssiPhysics.from_arrays(model.arrays())
+    model = fit_strengths(record, np.arange(70), None, FAST)
+    again = Strengths.from_arrays(model.arrays())
     assert record.tx_heading_rad is not None
     for k in range(3):
-        ours, theirs = (m.predict(record.tx_pos_m, k, record.tx_heading_rad) for m in (model, again))
+        ours, theirs = (m.predict(Inputs(record.tx_pos_m, record.tx_heading_rad), k) for m in (model, again))
         np.testing.assert_array_equal(ours.mean, theirs.mean)
         np.testing.assert_array_equal(ours.std, theirs.std)
-    assert again.summary() == model.summary()
+    assert again.facts() == model.facts()
 
 
 def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(FAST, shadow_db=12.0, shadow_m=0.2)
-    searched = replace(wrong, search_rows=50, search_rounds=1)
-    before, after = (fit_rssi(record, np.arange(120), None, one).summary() for one in (wrong, searched))
+    searched = replace(wrong, search_rows=50)
+    before, after = (fit_strengths(record, np.arange(120), None, one).facts()["fitted"] for one in (wrong, searched))
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_db"] < 12
 
@@ -221,8 +247,16 @@ def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
     turn = record.tx_heading_rad[:, None]
     np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
     stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
-    model = fit_rssi(stated, np.arange(120), None, replace(FAST, search_rows=50, search_rounds=2, noise_db=1.0))
-    assert model.summary()["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
+    model = fit_strengths(stated, np.arange(120), None, replace(FAST, search_rows=50, noise_db=1.0))
+    assert model.facts()["fitted"]["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
+
+
+def test_stops_are_thinned_where_factors_would_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = made(200, noise_db=1.0, body_db=4.0)
+    monkeypatch.setattr(strengths, "MOST_COVARIANCES", 3 * 50**2)
+    model = fit_strengths(record, np.arange(150), None, FAST)
+    assert len(model.field.stops.poses) == 50
+    assert np.median(np.abs(errors(model, record, np.arange(150, 200)))) < 1.5
 
 
 def test_folds_exclude_neighbours_in_time() -> None:
@@ -245,33 +279,27 @@ def test_skewed_residuals_shift_and_widen() -> None:
     assert wide[0] == pytest.approx(2, rel=0.06)
 
 
-def test_map_is_linear_between_its_points() -> None:
-    x, y, z = np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0])
-    power = PowerMap(x, y, z, (x[:, None, None] * 10 + y[None, :, None])[None])
-    where = np.array([[0.5, 1.0, 1.0], [1.5, 0.0, 9.0], [9.0, 9.0, 1.0]])
-    np.testing.assert_allclose(power(where, 0), [6.0, 15.0, 22.0])
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"shadow_m": 0.0}, "shadow_m"), ({"noise_db": -1.0}, "noise_db"), ({"body_db": np.nan}, "body_db")],
 )
 def test_settings_are_checked(change: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        RssiSettings(**change)  # type: ignore[arg-type]
+        StrengthSettings(**change)  # type: ignore[arg-type]
 
 
 def test_invalid_arguments_are_refused() -> None:
     record = made(10, noise_db=1.0)
     with pytest.raises(InputError, match="nor a scene"):
-        fit_rssi(record, np.array([], int), None)
+        fit_strengths(record, np.array([], int), None)
     with pytest.raises(InputError, match="holds csi"):
-        fit_rssi(replace(record, task="csi"), np.arange(5), None)
-    model = fit_rssi(record, np.arange(10), None, FAST)
-    with pytest.raises(InputError, match="no receiver 3"):
-        model.predict(record.tx_pos_m, 3)
-    with pytest.raises(InputError, match="one for each"):
-        model.predict(record.tx_pos_m, 0, np.zeros(3))
+        fit_strengths(replace(record, task="csi"), np.arange(5), None)
+    with pytest.raises(InputError, match="carrier frequency unknown"):
+        fit_strengths(replace(record, frequencies_hz=None), np.arange(5))
+    model = fit_strengths(record, np.arange(10), None, FAST)
+    for predict in (model.predict, model.predict_mean):
+        with pytest.raises(InputError, match="give finite x, y, z"):
+            predict(Inputs(np.array([[0.0, np.nan, 0.0]])), 0)
 
 
 def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -283,35 +311,15 @@ def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:  # type: ig
     trimesh.util.concatenate([wall, floor]).export(tmp_path / "room.ply")
     scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
     record = made(20, noise_db=1.0)
-    settings = replace(FAST, spacing_m=0.5, max_depth=2, max_reflections=1)
-    model = fit_rssi(record, np.array([], int), scene, settings)
+    model = fit_strengths(record, np.array([], int), trace_map(scene, record, 0.5, 0.3, 2, 1), FAST)
     # Equally far from the receiver at the origin, before the wall and behind it.
-    seen, hidden = model.predict(np.array([[0.0, 5.0, 1.3], [5.0, 0.7, 1.3]]), 0).mean
+    seen, hidden = model.predict(Inputs(np.array([[0.0, 5.0, 1.3], [5.0, 0.7, 1.3]])), 0).mean
     assert seen > hidden + 5
-    std = model.predict(record.tx_pos_m, 0).std
+    inputs = Inputs(record.tx_pos_m)
+    std = model.predict(inputs, 0).std
     assert (std > 8).all()
-    again = RssiPhysics.from_arrays(model.arrays())
-    np.testing.assert_array_equal(again.predict(record.tx_pos_m, 0).mean, model.predict(record.tx_pos_m, 0).mean)
-
-
-def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A column of 0.9 m holds points of the map's grid, whose antennas nobody has stated: no error and no warning."""
-    from wrf_mi.tracing import open_scene
-
-    column = box((2.6, 2.4, 0), (3.5, 3.3, 3.0))
-    trimesh.util.concatenate([sheet(2, 0.0, (0.0, 6.0), (0.0, 6.0)), column]).export(tmp_path / "room.ply")
-    scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
-    record = made(3, noise_db=1.0)
-    for smooth_m in (0.0, 0.3):
-        traced = trace_map(scene, record, 0.25, smooth_m, 1, 1)
-        x, y = np.meshgrid(traced.x_m, traced.y_m, indexing="ij")
-        within = (np.abs(x - 3.05) < 0.45) & (np.abs(y - 2.85) < 0.45)
-        around = (np.abs(x - 3.05) < 0.9) & (np.abs(y - 2.85) < 0.9) & ~within
-        assert within.sum() >= 9
-        for power in traced.power_dbm[..., 0]:
-            # What is inside continues what is outside; it is no hole of the map, whose least value is its floor.
-            assert power[around].min() <= power[within].min() <= power[within].max() <= power[around].max()
-    assert not caplog.records
+    again = Strengths.from_arrays(model.arrays())
+    np.testing.assert_array_equal(again.predict(inputs, 0).mean, model.predict(inputs, 0).mean)
 
 
 @pytest.mark.skipif("WRF_MI_DATA" not in os.environ, reason="needs the measured flat")
@@ -324,9 +332,9 @@ def test_beats_the_law_of_distance_in_a_real_flat() -> None:
     assert record.official is not None
     assert record.tx_heading_rad is not None
     out = np.setdiff1d(record.official[0], split.all_train)[::4]
-    model = fit_rssi(record, split.all_train, None)
+    model = fit_strengths(record, split.all_train, None)
     miss = [
-        model.predict(record.tx_pos_m[out], k, record.tx_heading_rad[out]).mean - record.observation[k, out]
+        model.predict(Inputs(record.tx_pos_m[out], record.tx_heading_rad[out]), k).mean - record.observation[k, out]
         for k in range(len(record.receivers))
     ]
     assert np.nanmedian(np.abs(miss)) < 3.5

@@ -1,4 +1,4 @@
-"""Fit of an RSSI physics model: Gaussian processes, folds, choice of hyperparameters, calibration of predictions.
+"""Fit of signal strengths: Gaussian processes, folds, choice of hyperparameters, calibration of predictions.
 
 The processes of the receivers share part of their mean:
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -25,8 +25,11 @@ from scipy.constants import speed_of_light
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks.scores import REAL_90
-from ..interpolation.kriging_equations import KrigingSystem
-from .rssi_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, PowerMap, Stops, basis
+from .kriging_equations import KrigingSystem
+from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
+
+if TYPE_CHECKING:
+    from ...tracing.power_map import PowerMap
 
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
@@ -229,12 +232,10 @@ class Fit:
         count = np.array([len(row) for row in received])
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
 
-    def search(
-        self, hyperparameters: Hyperparameters, rounds: int, on_progress: Callable[[float], None]
-    ) -> Hyperparameters:
+    def search(self, hyperparameters: Hyperparameters, on_progress: Callable[[float], None]) -> Hyperparameters:
         """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
 
-        ``rounds`` pass through all parameters; ``on_progress`` takes the fraction done.
+        One pass through all parameters; ``on_progress`` takes the fraction done.
         """
 
         def error_db(candidate: Hyperparameters) -> float:
@@ -244,7 +245,7 @@ class Fit:
         if self._measured.poses.heading_rad is not None:
             names += ["body_db", "body_m", "lever_m"]
         best = error_db(hyperparameters)
-        for done, name in enumerate(names * rounds, start=1):
+        for done, name in enumerate(names, start=1):
             for sign in (1, -1):
                 for _ in range(MOST_STEPS):
                     candidate = hyperparameters.changed(name, sign)
@@ -252,7 +253,7 @@ class Fit:
                     if error > best - LEAST_GAIN_DB:
                         break
                     best, hyperparameters = error, candidate
-            on_progress(done / (rounds * len(names)))
+            on_progress(done / len(names))
         return hyperparameters
 
 

@@ -1,0 +1,44 @@
+"""The local mean of traced power on a grid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from wrf_mi_scenes.build_laboratory import box, sheet
+
+from wrf_mi.core import Receiver, Record
+from wrf_mi.tracing import open_scene
+from wrf_mi.tracing.power_map import PowerMap, trace_map
+
+FREQUENCY_HZ = 2.44e9
+
+
+def test_map_is_linear_between_its_points() -> None:
+    x, y, z = np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0])
+    power = PowerMap(x, y, z, (x[:, None, None] * 10 + y[None, :, None])[None])
+    where = np.array([[0.5, 1.0, 1.0], [1.5, 0.0, 9.0], [9.0, 9.0, 1.0]])
+    np.testing.assert_allclose(power(where, 0), [6.0, 15.0, 22.0])
+
+
+def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A column of 0.9 m holds points of the map's grid, whose antennas nobody has stated: no error and no warning."""
+    column = box((2.6, 2.4, 0), (3.5, 3.3, 3.0))
+    trimesh.util.concatenate([sheet(2, 0.0, (0.0, 6.0), (0.0, 6.0)), column]).export(tmp_path / "room.ply")
+    scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
+    places = [(0, 0, 2), (6, 1, 2), (2, 5, 2)]
+    receivers = tuple(Receiver(f"r{k}", np.array(at, float), np.array([0.0, 0, 0, 1])) for k, at in enumerate(places))
+    position = np.array([[0.5, 0.5, 1.3], [5.5, 5.5, 1.3], [0.5, 5.5, 1.3]])
+    record = Record("made", "rssi", position, receivers, np.zeros((3, 3), np.float32))
+    for smooth_m in (0.0, 0.3):
+        traced = trace_map(scene, record, 0.25, smooth_m, 1, 1)
+        x, y = np.meshgrid(traced.x_m, traced.y_m, indexing="ij")
+        within = (np.abs(x - 3.05) < 0.45) & (np.abs(y - 2.85) < 0.45)
+        around = (np.abs(x - 3.05) < 0.9) & (np.abs(y - 2.85) < 0.9) & ~within
+        assert within.sum() >= 9
+        for power in traced.power_dbm[..., 0]:
+            # What is inside continues what is outside; it is no hole of the map, whose least value is its floor.
+            assert power[around].min() <= power[within].min() <= power[within].max() <= power[around].max()
+    assert not caplog.records

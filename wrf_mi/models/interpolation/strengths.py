@@ -1,0 +1,285 @@
+"""Kriging of received signal strengths: path loss or traced power, patterns and shadowing, pooled over receivers.
+
+Expected is free space, or the local mean of traced power (`wrf_mi.tracing.power_map`); measurements correct it. Common
+terms are in `strength_terms`; hyperparameters, the noise of each receiver, and the calibration of predictions come from
+held-out stretches of the training rows (`strength_fit`). Terms that all receivers share serve receivers without rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import InputError, Prediction, Record
+from ...core.angles import FloatArray
+from ...core.settings import Count, Positive
+from ...core.types import IntArray
+from ...tasks import require
+from ...training.session import OnProgress, quiet
+from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
+from .by_receiver import finite_positions
+from .kriging import KrigingSettings
+from .strength_fit import Field, Fit, PriorMean, shift_of, widening
+from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+
+if TYPE_CHECKING:
+    from ...tracing.power_map import PowerMap
+
+HEADINGS = 8
+"""Headings over which the prediction is averaged where the heading is unknown."""
+CHUNK = 1024
+"""Transmitters predicted together, which bounds the memory of their covariances with the rows."""
+MOST_COVARIANCES = 2e8
+"""Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
+ROBUST_ROUNDS = 2
+WIDER = 2.0
+"""Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
+SKEW_DB = 0.4
+"""Shift of predictions a priori, as fades reach deeper than peaks."""
+OFFSET_SD_DB = 10.0
+"""Standard deviation of the common offset of all receivers about the transmit power a priori."""
+EXPONENT_SD = (1.0, 0.3)
+"""Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
+TRACED_SD = (0.5, 0.2)
+"""Likewise of the factor of the traced decibels about 1."""
+BODY_PATTERN_DB = (1.0, 0.2)
+"""Likewise of the first harmonic of the transmitter's pattern."""
+RECEIVER_PATTERN_DB = 2.0
+"""Standard deviation of the first harmonic of each receiver's pattern."""
+
+
+@dataclass(frozen=True)
+class StrengthSettings(KrigingSettings, Hyperparameters):
+    """Settings of kriging of signal strengths; hyperparameters are those at the start of the search.
+
+    Attributes:
+        transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
+            or 0 dBm without any.
+        receiver_sd_db: standard deviation of each receiver's offset from the common one.
+        search_rows: least number of training rows with which held-out rows choose hyperparameters.
+        stop_m: consecutive rows within that distance are joined.
+        stop_rad: and within that turn.
+        stop_rows: and at most so many.
+    """
+
+    transmit_dbm: float | None = None
+    receiver_sd_db: Positive = 4.0
+    search_rows: int = 500
+    stop_m: float = 0.1
+    stop_rad: float = 0.2
+    stop_rows: Count = 20
+
+    @property
+    def hyperparameters(self) -> Hyperparameters:
+        """Start of the search."""
+        return Hyperparameters(**{one.name: getattr(self, one.name) for one in fields(Hyperparameters)})
+
+
+@dataclass(eq=False, repr=False)
+class Strengths(Fitted):
+    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report.
+
+    Attributes:
+        field: posterior of the signal strengths.
+        shift_db: shift of predictions.
+        widen: factor of each receiver's standard deviations [n_rx].
+        fit_facts: numbers of the fit for `facts`.
+    """
+
+    field: Field
+    shift_db: float
+    widen: FloatArray
+    fit_facts: dict[str, float]
+
+    def __post_init__(self) -> None:
+        """Headings count where the training rows had them."""
+        self.uses_heading = self.field.headings
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Signal strengths in dBm and their standard deviations, see `Fitted`.
+
+        Raises:
+            InputError: positions that are not known.
+        """
+        position_m = finite_positions(inputs, "kriging")
+        mean, std = np.empty((2, len(position_m)))
+        for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
+            means, variances = zip(*(self.field.predict(each, receiver) for each in poses), strict=True)
+            variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
+            mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
+        return Prediction(mean, std)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict` in a fraction of its time: variances take the most of that."""
+        position_m = finite_positions(inputs, "kriging")
+        mean = np.empty(len(position_m))
+        for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
+            mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0) + self.shift_db
+        return mean
+
+    def _chunks(self, position_m: FloatArray, heading_rad: FloatArray | None) -> list[tuple[slice, list[Poses]]]:
+        """Slices of the rows, and poses that predictions are averaged over.
+
+        These are at the stated headings, or at `HEADINGS` where headings count and are unknown.
+        """
+        turns: list[FloatArray | None] = [heading_rad if self.uses_heading else None]
+        if self.uses_heading and heading_rad is None:
+            turns = [np.full(len(position_m), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
+        parts = [slice(begin, begin + CHUNK) for begin in range(0, len(position_m), CHUNK)]
+        return [
+            (rows, [Poses(position_m[rows], None if turn is None else np.asarray(turn, float)[rows]) for turn in turns])
+            for rows in parts
+        ]
+
+    def arrays(self) -> Arrays:
+        """Arrays for `from_arrays`."""
+        field = self.field
+        stops, prior = field.stops, field.prior
+        arrays: dict[str, Any] = {
+            **field_arrays(stops.poses, "stop."),
+            **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
+            "receivers_m": prior.receivers_m,
+            "base": np.array([prior.transmit_dbm, prior.frequency_hz]),
+            "prior.shared": prior.sd,
+            "prior.rx": prior.rx_sd_db,
+            "ratio": field.ratio,
+            "rounds": field.rounds,
+            "shift_db": self.shift_db,
+            "widen": self.widen,
+            "fact.name": np.array(list(self.fit_facts)),
+            "fact.value": np.array(list(self.fit_facts.values()), float),
+            **field_arrays(field.hyperparameters, "knob."),
+        }
+        if prior.traced is not None:
+            arrays |= field_arrays(prior.traced, "map.")
+        return {name: np.asarray(value) for name, value in arrays.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> Strengths:
+        """The model that `arrays` stored."""
+        traced = None
+        if "map.power_dbm" in arrays:
+            from ...tracing.power_map import PowerMap  # the tracer is imported where there is a scene
+
+            traced = from_field_arrays(PowerMap, arrays, "map.")
+        transmit_dbm, frequency_hz = map(float, arrays["base"])
+        sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
+        prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
+        poses = from_field_arrays(Poses, arrays, "stop.")
+        stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
+        hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
+        field = Field(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
+        facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
+        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
+
+    def facts(self) -> dict[str, Any]:
+        """Hyperparameters, calibration, and error on held-out rows."""
+        fitted = {
+            "stops": len(self.field.stops.poses),
+            "traced": self.field.prior.traced is not None,
+            "headings": self.field.headings,
+            "transmit_dbm": self.field.prior.transmit_dbm,
+            **asdict(self.field.hyperparameters),
+            "noise_ratio": [float(ratio) for ratio in self.field.ratio],
+            "shift_db": self.shift_db,
+            "widen": [float(factor) for factor in self.widen],
+            **self.fit_facts,
+        }
+        return {"fitted": fitted}
+
+
+def fit_strengths(
+    record: Record,
+    rows: IntArray,
+    power_map: PowerMap | None = None,
+    settings: StrengthSettings = StrengthSettings(),
+    on_progress: OnProgress = quiet,
+) -> Strengths:
+    """Fit signal strengths to some rows of a record.
+
+    Nothing is drawn, so there is no seed.
+
+    Args:
+        record: signal strengths with a single, known carrier.
+        rows: numbers of training rows, in the order of time (`wrf_mi.models.interpolation.strength_fit.folds`).
+        power_map: local mean of traced power; None: free space is expected.
+        settings: settings.
+        on_progress: progress callback.
+
+    Raises:
+        InputError: a record of another task or without its carrier, or neither rows nor a map.
+    """
+    require(record, "rssi", why="these strengths are in dBm")
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
+    rows = np.unique(np.asarray(rows, np.int64))
+    values = np.asarray(record.observation[:, rows], float)
+    received = np.isfinite(values).any(axis=0)
+    rows, values = rows[received], values[:, received]
+    if not len(rows) and power_map is None:
+        raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
+    heading = record.tx_heading_rad if settings.heading else None
+    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    measured = Measured(poses, values, rows, record.precision(rows))
+    prior = _prior(record, measured, power_map, settings)
+    hyperparameters = settings.hyperparameters
+
+    def join(rows: Measured, factor: float = 1.0) -> Stops:
+        stops = stops_of(rows, factor * settings.stop_m, factor * settings.stop_rad, settings.stop_rows)
+        return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
+
+    ratio, widen = np.ones((2, len(values)))
+    shift, facts = SKEW_DB, {"rows": float(len(rows))}
+    if len(rows) > 1:
+        if len(rows) >= settings.search_rows:
+            search = Fit(prior, measured, partial(join, factor=WIDER))
+            search.set_ratio(hyperparameters)
+            hyperparameters = search.search(
+                hyperparameters, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
+            )
+        fit = Fit(prior, measured, join)
+        fit.set_ratio(hyperparameters)
+        on_progress("strengths: held-out rows", 0.8)
+        mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
+        residual = values - mean
+        shift, ratio = shift_of(residual, SKEW_DB), fit.ratio
+        widen = widening(residual - shift, std)
+        if np.isfinite(residual).any():
+            facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
+    on_progress("strengths: all rows", 0.9)
+    field = Field(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
+    on_progress("strengths: all rows", 1.0)
+    return Strengths(field, shift, widen, facts)
+
+
+def _prior(record: Record, measured: Measured, power_map: PowerMap | None, settings: StrengthSettings) -> PriorMean:
+    """Expected signal strength before the fit."""
+    assert record.frequencies_hz is not None
+    receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
+    traced_sd = np.multiply(TRACED_SD, power_map is not None)
+    sd = np.array([(OFFSET_SD_DB, settings.receiver_sd_db), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
+    carrier_hz = float(np.mean(record.frequencies_hz))
+    at_0_dbm = PriorMean(receivers_m, 0.0, carrier_hz, power_map, sd, RECEIVER_PATTERN_DB)
+    transmit_dbm = settings.transmit_dbm
+    if transmit_dbm is None:
+        transmit_dbm = _transmit_dbm(at_0_dbm, measured)
+    return replace(at_0_dbm, transmit_dbm=transmit_dbm)
+
+
+def _transmit_dbm(at_0_dbm: PriorMean, measured: Measured) -> float:
+    """Median level of the data above what is expected for 0 dBm; 0 dBm without data.
+
+    Strengths may be of any transmit power, and in any unit of decibels. A prior about 0 dBm would bend the law of
+    distance to them where rows are few: 0.4 dB with 5 rows that are 40 dB lower (flat-ble, 2026-11-27), while the level
+    of 5 rows is as good a prior as 0 dBm where that is right. A median, as fades reach deep.
+    """
+    excess = [
+        measured.value_dbm[receiver] - at_0_dbm.columns(measured.poses, receiver)[0]
+        for receiver in range(len(measured.value_dbm))
+    ]
+    known = np.concatenate(excess)[np.isfinite(np.concatenate(excess))]
+    return float(np.median(known)) if len(known) else 0.0

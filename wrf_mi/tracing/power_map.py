@@ -1,0 +1,105 @@
+"""Local mean of traced power on a grid.
+
+For a position known to a decimetre ray tracing gives the mean over some wavelengths, so powers are averaged over the
+neighbourhood before they are converted to decibels. The scene is traced once on a grid and needed only then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from .devices import solid_around
+from .kept_powers import traced_powers
+from .options import TraceOptions
+from .solve import Prepared
+
+MOST_POINTS = 6000
+"""Most traced positions; the grid becomes wider for larger scenes."""
+LAYER_M = 0.5
+"""Greatest distance of the grid's layers over the transmitter's heights."""
+SAME_HEIGHT_M = 0.02
+LEAST_SHARE = 1e-3
+"""Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
+
+
+@dataclass(frozen=True)
+class PowerMap:
+    """Local mean of traced power on a grid [n_rx, x, y, z], dBm for 0 dBm sent; one layer serves all heights."""
+
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+    power_dbm: FloatArray
+
+    def __call__(self, position_m: FloatArray, receiver: int) -> FloatArray:
+        """Power in dBm at positions [m, 3], linear between the grid's points; outside that of its nearest edge."""
+        axes = [(k, axis) for k, axis in enumerate((self.x_m, self.y_m, self.z_m)) if len(axis) > 1]
+        inside = [np.clip(position_m[:, k], axis[0], axis[-1]) for k, axis in axes]
+        grid = RegularGridInterpolator([axis for _, axis in axes], self.power_dbm[receiver].squeeze())
+        return np.asarray(grid(np.stack(inside, axis=-1)))
+
+
+def trace_map(
+    scene: Any, record: Record, spacing_m: float, smooth_m: float, max_depth: int, max_reflections: int
+) -> PowerMap:
+    """Trace a scene on a grid over its extent and all of a record's positions.
+
+    Points of the grid inside closed solids (`wrf_mi.tracing.devices.solids`) are not traced: local means exclude them,
+    and they take the mean of the points outside, or the value of the nearest of these.
+
+    Args:
+        scene: from `wrf_mi.tracing.open_scene`.
+        record: receivers and heights of the transmitter.
+        spacing_m: spacing of the grid.
+        smooth_m: standard deviation of the Gaussian over which powers are averaged; 0: none.
+        max_depth: interactions of a path at most, transmissions included.
+        max_reflections: reflections of a path at most.
+
+    Raises:
+        InputError: no path to a receiver from anywhere, or a scene filled by a solid.
+    """
+    box = scene.mi_scene.bbox()
+    low = np.minimum([box.min.x, box.min.y], record.tx_pos_m[:, :2].min(axis=0))
+    high = np.maximum([box.max.x, box.max.y], record.tx_pos_m[:, :2].max(axis=0))
+    bottom, top = record.tx_pos_m[:, 2].min(), record.tx_pos_m[:, 2].max()
+    layers = 1 if top - bottom < SAME_HEIGHT_M else 2 + int((top - bottom) // LAYER_M)
+    z_m = np.linspace(bottom, top, layers) if layers > 1 else np.array([(bottom + top) / 2])
+    spacing = max(spacing_m, float(np.sqrt(np.prod(high - low) * layers / MOST_POINTS)))
+    x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
+    grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
+    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
+    points, prepared = grid.reshape(-1, 3), Prepared(scene)
+    outside = solid_around(prepared.surfaces, points) < 0
+    if not outside.any():
+        raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
+    traced = np.full((len(record.receivers), len(points)), np.nan)
+    traced[:, outside] = traced_powers(scene, prepared, points[outside], record.receivers, options, record.tx_antenna)
+    power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
+    steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
+    # Not across layers, which lie further apart than the neighbourhood and may be on different floors.
+    sigma = (0, smooth_m / steps[0], smooth_m / steps[1], 0)
+    power = _means_outside(power, outside.reshape(grid.shape[:3]), sigma, steps)
+    for receiver, grid_mw in zip(record.receivers, power, strict=True):
+        if not (grid_mw > 0).any():
+            raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or max_depth")
+        grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()
+    return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
+
+
+def _means_outside(
+    power: FloatArray, outside: NDArray[np.bool_], sigma: tuple[float, ...], steps_m: list[float]
+) -> FloatArray:
+    """Local means of power [n_rx, x, y, z] over points outside of solids; where there are none, the nearest mean."""
+    share = gaussian_filter(outside[None].astype(float), sigma, mode="nearest")
+    mean = gaussian_filter(power, sigma, mode="nearest") / np.maximum(share, LEAST_SHARE)
+    sampling = [step if np.isfinite(step) else 1.0 for step in steps_m]
+    nearest = distance_transform_edt(share[0] < LEAST_SHARE, sampling, return_distances=False, return_indices=True)
+    return np.asarray(mean[:, *nearest])
