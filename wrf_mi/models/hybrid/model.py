@@ -54,8 +54,8 @@ from ..model import (
     under,
 )
 from .mixture import Mixture, choose, constant
-from .parts import KRIGING, PATHS_PART, TRACED, UPLINK_PARTS, HybridSettings, parts_of, stored_parts
-from .paths import PATHS, RESIDUAL, FittedPaths, StageReport, stated_reports
+from .parts import KRIGING, PATHS, SCENE_SIDES, TRACED, UPLINK_PARTS, HybridSettings, parts_of, stored_parts
+from .scene_side import RESIDUAL, SceneSide, StageReport, stated_reports
 
 logger = logging.getLogger(__name__)
 FOLDER = "parts"
@@ -198,7 +198,7 @@ class FittedHybrid(Fitted):
             return values.reshape(-1, *[1] * len(shape))
 
         for name, fitted, weight in zip(names, self.parts.values(), weights.T, strict=False):
-            share = weight + with_residual if name == PATHS_PART else weight
+            share = weight + with_residual if name == PATHS else weight
             rows = np.flatnonzero(share)
             if not len(rows):
                 continue
@@ -256,21 +256,29 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     predictions: dict[str, Prediction] = {}
     reports: list[StageReport] = []
     residuals, begun = None, time.perf_counter()
+    # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
+    interpolates = RESIDUAL in problem.settings.wanted and not task_of(record).in_decibel and record.carriers_hz is None
     for name, (entry, inner) in parts_of(problem, split).items():
         place = replace(session, folder=session.folder / FOLDER / name, run=session.folder / FOLDER / name)
         place.folder.mkdir(parents=True, exist_ok=True)
         fitted[name], _ = fit_model(entry, inner, split, labelled(place, name))
         one = fitted[name]
-        if isinstance(one, FittedPaths):
+        if isinstance(one, SceneSide):
             reports += one.stages
+            entry, inner = SCENE_SIDES[task_of(record).in_decibel][1], one.problem  # the scene is corrected once
         if fold is None or held is None:
             continue
-        reports_at = one.held_out_at(held.receiver, held.row) if isinstance(one, FittedPaths) else None
-        if isinstance(one, FittedPaths) and reports_at is not None:
-            predictions[name] = Prediction(as_unseen(reports_at, one.problem, held))
+        unseen = one.held_out_at(held.receiver, held.row) if isinstance(one, SceneSide) else None
+        if unseen is not None:
+            predictions[name] = Prediction(as_unseen(unseen, inner, held))
         else:
             predictions[name] = held_out_predictions(entry, inner, fold, held, _inside(place, "held"), name)
-        if name == PATHS_PART and RESIDUAL in problem.settings.wanted and record.carriers_hz is None:
+        if (
+            name == PATHS
+            and not task_of(record).in_decibel
+            and RESIDUAL in problem.settings.wanted
+            and record.carriers_hz is None
+        ):
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
     names = [*predictions] if predictions else [*fitted]
     interpolating = time.perf_counter()
@@ -278,8 +286,8 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     if not predictions:
         mixture = constant(np.eye(len(fitted))[0])
     used = [name for name, most in zip(names, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
-    if RESIDUAL in used and PATHS_PART not in used:
-        used.insert(0, PATHS_PART)
+    if RESIDUAL in used and PATHS not in used:
+        used.insert(0, PATHS)
     used = [*(name for name in used if name != RESIDUAL), *([RESIDUAL] if RESIDUAL in used else [])]
     kept = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
     for name in set(fitted) - set(used):
@@ -379,7 +387,7 @@ def _by_data(task: str, with_scene: bool) -> Model:
     """The entry, whose arrays have the gaps of the parts' arrays."""
     entries = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
     gaps = {name for entry in entries for name in entry.serving(task, with_scene).gaps}
-    return replace(MODEL, by_data=None, gaps=(*GAPS, *PATHS.gaps, *sorted(gaps)))
+    return replace(MODEL, by_data=None, gaps=(*GAPS, *sorted(gaps)))
 
 
 MODEL = Model(

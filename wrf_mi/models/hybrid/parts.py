@@ -11,14 +11,17 @@ from ...tasks import task_of
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..model import Model, Problem, default_settings
-from .paths import FIELD, PATHS, RESIDUAL, STAGES, needs_graph
+from . import paths, strengths
+from .scene_side import FIELD, RESIDUAL, STAGES, needs_scene
 
 logger = logging.getLogger(__name__)
 
-PATHS_PART, KRIGING, FIELD_PART = "paths", "kriging", FIELD
+PATHS, KRIGING = "paths", "kriging"
+SCENE_SIDES = {True: (strengths.TRACED_STRENGTHS, strengths.IN_SCENE), False: (paths.PATHS, paths.IN_SCENE)}
+"""Entries of the scene's side, with and without its correction, by whether observations are in decibels."""
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
-TRACED = (PATHS_PART, "r2f2-scene")
+TRACED = (PATHS, "r2f2-scene")
 """Parts that are given the scene."""
 
 
@@ -65,10 +68,10 @@ def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]
         names = (("r2f2-scene", True),) if problem.scene is not None else ()
         for name, scene in (*names, *((name, False) for name in UPLINK_PARTS)):
             _add(parts, name, problem, split, scene)
-    elif problem.scene is not None and task.receiver_with_scene and needs_graph(wanted):
-        _add(parts, PATHS_PART, problem, split, True)
+    elif problem.scene is not None and task.receiver_with_scene and needs_scene(wanted):
+        _add(parts, PATHS, problem, split, True)
     if problem.scene is None and settings.stages is not None and FIELD in wanted:
-        _add(parts, FIELD_PART, problem, split, False)
+        _add(parts, FIELD, problem, split, False)
     if RESIDUAL in wanted or not parts:
         _add(parts, KRIGING, problem, split, False)
     if not parts:
@@ -82,9 +85,9 @@ def stored_parts(problem: Problem, names: list[str]) -> dict[str, tuple[Model, P
 
 
 def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
-    if name == PATHS_PART:
-        return PATHS, problem
-    model = {FIELD_PART: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
+    if name == PATHS:
+        return SCENE_SIDES[task_of(problem.record).in_decibel][0], problem
+    model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
     given = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
     inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), given))

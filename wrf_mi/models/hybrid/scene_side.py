@@ -1,0 +1,137 @@
+"""The hybrid's scene: stages 1 to 3, by the correction of the scene, and what every part in it reports.
+
+scene/  in a part's folder: the corrected scene with its page, where the correction gained (`wrf_mi.correction`)
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import InputError, Record, Split
+from ...core.files import write_atomically
+from ...core.types import IntArray
+from ...correction import Correction, correct_scene, default_options, write_page
+from ...correction.options import FRAME, HIDDEN, PLANES
+from ...scene.correction_data import FILE as CORRECTION
+from ...tasks import task_of
+from ...training.reach import hold_out_groups
+from ..model import Fitted, Problem, Session
+
+logger = logging.getLogger(__name__)
+
+SCENE, STAGES_FILE = "scene", "stages.json"
+MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = (
+    "mean",
+    "calibration",
+    "correction",
+    "surfaces",
+    "field",
+    "residual",
+)
+OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))
+"""Parts of a correction beyond materials and gains."""
+STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)
+"""Stages in their order."""
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What one stage contributes.
+
+    Attributes:
+        stage: its name, of `STAGES`.
+        kept: whether it is part of the prediction.
+        held_out: mean score of held-out training rows by the stages up to it; None: it was not judged.
+        seconds: duration of its fit; None: it is part of the next one's.
+    """
+
+    stage: str
+    kept: bool
+    held_out: float | None = None
+    seconds: float | None = None
+
+
+class SceneSide(Fitted):
+    """A part of the hybrid that predicts from the scene.
+
+    Attributes:
+        problem: problem with the scene that it was fitted in.
+        stages: reports of the stages that were tried; none after loading.
+    """
+
+    problem: Problem
+    stages: tuple[StageReport, ...] = ()
+
+    def held_out_at(self, receiver: IntArray, row: IntArray) -> NDArray[Any] | None:
+        """Reports [q, ...] of training rows by a fit that had not seen them; None: another fit has to predict them."""
+        return None
+
+
+def too_few(record: Record, split: Split) -> bool:
+    """Whether the training rows are too few to hold groups of them out for a choice of stages."""
+    return hold_out_groups(split, record.tx_pos_m) is split
+
+
+def needs_scene(wanted: Collection[str]) -> bool:
+    """Whether one of the stages needs the scene."""
+    return not {MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD}.isdisjoint(wanted)
+
+
+def in_scene(problem: Problem, folder: Path) -> Problem:
+    """The problem with the scene of a fit in a folder: the corrected one, where there is one."""
+    corrected = folder / SCENE
+    return replace(problem, scene=str(corrected), material=None) if (corrected / CORRECTION).exists() else problem
+
+
+def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem, list[StageReport]]:
+    """The problem in the scene that training rows correct, and reports of stages 1 to 3.
+
+    The corrected scene lies in the session's folder where it gains; a resumed fit finds it there.
+    """
+    record, path = problem.record, session.folder / STAGES_FILE
+    if path.exists():
+        return in_scene(problem, session.folder), [StageReport(**one) for one in json.loads(path.read_text())]
+    reports: list[StageReport] = []
+    wanted = problem.settings.wanted
+    if CALIBRATION in wanted and (split.held_receivers or not too_few(record, split)):
+        options = default_options(record)
+        if CORRECTED not in wanted:
+            options = replace(options, parts=tuple(part for part in options.parts if part not in OF_GEOMETRY))
+        assert problem.scene is not None
+        try:
+            correction = correct_scene(problem.scene, record, split, options, problem.material, session.report)
+        except InputError as error:
+            logger.warning("%s; the scene is used as it is stated", error)
+        else:
+            if correction.kept:
+                write_page(correction, session.folder / SCENE, replace=True)
+            reports = _reports(correction, task_of(record).higher_is_better)
+    write_atomically(path, json.dumps(stated_reports(reports)) + "\n")
+    return in_scene(problem, session.folder), reports
+
+
+def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport]:
+    """Materials and gains are the calibration, all further parts the correction."""
+    scores = {name: float(np.nanmean(score)) for name, score in correction.scores.items()}
+    of_geometry = {name: bool(OF_GEOMETRY.intersection(name.split("+"))) for name in scores}
+    reports = [StageReport(MEAN, True, scores.pop(""))]
+    for stage, geometry in ((CALIBRATION, False), (CORRECTED, True)):
+        judged = {name: score for name, score in scores.items() if of_geometry[name] == geometry}
+        if judged:
+            best = (max if higher_is_better else min)(judged.values())
+            kept = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
+            reports.append(StageReport(stage, kept, judged.get(correction.kept, best)))
+    return [*reports[:-1], replace(reports[-1], seconds=correction.seconds)]
+
+
+def stated_reports(reports: Collection[StageReport]) -> list[dict[str, Any]]:
+    """Reports as ``metrics.json`` has them."""
+    return [asdict(one) for one in reports]

@@ -1,0 +1,102 @@
+"""The scene's side for signal strengths: kriging about the local mean of the power traced in the corrected scene.
+
+For a transmitter whose position is known to a decimetre, ray tracing gives the mean over some wavelengths: single
+paths, and Gaussians that change them, say nothing of the fading about it. So stages 4 and 5 are not tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from ...core import InputError, Prediction, Split
+from ...correction.options import STRENGTHS
+from ...tracing.polarization import check_polarization
+from ...tracing.power_map import trace_map
+from ...tracing.solve import Prepared
+from .. import MODELS
+from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
+from ..model import Arrays, Inputs, Model, Problem, Session
+from .scene_side import SceneSide, StageReport, corrected, in_scene
+
+SPACING_M, SMOOTH_M = 0.25, 0.3
+"""Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
+
+
+class FittedStrengths(SceneSide):
+    """Kriging of signal strengths about traced power.
+
+    Args:
+        strengths: the fitted kriging.
+        problem: problem of the hybrid with the scene that was traced.
+        stages: reports of the stages that were tried.
+    """
+
+    def __init__(self, strengths: Strengths, problem: Problem, stages: Sequence[StageReport] = ()) -> None:
+        self.strengths, self.problem, self.stages = strengths, problem, tuple(stages)
+        self.receivers, self.uses_heading = strengths.receivers, strengths.uses_heading
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Strengths at the receiver of that index, dBm [m]."""
+        return self.strengths.predict(inputs, receiver)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, which takes a fraction of its time."""
+        return self.strengths.predict_mean(inputs, receiver)
+
+    def arrays(self) -> Arrays:
+        """Arrays of the kriging, the map among them."""
+        return self.strengths.arrays()
+
+
+def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
+    """Correct the scene, trace a map in it, and fit kriging about it."""
+    inner, reports = corrected(problem, split, session)
+    fitted = fit_in_scene(inner, split, session)
+    fitted.stages = tuple(reports)
+    return fitted
+
+
+def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedStrengths:
+    """`fit` without the correction."""
+    session.report("tracing a map", 0.0)
+    reach = STRENGTHS.depth, STRENGTHS.reflections
+    power_map = trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, *reach)
+    rows = problem.rows(split)
+    return FittedStrengths(fit_strengths(problem.record, rows, power_map, StrengthSettings(), session.report), problem)
+
+
+def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
+    """The kriging that `FittedStrengths.arrays` described."""
+    return FittedStrengths(Strengths.from_arrays(arrays), in_scene(problem, folder))
+
+
+def check(problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse data without a single, known carrier, and antennas inside solids.
+
+    Raises:
+        InputError: naming them.
+    """
+    record = problem.record
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: carrier frequency unknown, or several; a map is traced at one")
+    Prepared(problem.opened_scene).check(record.tx_pos_m, record.receivers)
+    check_polarization(problem.opened_scene, record.tx_pos_m, record.receivers, record.tx_antenna)
+
+
+TRACED_STRENGTHS = replace(
+    MODELS["kriging"].serving("rssi", False),
+    name="strengths",
+    fit=fit,
+    load=load,
+    scene="required",
+    check=check,
+    by_data=None,
+)
+"""The scene's side for strengths as an entry, which no name of the registry has."""
+IN_SCENE: Model = replace(TRACED_STRENGTHS, fit=fit_in_scene)
+"""The same in a scene that is corrected already."""
