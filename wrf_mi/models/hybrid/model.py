@@ -273,12 +273,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
             predictions[name] = Prediction(as_unseen(unseen, inner, held))
         else:
             predictions[name] = held_out_predictions(entry, inner, fold, held, _inside(place, "held"), name)
-        if (
-            name == PATHS
-            and not task_of(record).in_decibel
-            and RESIDUAL in problem.settings.wanted
-            and record.carriers_hz is None
-        ):
+        if name == PATHS and interpolates:
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
     names = [*predictions] if predictions else [*fitted]
     interpolating = time.perf_counter()
@@ -293,7 +288,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     for name in set(fitted) - set(used):
         shutil.rmtree(session.folder / FOLDER / name, ignore_errors=True)
     if KRIGING in names and len(names) > 1:
-        gained = KRIGING in used or RESIDUAL in used
+        gained = task_of(record).in_decibel or KRIGING in used or RESIDUAL in used
         reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), interpolating - begun))
     facts = {
         "stages": stated_reports(reports),

@@ -1,4 +1,4 @@
-"""The scene's side for spectra and channels: stages 4 and 5, paths and Gaussians of one graph in the corrected scene."""
+"""The scene's side for spectra and channels: stages 4 and 5, a graph of paths and Gaussians in the corrected scene."""
 
 from __future__ import annotations
 
