@@ -76,7 +76,7 @@ def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -
     field = with_settings(default_config("spectrum", False), FIELD)
     runs = {
         "kriging": train(folder / HOME / FLAT, folder / "kriging", "kriging").folder,
-        "wrf-gs+": train(folder / SPECTRA, folder / "field", settings=field).folder,
+        "wrf-gs+": train(folder / SPECTRA, folder / "field", "wrf-gs+", settings=field).folder,
     }
     rng, rows, wrong = np.random.default_rng(0), [], []
     for name, run in runs.items():

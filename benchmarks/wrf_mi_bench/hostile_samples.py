@@ -313,11 +313,13 @@ def _write_runs(folder: Path) -> None:
     write_map(made, folder / "runs" / "map.zarr")
     write_map(radio_map(strengths, surface=folder / "files" / "box.ply"), folder / "runs" / "surface.nc")
     settings = (*SMALL, "network.static_geometry=true")
-    run = train(folder / "spectra", folder / "runs" / "field", settings=settings).folder
+    run = train(folder / "spectra", folder / "runs" / "field", "wrf-gs+", settings=settings).folder
     export(run, "field", folder / "runs" / "field.npz")
     open_run(run).predict([[2.0, 1.0, 1.0]])  # builds the operator
     asked = iter(range(1, 5))
     try:
-        train(folder / "spectra", folder / "runs" / "stopped", settings=settings, stop=lambda: next(asked) >= 3)
+        train(
+            folder / "spectra", folder / "runs" / "stopped", "wrf-gs+", settings=settings, stop=lambda: next(asked) >= 3
+        )
     except Interrupted:
         return

@@ -94,9 +94,9 @@ def test_settings_of_ray_tracing_without_effect_are_named(
 
 
 def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: Any) -> None:
-    plan_run(flat_folder)
+    plan_run(flat_folder, "wrf-gs+")
     assert caplog.text == ""
-    plan_run(flat_folder, settings=["traced.depth=5", "traced.rays=64"])
+    plan_run(flat_folder, "wrf-gs+", settings=["traced.depth=5", "traced.rays=64"])
     assert "traced.depth, traced.rays: no effect without a scene" in caplog.text
 
 

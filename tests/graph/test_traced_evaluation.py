@@ -294,7 +294,16 @@ def test_traced_run_with_a_scene_reproduces_its_score(tmp_path: Path) -> None:
     own = Record("made", "spectrum", tx, (at,), record.observation, frequencies_hz=np.array([WALLS_HZ]))
     scene = write_xml(tmp_path / "room", SHOEBOX)
     asked = ["steps=4", *QUICK[:-1], "validate_every=2", "traced.rays=1024", "batch=2"]
-    train(own, tmp_path / "run", scene=scene, settings=asked, receiver="pixel", evaluation="traced", split="random")
+    train(
+        own,
+        tmp_path / "run",
+        "wrf-gs+",
+        scene=scene,
+        settings=asked,
+        receiver="pixel",
+        evaluation="traced",
+        split="random",
+    )
     stored = np.load(tmp_path / "run" / "predictions.npz")
     rows = stored["row"]
     again = open_run(tmp_path / "run", own).predict(tx[rows]).mean
@@ -311,6 +320,6 @@ def test_untraceable_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     record, _ = made_record(24)
     with pytest.raises(InputError, match=r"--evaluation belongs to Gaussians .*, not to idw"):
         train(record, tmp_path / "idw", "idw", evaluation="traced")
-    run = train(record, tmp_path / "run", settings=settings("steps=2", "evaluation=traced"), split="random")
+    run = train(record, tmp_path / "run", "wrf-gs+", settings=settings("steps=2", "evaluation=traced"), split="random")
     with pytest.raises(InputError, match="compress a run with evaluation=splatted"):
         compress_run(run.folder, tmp_path / "small", Compression(budget=4), record)

@@ -88,7 +88,7 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
         return steps == 30
 
     with pytest.raises(Interrupted):
-        train(flat_folder, out, settings=SETTINGS, receiver="attenuated", stop=stop)
+        train(flat_folder, out, "wrf-gs+", settings=SETTINGS, receiver="attenuated", stop=stop)
     run = resume(out)
     assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
     positions = load(flat_folder).tx_pos_m[:2]
@@ -102,9 +102,9 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
 
 def test_receiver_of_another_task_or_unknown_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="receiver model pixel does not report rssi; choose from power, attenuated"):
-        train(flat_folder, tmp_path / "run", receiver="pixel")
+        train(flat_folder, tmp_path / "run", "wrf-gs+", receiver="pixel")
     with pytest.raises(InputError, match="receiver model 'horn': unknown; choose from power, attenuated"):
-        train(flat_folder, tmp_path / "run", receiver="horn")
+        train(flat_folder, tmp_path / "run", "wrf-gs+", receiver="horn")
     assert not (tmp_path / "run").exists()
 
 

@@ -83,7 +83,7 @@ def config(*settings: str, with_scene: bool = True) -> TrainConfig:
 @pytest.fixture(scope="module")
 def run(rooms: dict[str, Path], data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "joint"
-    train(str(data), out, settings=config(), scene=rooms["known"])
+    train(str(data), out, "wrf-gs+", settings=config(), scene=rooms["known"])
     return out
 
 
@@ -94,7 +94,7 @@ def median(run: Path) -> float:
 def test_joint_training_predicts_better_than_paths_or_gaussians_alone(
     rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path
 ) -> None:
-    train(str(data), tmp_path / "field", settings=config(with_scene=False))
+    train(str(data), tmp_path / "field", "wrf-gs+", settings=config(with_scene=False))
     asked = ["trace", rooms["known"], data, "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"]
     assert main([str(word) for word in asked]) == 0
     assert median(run) > median(tmp_path / "field") + 0.03
@@ -134,7 +134,7 @@ def test_resumed_run_is_bit_identical(rooms: dict[str, Path], data: Path, run: P
         return steps == 100
 
     with pytest.raises(Interrupted):
-        train(str(data), tmp_path / "run", settings=config(), scene=rooms["known"], stop=stop)
+        train(str(data), tmp_path / "run", "wrf-gs+", settings=config(), scene=rooms["known"], stop=stop)
     resume(tmp_path / "run")
     one, other = (open_run(folder).field.arrays() for folder in (run, tmp_path / "run"))
     for key in one:
@@ -143,7 +143,7 @@ def test_resumed_run_is_bit_identical(rooms: dict[str, Path], data: Path, run: P
 
 def test_receivers_poses_are_trained_where_a_rate_is_given(rooms: dict[str, Path], data: Path, tmp_path: Path) -> None:
     own = config("steps=20", "traced.position=0.001", "traced.turn=0.001", "traced.pattern_degree=1", "receiver=pixel")
-    train(str(data), tmp_path / "run", settings=own, scene=rooms["known"])
+    train(str(data), tmp_path / "run", "wrf-gs+", settings=own, scene=rooms["known"])
     params = open_run(tmp_path / "run").field.params
     for name in (
         "receiver.gateway1.position",
@@ -158,7 +158,7 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(
     rooms: dict[str, Path], data: Path, tmp_path: Path
 ) -> None:
     own = config("steps=20", "validate_every=1000", "patience=0", "optimiser.warm_up=5")
-    train(str(data), tmp_path / "run", settings=own, scene=rooms["known"])
+    train(str(data), tmp_path / "run", "wrf-gs+", settings=own, scene=rooms["known"])
     run = open_run(tmp_path / "run")
     assert np.isinf(run.fitted.arrays()["reach_m"])
     position = np.array([[1.9, 2.9, 1.5]])

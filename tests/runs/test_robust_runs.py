@@ -143,7 +143,7 @@ def test_a_run_whose_arrays_are_not_finite_is_not_opened(
 def test_a_checkpoint_of_other_arrays_is_refused(change: str, folder: Path, tmp_path: Path) -> None:
     """They are refused before the backend, which ends the process on other shapes."""
     with pytest.raises(Interrupted):
-        train(folder, tmp_path / "run", settings=settings("steps=10"), stop=stop_after(4))
+        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10"), stop=stop_after(4))
     file = tmp_path / "run" / "checkpoint.npz"
     arrays = stored_arrays(file)
     for group in ("param", "mean", "first", "second"):
@@ -166,7 +166,7 @@ def test_sizes_are_checked_before_they_are_allocated(tmp_path: Path) -> None:
 
 def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"initial.gaussians=500000000 with batch=.*; lower one of them"):
-        train(folder, tmp_path / "run", settings=settings("initial.gaussians=500000000"))
+        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("initial.gaussians=500000000"))
     assert not (tmp_path / "run").exists()
 
 

@@ -70,7 +70,7 @@ def checkpoint_of(run: Path) -> dict[str, np.ndarray]:
 
 def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -> None:
     with pytest.raises(Interrupted, match=rf"stopped after step {at} of 40; .* train --resume {out}"):
-        train(folder, out, settings=config, stop=stop_after(at))
+        train(folder, out, "wrf-gs+", settings=config, stop=stop_after(at))
     assert not (out / "metrics.json").exists()
     assert int(read_checkpoint(out)["step"]) == at
     assert [entry["step"] for entry in log_of(out)] == [s for s in range(5, 41, 5) if s <= at]
@@ -90,6 +90,7 @@ def test_resumed_run_is_bit_identical(folder: Path, tmp_path: Path) -> None:
     train(
         folder,
         tmp_path / "whole",
+        "wrf-gs+",
         settings=config,
         on_progress=lambda *said: keep_checkpoint(tmp_path / "whole", said[2]),
     )
@@ -114,7 +115,7 @@ def test_resumed_run_is_bit_identical(folder: Path, tmp_path: Path) -> None:
 def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -> None:
     set_threads(max(2, dr.thread_count()))
     config = settings("steps=40", "checkpoint_every=8")
-    train(folder, tmp_path / "whole", settings=config)
+    train(folder, tmp_path / "whole", "wrf-gs+", settings=config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
     greys = [stored(tmp_path / name)["prediction"] for name in ("whole", "resumed")]
     assert np.abs(greys[0] - greys[1]).mean() < PARALLEL_TOLERANCE
@@ -133,12 +134,12 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, tmp_path: Pat
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "killed", settings=config, on_progress=kill)
+        train(folder, tmp_path / "killed", "wrf-gs+", settings=config, on_progress=kill)
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 24
     assert log_of(tmp_path / "killed")[-1]["step"] == 30
     resume(tmp_path / "killed")
     assert [e["step"] for e in log_of(tmp_path / "killed")] == list(range(5, 41, 5))
-    train(folder, tmp_path / "whole", settings=config)
+    train(folder, tmp_path / "whole", "wrf-gs+", settings=config)
     for name, values in arrays_of(tmp_path / "whole").items():
         np.testing.assert_array_equal(arrays_of(tmp_path / "killed")[name], values, err_msg=name)
 
@@ -162,11 +163,11 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     broken.observation[0, row, 4, 5] = 2
     monkeypatch.setattr(Spectrum, "loss", loss)
     with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
-        train(broken, tmp_path / "broken", settings=config)
+        train(broken, tmp_path / "broken", "wrf-gs+", settings=config)
     monkeypatch.undo()
     assert int(read_checkpoint(tmp_path / "broken")["step"]) == step - 1
     resume(tmp_path / "broken")
-    train(folder, tmp_path / "whole", settings=config)
+    train(folder, tmp_path / "whole", "wrf-gs+", settings=config)
     for name, values in arrays_of(tmp_path / "whole").items():
         np.testing.assert_array_equal(arrays_of(tmp_path / "broken")[name], values, err_msg=name)
 
@@ -176,7 +177,7 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
         raise PowerCut
 
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "run", settings=settings("steps=10"), on_progress=kill)
+        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10"), on_progress=kill)
     assert not (tmp_path / "run" / "checkpoint.npz").exists()
     with pytest.raises(InputError, match=r"model\.npz: missing, the fit was stopped; finish it with train"):
         open_run(tmp_path / "run").predictor()
@@ -185,7 +186,7 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
 
 
 def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None:
-    before = train(folder, tmp_path / "run", settings=settings("steps=10")).metrics
+    before = train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10")).metrics
     arrays = arrays_of(tmp_path / "run")
     (tmp_path / "run" / "metrics.json").unlink()
     after = resume(tmp_path / "run").metrics
@@ -195,7 +196,9 @@ def test_finished_run_is_only_scored_again(folder: Path, tmp_path: Path) -> None
 
 
 def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = train(folder, tmp_path / "run", settings=settings("steps=10", "seed=3"), split="random", n_train=0.5)
+    run = train(
+        folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10", "seed=3"), split="random", n_train=0.5
+    )
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
     assert contents(run.folder) == files
     config = yaml.safe_load((run.folder / "config.yaml").read_text())
@@ -225,7 +228,7 @@ def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Recor
 
 def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_path: Path) -> None:
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    run = train(data, tmp_path / "run", settings=settings("steps=20"))
+    run = train(data, tmp_path / "run", "wrf-gs+", settings=settings("steps=20"))
     m = run.metrics
     assert list(m["receivers"]) == ["gateway1", "gateway2"]
     held = stored(run.folder)
@@ -246,7 +249,9 @@ def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_pat
 
 @pytest.fixture(scope="module")
 def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(folder, tmp_path_factory.mktemp("runs") / "finished", settings=settings("steps=10"), n_train=10).folder
+    return train(
+        folder, tmp_path_factory.mktemp("runs") / "finished", "wrf-gs+", settings=settings("steps=10"), n_train=10
+    ).folder
 
 
 def predictor(run: Path) -> Any:
@@ -312,7 +317,7 @@ def test_split_without_unseen_rows_is_refused(folder: Path, tmp_path: Path, one_
     """Official training rows hold all test rows of this random split."""
     split, other = official(one_gateway), make_splits(one_gateway, "random")[0]
     assert np.isin(other.test, split.all_train).all()
-    train(folder, tmp_path / "run", settings=settings("steps=1"))
+    train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=1"))
     with pytest.raises(InputError, match="trained on all test rows of split random; nothing is left to score"):
         evaluate_run(tmp_path / "run", "random")
 
@@ -320,7 +325,7 @@ def test_split_without_unseen_rows_is_refused(folder: Path, tmp_path: Path, one_
 def test_unfinished_runs_have_no_scores(folder: Path, tmp_path: Path) -> None:
     """Metrics mark a run as finished."""
     with pytest.raises(Interrupted):
-        train(folder, tmp_path / "run", settings=settings("steps=40"), stop=stop_after(10))
+        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=40"), stop=stop_after(10))
     with pytest.raises(InputError, match=r"run.model\.npz: missing, the fit was stopped; finish it with train"):
         evaluate_run(tmp_path / "run")
     assert not (tmp_path / "run" / "metrics.json").exists()
@@ -343,7 +348,7 @@ def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_
     split = official(one_gateway)
     for own in (replace(split, train=np.append(split.train, 24)), replace(split, test=np.array([-1]))):
         with pytest.raises(InputError, match=r"split official: row (24|-1), but made-here has rows 0 to 23"):
-            train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=own)
+            train(one_gateway, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split=own)
     assert not (tmp_path / "run").exists()
     # A data set that has become shorter since.
     run = copied(finished, tmp_path / "copy")
@@ -360,7 +365,7 @@ def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_
 
 
 def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = train(folder, tmp_path / "run", settings=settings("steps=5"), split="blocked")
+    run = train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split="blocked")
     m = run.metrics
     assert (m["split"], m["n_train"], m["n_test"]) == ("blocked", 16, 24)
     parts = [Run(run.folder / f"fold{k}").metrics for k in range(3)]
@@ -384,7 +389,7 @@ def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: 
 
 def test_blocked_run_goes_on_in_the_fold_where_it_was_stopped(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(Interrupted, match=rf"stopped after step 4 of 5; .* train --resume {tmp_path / 'run'}"):
-        train(folder, tmp_path / "run", settings=settings("steps=5"), split="blocked", stop=stop_after(8))
+        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split="blocked", stop=stop_after(8))
     assert (tmp_path / "run" / "fold0" / "metrics.json").exists()
     assert not (tmp_path / "run" / "fold1" / "metrics.json").exists()
     with pytest.raises(InputError, match=r"fold1.model\.npz: missing, the fit was stopped; finish it with train"):
@@ -399,16 +404,16 @@ def test_folders_with_content_are_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run" / "mine.txt").write_text("mine")
     for split in ("official", "blocked"):
         with pytest.raises(InputError, match="exists and is not empty"):
-            train(folder, tmp_path / "run", settings=settings("steps=5"), split=split)
+            train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split=split)
     assert contents(tmp_path / "run") == {"mine.txt"}
     with pytest.raises(InputError, match="exists and is not empty"):
-        train(folder, tmp_path / "run" / "mine.txt", settings=settings("steps=5"))
+        train(folder, tmp_path / "run" / "mine.txt", "wrf-gs+", settings=settings("steps=5"))
 
 
 def test_custom_split_is_trained(one_gateway: Record, tmp_path: Path) -> None:
     """A record in memory and a split by hand, without validation rows."""
     split = Split("mine", 0, np.arange(10), np.arange(0), np.arange(20, 24))
-    run = train(one_gateway, tmp_path / "run", settings=settings("steps=5"), split=split)
+    run = train(one_gateway, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split=split)
     assert (run.metrics["split"], run.metrics["n_train"], run.metrics["n_test"]) == ("mine", 10, 4)
     # Standard JSON knows no NaN.
     for name in ("log.jsonl", "metrics.json"):

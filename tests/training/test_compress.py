@@ -103,7 +103,10 @@ def run(one_gateway: Record, folder: Path, tmp_path_factory: pytest.TempPathFact
     """A short fit of eight Gaussians."""
     out = tmp_path_factory.mktemp("runs") / "run"
     return train(
-        str(folder), out, settings=small("steps=60", "holdout_steps_fraction=0", "network.width=32", "network.layers=4")
+        str(folder),
+        out,
+        "wrf-gs+",
+        settings=small("steps=60", "holdout_steps_fraction=0", "network.width=32", "network.layers=4"),
     ).folder
 
 

@@ -58,7 +58,7 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path, tmp_p
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     assert run_module("wrf_mi.cli", ["train", str(folder), "--deterministic", *words, "--out", str(whole)])[0] == 0
     with pytest.raises(Interrupted):
-        train(folder, resumed, settings=[*FIT, "deterministic=true"], stop=stop_after(17))
+        train(folder, resumed, "wrf-gs+", settings=[*FIT, "deterministic=true"], stop=stop_after(17))
     assert run_module("wrf_mi.cli", ["train", "--resume", str(resumed)])[0] == 0
     assert_same_bits(whole, resumed)
     assert stored_arrays(whole / "model.npz")["param/position"].shape[1] > 8
@@ -118,7 +118,7 @@ def test_no_deterministic_fit_on_a_gpu(one_gateway: Record) -> None:
 @pytest.mark.usefixtures("gpu_process")
 def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> None:
     """Nothing is written, wherever determinism is stated."""
-    for stated in ({"settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
+    for stated in ({"model": "wrf-gs+", "settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
         with pytest.raises(BackendError, match="already computes with cuda: start another for llvm"):
             train(one_gateway, tmp_path / "run", **stated)
         assert not (tmp_path / "run").exists()

@@ -45,13 +45,15 @@ def traced(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def joint(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, depth = tmp_path_factory.mktemp("runs") / "joint", ["traced.depth=1", "traced.rays=4096"]
-    return wrf_mi.train(flat_folder, folder, scene=room, settings=[*SMALL, *depth, "density.max_gaussians=8"]).folder
+    return wrf_mi.train(
+        flat_folder, folder, "wrf-gs+", scene=room, settings=[*SMALL, *depth, "density.max_gaussians=8"]
+    ).folder
 
 
 @pytest.fixture(scope="module")
 def field(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field of spectra without a scene."""
-    return wrf_mi.train(folder, tmp_path_factory.mktemp("runs") / "field", settings=SMALL).folder
+    return wrf_mi.train(folder, tmp_path_factory.mktemp("runs") / "field", "wrf-gs+", settings=SMALL).folder
 
 
 def write_map(path: Path, height_m: float = 1.0) -> Path:

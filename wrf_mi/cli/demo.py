@@ -78,7 +78,7 @@ def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) ->
         print(f"using the embedded room {NAME}, traced by Sionna RT, instead", file=sys.stderr)
     dataset = REAL if real else NAME
     print(f"training wrf-gs+ on {dataset}; results go to {folder}", file=sys.stderr)
-    run = train(dataset, folder, settings=PRESETS["quick"], on_progress=on_progress, stop=stop)
+    run = train(dataset, folder, "wrf-gs+", settings=PRESETS["quick"], on_progress=on_progress, stop=stop)
     settings: tuple[str, ...] = ()
     if not real:
         print(f"tracing {NAME} in the mesh of its scan", file=sys.stderr)

@@ -44,8 +44,11 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add data set, model, split and settings."""
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
-    add("--model", choices=list(MODELS), help="model to fit (default: wrf-gs+); baselines: docs/baselines.md")
-    text = "scene to trace: beside wrf-gs, wrf-gs+, factorised, r2f2, for physics and hybrid, or alone for ray-tracing"
+    add("--model", choices=list(MODELS), help="model to fit (default: hybrid); baselines: docs/baselines.md")
+    text = "stages of the hybrid that may be used, from mean,calibration,correction,surfaces,field,residual"
+    add("--stages", metavar="LIST", help=f"{text} (default: all that the data allow)")
+    add("--fast", action="store_true", help="the hybrid without its field, whose training takes most of the time")
+    text = "scene to trace: for hybrid, beside wrf-gs, wrf-gs+, factorised and r2f2, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     add("--receiver", metavar="NAME", help=text)
@@ -58,7 +61,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
-    text = "calibrate predicted standard deviations on training rows held out in space (five to ten more fits)"
+    text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"
     add("--intervals", action="store_true", help=text)
     add("--preset", choices=("default", "paper", "quick"), help="named set of settings")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")

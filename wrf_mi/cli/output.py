@@ -41,6 +41,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     named += [(f"{words} ({key})", references[key]) for key, words in task.references.items() if key in references]
     for name, block in named:
         print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    _show_stages(metrics.get("stages", []), task.label)
     if metrics.get("n_not_scored"):
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     if "inside_90" in metrics:
@@ -55,6 +56,17 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if folder is not None:
         print(f"results: {folder}")
     return 0
+
+
+def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
+    """Print what each stage of a fit contributes on held-out training rows."""
+    if not reports:
+        return
+    print(f"{'stage':<16}{'held-out rows, mean ' + label:>32}{'seconds':>10}")
+    for one in reports:
+        score = "" if one["held_out"] is None else f"{one['held_out']:.3f}"
+        seconds = "" if one["seconds"] is None else f"{one['seconds']:.0f}"
+        print(f"{one['stage']:<16}{score:>32}{seconds:>10}{'' if one['kept'] else '  not kept'}")
 
 
 @contextmanager

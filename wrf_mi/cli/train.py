@@ -15,7 +15,7 @@ from ..core.yaml_files import read_yaml
 from .options import Arguments, add_command, add_training
 from .output import Watch, show_metrics
 
-RAY_TRACING = "ray-tracing"
+HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
 BESIDE_RESUME = ("resume", "json", "help_settings", "call")
@@ -83,8 +83,10 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
     Raises:
         InputError: options that do not belong together.
     """
-    model = a.model or "wrf-gs+"
+    model = a.model or HYBRID
     settings = [*a.set]
+    if a.stages is not None or a.fast:
+        settings = [*_stages(a, model), *settings]
     if model == RAY_TRACING:
         settings = [*_tracing_settings(a), *settings]
     elif any(getattr(a, name) is not None for name in TRACING):
@@ -103,6 +105,16 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
         "split": "official" if a.split is None else a.split,
         "seed": a.seed or 0,
     }
+
+
+def _stages(a: Arguments, model: str) -> list[str]:
+    from ..models.hybrid.scene_side import FAST
+
+    if model != HYBRID:
+        raise InputError(f"--stages and --fast belong to --model {HYBRID}, not to {model}")
+    if a.stages is not None and a.fast:
+        raise InputError("--fast limits the stages, too: give one of --stages and --fast")
+    return [f"stages={a.stages or ','.join(FAST)}"]
 
 
 def _preset(a: Arguments, model: str) -> tuple[str, ...]:

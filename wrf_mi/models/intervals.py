@@ -91,7 +91,9 @@ def fit_intervals(
     step = max(1, mean.size // MOST_VALUES)
     sizes, error = (np.ravel(values)[::step] for values in (size, np.abs(mean - observed)))
     distance = np.broadcast_to(_columns(distance_m, mean.ndim), mean.shape).ravel()[::step]
-    level = min(LEVEL * (1 + 1 / error.size), 1.0)
+    # Receivers of one row have errors alike; values of an image or channel differ as much within as between rows.
+    count = len(np.unique(row)) if mean.ndim == 1 else error.size
+    level = min(LEVEL * (1 + 1 / count), 1.0)
     floor = max(
         SMALLEST * float(np.median(error)), float(np.finfo(np.float32).eps * np.median(np.abs(observed))), LEAST
     )

@@ -101,7 +101,7 @@ def _settings_of(model: Model, settings: Settings, given: dict[str, Any]) -> Any
 
 def plan_run(
     dataset: str | Path | Record,
-    model: str = "wrf-gs+",
+    model: str = "hybrid",
     *,
     scene: str | Path | None = None,
     material: str | None = None,
@@ -189,7 +189,7 @@ def _check_scene(
 def train(
     dataset: str | Path | Record,
     out: str | Path,
-    model: str = "wrf-gs+",
+    model: str = "hybrid",
     *,
     scene: str | Path | None = None,
     material: str | None = None,
@@ -224,7 +224,7 @@ def train(
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
         intervals: calibrate the standard deviations of predictions on training rows that are held out in space; the
-            model is fitted five more times, ten up to 100 rows.
+            model is fitted once more.
         on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
         stop: called wherever nothing would be lost; True ends the run, and `resume` continues it.
         scheduler: computes parts of the work of models that have some (ray tracing), with the same result; None: this

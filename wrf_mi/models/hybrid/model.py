@@ -61,6 +61,8 @@ logger = logging.getLogger(__name__)
 FOLDER = "parts"
 NEGLIGIBLE = 1e-3
 """Weight below which a part is not evaluated: its share of the prediction."""
+STATED, PREDICTED = "stated", "predicted"
+"""Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
 LEAST_RESIDUALS = 3
 """Fewest rows of a receiver whose residuals are interpolated."""
 
@@ -144,9 +146,20 @@ class FittedHybrid(Fitted):
         self._check(inputs)
 
         def predicted(one: Fitted, some: IntArray) -> Decomposition:
+            if self._facts["sizes"] == STATED:
+                return Decomposition(one.predict(inputs.rows(some), receiver))
             return Decomposition(Prediction(one.predict_mean(inputs.rows(some), receiver)))
 
         return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, by parts that save time without standard deviations."""
+        self._check(inputs)
+
+        def predicted(one: Fitted, some: IntArray) -> Decomposition:
+            return Decomposition(Prediction(one.predict_mean(inputs.rows(some), receiver)))
+
+        return self._mixed(inputs.tx_pos_m, receiver, predicted, std=False).whole.mean
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; parts use what they have stored."""
@@ -164,9 +177,9 @@ class FittedHybrid(Fitted):
         self._check(inputs)
 
         def decomposed(one: Fitted, some: IntArray) -> Decomposition:
-            return one.decompose(inputs.rows(some), receiver, std=False)
+            return one.decompose(inputs.rows(some), receiver, std and self._facts["sizes"] == STATED)
 
-        return self._mixed(inputs.tx_pos_m, receiver, decomposed)
+        return self._mixed(inputs.tx_pos_m, receiver, decomposed, std)
 
     @property
     def depends_on_heading(self) -> bool:
@@ -179,7 +192,11 @@ class FittedHybrid(Fitted):
             raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
 
     def _mixed(
-        self, tx_pos_m: FloatArray, receiver: int, predict: Callable[[Fitted, IntArray], Decomposition]
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        predict: Callable[[Fitted, IntArray], Decomposition],
+        std: bool = True,
     ) -> Decomposition:
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
@@ -192,7 +209,7 @@ class FittedHybrid(Fitted):
         names = list(self.parts)
         with_residual = weights[:, len(names)] if self.residuals is not None else np.zeros(len(tx_pos_m))
         sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
-        mean, paths = np.zeros((len(tx_pos_m), *shape), kind), None
+        mean, paths, size = np.zeros((len(tx_pos_m), *shape), kind), None, np.zeros((len(tx_pos_m), *shape))
 
         def spread(values: FloatArray) -> FloatArray:
             return values.reshape(-1, *[1] * len(shape))
@@ -206,6 +223,8 @@ class FittedHybrid(Fitted):
             traced = int(name in TRACED)
             sides[traced, rows] += spread(share[rows]) * found.whole.mean
             totals[traced, rows] += share[rows]
+            if found.whole.std is not None:
+                size[rows] += spread(share[rows]) * found.whole.std
             if paths is None and found.paths is not None:
                 paths = found.paths.placed(rows, len(tx_pos_m))
         mean += sides.sum(axis=0)
@@ -215,8 +234,11 @@ class FittedHybrid(Fitted):
         if task_of(self._problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         whole = Prediction(mean)
-        if self.intervals is not None:
-            whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance_m)
+        if self.intervals is not None and std:
+            if self._facts["sizes"] == STATED:
+                whole = Prediction(mean, size * self.intervals(mean, np.ones(mean.shape), distance_m).stated_std)
+            else:
+                whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance_m)
         if not (totals[0].any() and totals[1].any()):
             return Decomposition(whole, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -277,7 +299,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
     names = [*predictions] if predictions else [*fitted]
     interpolating = time.perf_counter()
-    form, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
+    form, sizes, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
     if not predictions:
         mixture = constant(np.eye(len(fitted))[0])
     used = [name for name, most in zip(names, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
@@ -293,6 +315,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     facts = {
         "stages": stated_reports(reports),
         "form": form,
+        "sizes": sizes,
         "held_out": scores,
         "weights": _stated(kept, used),
     }
@@ -323,13 +346,13 @@ def _residuals(
 
 def _weights(
     record: Record, predictions: Mapping[str, Prediction], held: HeldOut | None, by_receiver: bool, session: Session
-) -> tuple[str, Mixture, Intervals | None, dict[str, float]]:
-    """Form of the weights, weights, intervals, and mean held-out scores of the parts.
+) -> tuple[str, str, Mixture, Intervals | None, dict[str, float]]:
+    """Form of the weights, sizes of expected errors, weights, intervals, and mean held-out scores of the parts.
 
     Errors are independent between rows; ``by_receiver``: between receivers, which are held out.
     """
     if held is None or not len(held) or not predictions:
-        return "alone", constant(np.ones(1)), None, {}
+        return "alone", PREDICTED, constant(np.ones(1)), None, {}
     task, observed = task_of(record), held.observed(record)
     means = np.stack([one.mean for one in predictions.values()])
     score, every = task.mixtures(means, observed), np.arange(len(held))
@@ -340,14 +363,23 @@ def _weights(
 
     form, mixture = choose(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
     mean = np.einsum("qk,kq...->q...", mixture(held.distance_m), means)
-    size = expected_size(task, Prediction(mean))
+    stds = [one.std for one in predictions.values()]
+    known = [std for std in stds if std is not None]
+    sizes = PREDICTED
+    if len(known) == len(stds):
+        # Few rows tell a factor of stated deviations, not how errors depend on them.
+        sizes, std = STATED, np.einsum("qk,kq...->q...", mixture(held.distance_m), np.stack(known))
+        intervals = fit_intervals(mean / std, observed / std, np.ones(mean.shape), held.distance_m, held.row)
+    else:
+        size = expected_size(task, Prediction(mean))
+        intervals = fit_intervals(mean, observed, size, held.distance_m, held.row)
     sign = 1 if task.higher_is_better else -1
     scores = {
         name: sign * float(score(np.broadcast_to(one, (len(held), len(means))), every).mean())
         for name, one in zip(predictions, np.eye(len(means)), strict=True)
     }
     scores["hybrid"] = sign * float(score(mixture(held.distance_m), every).mean())
-    return form, mixture, fit_intervals(mean, observed, size, held.distance_m, held.row), scores
+    return form, sizes, mixture, intervals, scores
 
 
 def _stated(mixture: Mixture, names: Sequence[str]) -> list[dict[str, float]]:

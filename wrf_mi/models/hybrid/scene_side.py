@@ -40,6 +40,8 @@ OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))
 """Parts of a correction beyond materials and gains."""
 STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)
 """Stages in their order."""
+FAST = tuple(stage for stage in STAGES if stage != FIELD)
+"""Stages without the one whose training takes most of the time."""
 
 
 @dataclass(frozen=True)

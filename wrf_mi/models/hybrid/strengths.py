@@ -6,22 +6,28 @@ paths, and Gaussians that change them, say nothing of the fading about it. So st
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Split
+from ...core.angles import FloatArray
 from ...correction.options import STRENGTHS
+from ...tasks import task_of
 from ...tracing.polarization import check_polarization
 from ...tracing.power_map import trace_map
 from ...tracing.solve import Prepared
+from ...training.reach import improves
 from .. import MODELS
+from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
-from .scene_side import SceneSide, StageReport, corrected, in_scene
+from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
@@ -56,9 +62,31 @@ class FittedStrengths(SceneSide):
 def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
     """Correct the scene, trace a map in it, and fit kriging about it."""
     inner, reports = corrected(problem, split, session)
+    if inner is not problem and not _gains(problem, inner, split, session):
+        # A trace that gains may have nothing to add to kriging, which knows the level around each row.
+        shutil.rmtree(session.folder / SCENE)
+        inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
     fitted = fit_in_scene(inner, split, session)
     fitted.stages = tuple(reports)
     return fitted
+
+
+def _gains(stated: Problem, inner: Problem, split: Split, session: Session) -> bool:
+    """Whether kriging about the power of the corrected scene predicts held-out rows clearly better."""
+    record = stated.record
+    if (fold := hold_out(record, split)) is None:
+        return False
+    held, scores = HeldOut.of(record, fold, stated.seed), list[FloatArray]()
+    for name, problem in (("stated", stated), ("corrected", inner)):
+        place = replace(session, folder=session.folder / name, run=session.folder / name)
+        means = held_out_predictions(IN_SCENE, problem, fold, held, place, f"{name} scene").mean
+        shutil.rmtree(place.folder)
+        each = task_of(record).mixtures(means[None], held.observed(record))
+        unit = held.receiver if split.held_receivers else held.row
+        _, number = np.unique(unit, return_inverse=True)
+        values = each(np.ones((len(held), 1)), np.arange(len(held)))
+        scores.append(np.bincount(number, values) / np.bincount(number))
+    return improves(scores[1], scores[0], True)
 
 
 def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedStrengths:
