@@ -40,7 +40,7 @@ SECONDS_TO_START = 120
 @pytest.fixture(scope="module")
 def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["train", str(folder), "--out", str(out), *SET]) == 0
+    assert main(["train", str(folder), "--model", "wrf-gs+", "--out", str(out), *SET]) == 0
     return out
 
 
@@ -108,7 +108,9 @@ def test_train_prints_a_table_and_progress_elsewhere(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out_folder = tmp_path / "run"
-    status, out, err = call(["train", folder, "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys)
+    status, out, err = call(
+        ["train", folder, "--model", "wrf-gs+", "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys
+    )
     assert status == 0
     head, own, blend, facts, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
@@ -127,7 +129,7 @@ def test_train_prints_a_table_and_progress_elsewhere(
 
 def test_train_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = ["--split", "random", "--n-train", "0.5", "--deterministic", "--json"]
-    status, out, _ = call(["train", folder, "--out", tmp_path / "run", *own, *SET], capsys)
+    status, out, _ = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *own, *SET], capsys)
     assert status == 0
     printed = json.loads(out)
     assert printed == json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -139,7 +141,9 @@ def test_train_with_one_row_logs_no_validation_score(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without validation rows the logged score is null, not NaN."""
-    status, _, err = call(["train", folder, "--out", tmp_path / "run", "--n-train", 1, *SET], capsys)
+    status, _, err = call(
+        ["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", "--n-train", 1, *SET], capsys
+    )
     assert status == 0
     assert "4/4" in err
     assert "nan" not in err
@@ -150,7 +154,7 @@ def test_train_with_one_row_logs_no_validation_score(
 def test_settings_override_the_preset(folder: Path, tmp_path: Path) -> None:
     """``--set`` takes precedence over ``--preset``."""
     chosen = ["--preset", "paper", *SET, "--set", "encoding.tx_octaves=3"]
-    assert main(["train", str(folder), "--out", str(tmp_path / "run"), *chosen]) == 0
+    assert main(["train", str(folder), "--model", "wrf-gs+", "--out", str(tmp_path / "run"), *chosen]) == 0
     text = (tmp_path / "run" / "config.yaml").read_text()
     assert "position_octaves: 10" in text
     assert "tx_octaves: 3" in text
@@ -214,7 +218,7 @@ def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The error is one line, without traceback."""
     own = [*SET, "--set", "optimiser.signal=1e38", "--set", "steps=20"]
-    status, out, err = call(["train", folder, "--out", tmp_path / "run", *own], capsys)
+    status, out, err = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *own], capsys)
     assert (status, out) == (1, "")
     assert re.fullmatch(r"wrf-mi: .*not finite.*\n", err.splitlines(keepends=True)[-1])
     assert "Traceback" not in err
@@ -224,7 +228,7 @@ def test_stopped_run_ends_with_status_130(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(Watch, "stop", lambda self: True)
-    status, out, err = call(["train", folder, "--out", tmp_path / "run", *SET], capsys)
+    status, out, err = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *SET], capsys)
     assert (status, out) == (130, "")
     assert err == f"wrf-mi: stopped after step 1 of 4; go on with: wrf-mi train --resume {tmp_path / 'run'}\n"
     refused(["evaluate", tmp_path / "run"], "model.npz: missing, the fit was stopped; finish it with train", capsys)
@@ -240,7 +244,7 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
     out = tmp_path / "run"
     own = [*SET, "--set", "steps=400", "--set", "log_every=1", "--set", "validate_every=400"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "wrf_mi.cli", "train", str(folder), "--out", str(out), *own],
+        [sys.executable, "-m", "wrf_mi.cli", "train", str(folder), "--model", "wrf-gs+", "--out", str(out), *own],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -20,7 +20,7 @@ from wrf_mi.runs.prediction_file import read_inputs
 @pytest.fixture(scope="module")
 def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["train", str(folder), "--out", str(out), *SET]) == 0
+    assert main(["train", str(folder), "--model", "wrf-gs+", "--out", str(out), *SET]) == 0
     return out
 
 
@@ -70,7 +70,7 @@ def test_bad_training_options_are_refused(
     for split in ([], ["--split", "blocked"]):
         if split and ("--split" in own or "--n-train" in own):
             continue
-        refused(["train", folder, "--out", tmp_path / "run", *SET, *split, *own], message, capsys)
+        refused(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *SET, *split, *own], message, capsys)
         assert not (tmp_path / "run").exists()  # nothing is half written
 
 
@@ -90,9 +90,12 @@ def test_bad_data_and_folders_are_refused(
             ["train", tmp_path / "empty", "--out", tmp_path / "out"],
             "empty: an empty folder; a data set is a folder with anchors.csv",
         ),
-        (["train", folder, "--out", folder], "exists and is not empty; choose another --out"),
-        (["train", folder, "--out", tmp_path / "file", *SET], "file: exists and is not empty"),
-        (["train", folder, "--out", tmp_path / "file" / "out", *SET], r"file.*; choose another place"),
+        (["train", folder, "--model", "wrf-gs+", "--out", folder], "exists and is not empty; choose another --out"),
+        (["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "file", *SET], "file: exists and is not empty"),
+        (
+            ["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "file" / "out", *SET],
+            r"file.*; choose another place",
+        ),
         (["train", "--resume", tmp_path / "empty"], "no config.yaml, so not a run folder"),
         (["train", "--resume", tmp_path / "none"], "no config.yaml, so not a run folder"),
         (["evaluate", tmp_path / "empty"], "no config.yaml, so not a run folder"),

@@ -105,7 +105,7 @@ def test_commands_need_a_minute_and_two_gibibytes(folder: Path, tmp_path: Path) 
     commands = [
         ("correct", room, spectra, "--out", tmp_path / "corrected"),
         ("trace", room, spectra, "--out", run),
-        ("train", spectra, "--scene", room, "--set", "steps=300", "--out", tmp_path / "trained"),
+        ("train", spectra, "--model", "wrf-gs+", "--scene", room, "--set", "steps=300", "--out", tmp_path / "trained"),
         ("predict", run, "--tx", tmp_path / "places.csv", "--out", tmp_path / "predicted.npz"),
         ("map", run, "--out", tmp_path / "map.nc"),
         ("view", run, "--out", tmp_path / "view.html"),

@@ -224,8 +224,8 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
     traced = wrf_mi.train(record, tmp_path / "traced", "ray-tracing", scene=scene, settings=["rays=1024"])
     law = wrf_mi.train(record, tmp_path / "law", "mri")
     mixture = Mixture(np.array([0.0, 1.0]), np.array([[1.0, 0.0], [0.2, 0.8]]))
-    fitted = {"ray-tracing": traced.fitted, "mri": law.fitted}
-    hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, {})
+    fitted = {"paths": traced.fitted, "kriging": law.fitted}
+    hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, None, {"sizes": "predicted"})
     positions = np.concatenate([record.tx_pos_m[:2], record.tx_pos_m[:2] + np.array([0.0, 0.0, 0.7])])
     found = hybrid.decompose(Inputs(positions), 0)
     np.testing.assert_array_equal(found.whole.mean, hybrid.predict(Inputs(positions), 0).mean)

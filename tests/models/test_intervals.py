@@ -15,7 +15,7 @@ import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out_folds
+from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out
 from wrf_mi.models.intervals import fit_intervals
 from wrf_mi.models.model import default_settings
 from wrf_mi.scene.correction_data import FILE, CorrectionData
@@ -27,38 +27,36 @@ COVERED = 0.02
 """Allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors."""
 
 
-def folds_of(record: Record) -> tuple[Split, list[Split]]:
-    split = make_splits(record, "official")[0]
-    return split, hold_out_folds(record, split)
+def fold_of(record: Record, n_train: int | None = None) -> tuple[Split, Split]:
+    split = make_splits(record, "official", n_train=n_train)[0]
+    fold = hold_out(record, split)
+    assert fold is not None
+    return split, fold
 
 
-def test_every_training_row_is_held_out_and_no_test_row_is_used(flat_folder: Path):
+@pytest.mark.parametrize("n_train", [None, 20, 6, 4, 3])
+def test_held_out_rows_are_a_part_of_the_training_rows(flat_folder: Path, n_train: int | None):
+    split, fold = fold_of(load(flat_folder), n_train)
+    assert not set(fold.test) & set(fold.all_train)
+    assert set(fold.test) | set(fold.all_train) == set(split.all_train)
+    assert len(fold.test) <= len(split.all_train) / 2
+    assert len(fold.test) >= min(2, len(split.all_train) - 2)
+
+
+def test_nothing_is_held_out_of_two_rows_or_one_position(flat_folder: Path):
     record = load(flat_folder)
-    split, folds = folds_of(record)
-    assert set(np.concatenate([fold.test for fold in folds])) == set(split.all_train)
-    for fold in folds:
-        assert not set(fold.test) & set(fold.all_train)
-        assert set(fold.test) | set(fold.all_train) == set(split.all_train)
-
-
-def test_few_rows_leave_out_a_region_or_rows_in_between_at_a_time(flat_folder: Path):
-    """Of 20 rows each is held out once with its region and once with rows in between; four fifths remain on average."""
-    record = load(flat_folder)
-    split = make_splits(record, "official", n_train=20)[0]
-    folds = hold_out_folds(record, split)
-    rows, counts = np.unique(np.concatenate([fold.test for fold in folds]), return_counts=True)
-    assert rows.tolist() == sorted(split.all_train)
-    assert set(counts) == {2}
-    assert np.mean([len(fold.all_train) for fold in folds]) == pytest.approx(16)
+    assert hold_out(record, make_splits(record, "official", n_train=2)[0]) is None
+    rows = np.arange(6)
+    still = replace(record, tx_pos_m=np.zeros_like(record.tx_pos_m))
+    assert hold_out(still, Split("still", 0, rows, rows[:0], rows[:0])) is None
 
 
 def test_distances_are_those_to_the_rows_that_remain(flat_folder: Path):
     record = load(flat_folder)
-    _, folds = folds_of(record)
-    held = HeldOut.of(record, folds, 0)
+    _, fold = fold_of(record)
+    held = HeldOut.of(record, fold, 0)
     for place in (0, len(held) // 2, len(held) - 1):
-        rows = folds[held.fold[place]].all_train
-        seen = rows[np.isfinite(record.observation[held.receiver[place], rows])]
+        seen = fold.all_train[np.isfinite(record.observation[held.receiver[place], fold.all_train])]
         apart = np.linalg.norm(record.tx_pos_m[seen] - record.tx_pos_m[held.row[place]], axis=1)
         assert held.distance_m[place] == pytest.approx(apart.min())
 
@@ -132,13 +130,13 @@ def test_crps_equals_its_integral():
 
 def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: Path, tmp_path: Path):
     record = load(flat_folder)
-    _, folds = folds_of(record)
-    held = HeldOut.of(record, folds, 0)
+    _, fold = fold_of(record)
+    held = HeldOut.of(record, fold, 0)
     entry, observed = MODELS["kriging"].serving("rssi", True), held.observed(record)
 
     def errors(scene: Path) -> np.ndarray:
         problem = Problem(record, default_settings(entry, (), {}), scene=str(scene))
-        found = held_out_predictions(entry, problem, folds, held, Session(tmp_path, tmp_path), "kriging")
+        found = held_out_predictions(entry, problem, fold, held, Session(tmp_path, tmp_path), "kriging")
         return found.mean - observed
 
     plain = errors(tmp_path)

@@ -127,7 +127,18 @@ def test_receivers_and_benchmarks_of_installed_packages_are_found(
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     trained, _ = in_subprocess(
         environment,
-        ["train", flat_folder, "--receiver", "attenuated", "--out", tmp_path / "run", "--json", *settings],
+        [
+            "train",
+            flat_folder,
+            "--model",
+            "wrf-gs+",
+            "--receiver",
+            "attenuated",
+            "--out",
+            tmp_path / "run",
+            "--json",
+            *settings,
+        ],
         ["bench", "attenuator", "--out", tmp_path / "results", "--runs", tmp_path / "runs"],
     )
     assert json.loads(trained)["task"] == "rssi"

@@ -15,7 +15,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.datasets import make_splits, write_ble_folder
 from wrf_mi.models import MODELS
-from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out_folds
+from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out
 from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
@@ -84,17 +84,18 @@ def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, t
     assert near["abs_error_db"]["median"] < run.metrics["abs_error_db"]["median"]
 
 
-def test_the_hybrid_chooses_on_receivers_held_out_in_turn(law: Record, tmp_path: Path) -> None:
+def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, tmp_path: Path) -> None:
     """Offsets of the receivers are unlike: a law with an offset of each is as good as one law at a new receiver."""
     run = train(law, tmp_path / "run", "hybrid", split="receiver:1")
-    assert set(run.metrics["held_out"]) == {"kriging", "mri", "hybrid"}
-    assert run.metrics["held_out"]["hybrid"] < 7
+    assert set(run.metrics["held_out"]) == {"kriging", "hybrid"}
+    assert run.metrics["held_out"]["hybrid"] < 10  # an offset of 9 dB
     assert run.metrics["inside_90"] == 1
     found = read_run(run.folder)
     again = open_run(run.folder, law).predict(law.tx_pos_m[found.row], "anchor1")
     np.testing.assert_allclose(again.mean, found.prediction[1], atol=ROUNDING_DB)
-    folds = hold_out_folds(law, make_splits(law, "receiver:1")[0])
-    assert sorted(fold.held_receivers for fold in folds) == [(1, 0), (1, 2), (1, 3)]
+    fold = hold_out(law, make_splits(law, "receiver:1")[0])
+    assert fold is not None
+    assert fold.held_receivers in ((1, 0), (1, 2), (1, 3))
 
 
 def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path) -> None:
@@ -104,23 +105,21 @@ def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path)
     assert few["receivers"]["anchor3"]["n_test"] == 20
     hybrid = train(law, tmp_path / "hybrid", "hybrid", split="receiver+5:3").metrics
     assert hybrid["abs_error_db"]["median"] < 1
-    assert {"kriging", "idw"} < set(hybrid["held_out"])  # idw serves a receiver with rows of its own
 
 
-def test_rows_left_to_new_receivers_are_held_out_in_turn(law: Record) -> None:
+def test_a_part_of_the_rows_left_to_new_receivers_is_held_out(law: Record) -> None:
     (split,) = make_splits(law, "receiver+12:3")
     record = law.seen(split)
-    folds = hold_out_folds(record, split)
-    held = HeldOut.of(record, folds, 0)
-    for number, fold in enumerate(folds):
-        (other,) = (one for one in fold.held_receivers if one != 3)
-        assert (fold.left[:, 0] == other).sum() == 12
-        of_fold = held.chosen(held.fold == number)
-        kept = {tuple(pair) for pair in fold.left.tolist()}
-        assert not kept & set(zip(of_fold.receiver.tolist(), of_fold.row.tolist(), strict=True))
-        assert set(of_fold.receiver.tolist()) == {3, other}
+    fold = hold_out(record, split)
+    assert fold is not None
+    held = HeldOut.of(record, fold, 0)
+    (other,) = (one for one in fold.held_receivers if one != 3)
+    assert (fold.left[:, 0] == other).sum() == 12
+    kept = {tuple(pair) for pair in fold.left.tolist()}
+    assert not kept & set(zip(held.receiver.tolist(), held.row.tolist(), strict=True))
+    assert set(held.receiver.tolist()) == {3, other}
     own = held.row[held.receiver == 3]
-    assert sorted(own) == sorted(split.left[:, 1])  # each of them once
+    assert set(own) < set(split.left[:, 1])  # the others train
 
 
 @pytest.mark.parametrize("name", ["kriging", "mri", "hybrid"])
@@ -145,19 +144,21 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
     record = replace(law, receivers=receivers, observation=observed)
     entry, split = MODELS["mri"], make_splits(record, "receiver:0")[0]
     problem = Problem(record, default_settings(entry, (), {})).seen(split)
-    folds = hold_out_folds(problem.record, split)
-    assert any(list(fold.held_receivers) != sorted(fold.held_receivers) for fold in folds)
-    held = HeldOut.of(problem.record, folds, 0)
+    fold = hold_out(problem.record, split)
+    assert fold is not None
+    assert len(fold.held_receivers) > 2
+    fold = replace(fold, held_receivers=tuple(reversed(fold.held_receivers)))
+    held = HeldOut.of(problem.record, fold, 0)
     with tempfile.TemporaryDirectory() as folder:
         session = Session(Path(folder), Path(folder))
-        found = held_out_predictions(entry, problem, folds, held, session, "mri").mean
+        found = held_out_predictions(entry, problem, fold, held, session, "mri").mean
     np.testing.assert_allclose(found, held.observed(record), atol=0.05)  # one law without noise; dB
 
 
 def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:
     run = train(law, tmp_path / "run", "mri", split="receiver", intervals=True)
-    # Held-out offsets of -3, 1, 2 and 9 dB: the intervals of three receivers know the fourth's but for 9 dB.
-    assert run.metrics["inside_90"] == pytest.approx(0.75, abs=0.15)
+    # Offsets of -3, 1, 2 and 9 dB: one receiver of three is held out, whose error says little of the fourth's.
+    assert run.metrics["inside_90"] >= 0.5
     two = Split("two", 0, np.arange(40), np.zeros(0, np.int64), np.arange(40, 60), (0, 1, 2))
     with pytest.raises(InputError, match="one receiver trains; intervals at others need two at least"):
         train(law, tmp_path / "two", "mri", split=two, intervals=True)

@@ -171,7 +171,7 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(
 
 def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, capsys: Any) -> None:
     settings = [part for one in ("steps=20", *SETTINGS[1:]) for part in ("--set", one)]
-    asked = ["train", data, "--receiver", "array", "--out", tmp_path / "run", *settings]
+    asked = ["train", data, "--model", "wrf-gs+", "--receiver", "array", "--out", tmp_path / "run", *settings]
     status, _, err = call(asked, capsys)
     assert status == 0, err
     with np.load(tmp_path / "run" / "predictions.npz") as stored:
@@ -193,7 +193,7 @@ def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path,
 def test_incompatible_options_are_refused_in_one_line(
     data: Path, tmp_path: Path, capsys: Any, arguments: list[str], message: str
 ) -> None:
-    status, _, err = call(["train", data, *arguments, "--out", tmp_path / "run"], capsys)
+    status, _, err = call(["train", data, "--model", "wrf-gs+", *arguments, "--out", tmp_path / "run"], capsys)
     assert (status, err.count("\n")) == (2, 1), err
     assert message in err
     assert not (tmp_path / "run").exists()

@@ -56,7 +56,12 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path, tmp_p
     """One trains without a stop, one stops here and is resumed by another process."""
     words = [word for setting in FIT for word in ("--set", setting)]
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    assert run_module("wrf_mi.cli", ["train", str(folder), "--deterministic", *words, "--out", str(whole)])[0] == 0
+    assert (
+        run_module(
+            "wrf_mi.cli", ["train", str(folder), "--model", "wrf-gs+", "--deterministic", *words, "--out", str(whole)]
+        )[0]
+        == 0
+    )
     with pytest.raises(Interrupted):
         train(folder, resumed, "wrf-gs+", settings=[*FIT, "deterministic=true"], stop=stop_after(17))
     assert run_module("wrf_mi.cli", ["train", "--resume", str(resumed)])[0] == 0

@@ -274,40 +274,48 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     known_positions(record, rows, "hybrid")
     fold = hold_out(record, split)
     held = None if fold is None else HeldOut.of(record, fold, problem.seed)
+    parts = parts_of(problem, split)
     fitted: dict[str, Fitted] = {}
     predictions: dict[str, Prediction] = {}
     reports: list[StageReport] = []
     residuals, begun = None, time.perf_counter()
     # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
     interpolates = RESIDUAL in problem.settings.wanted and not task_of(record).in_decibel and record.carriers_hz is None
-    for name, (entry, inner) in parts_of(problem, split).items():
-        place = replace(session, folder=session.folder / FOLDER / name, run=session.folder / FOLDER / name)
+
+    def fit_part(name: str) -> Fitted:
+        place = _inside(session, FOLDER, name)
         place.folder.mkdir(parents=True, exist_ok=True)
-        fitted[name], _ = fit_model(entry, inner, split, labelled(place, name))
-        one = fitted[name]
-        if isinstance(one, SceneSide):
+        return fit_model(*parts[name], split, labelled(place, name))[0]
+
+    for name, (entry, inner) in parts.items():
+        unseen = None
+        if name == PATHS:
+            # Its stages are chosen by the held-out rows, which it predicts on the way.
+            fitted[name] = one = fit_part(name)
+            assert isinstance(one, SceneSide)
             reports += one.stages
             entry, inner = SCENE_SIDES[task_of(record).in_decibel][1], one.problem  # the scene is corrected once
+            unseen = None if held is None else one.held_out_at(held.receiver, held.row)
         if fold is None or held is None:
             continue
-        unseen = one.held_out_at(held.receiver, held.row) if isinstance(one, SceneSide) else None
         if unseen is not None:
             predictions[name] = Prediction(as_unseen(unseen, inner, held))
         else:
-            predictions[name] = held_out_predictions(entry, inner, fold, held, _inside(place, "held"), name)
+            place = _inside(session, FOLDER, name, "held")
+            predictions[name] = held_out_predictions(entry, inner, fold, held, place, name)
         if name == PATHS and interpolates:
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
-    names = [*predictions] if predictions else [*fitted]
+    names = [*predictions] if predictions else [*parts]
     interpolating = time.perf_counter()
     form, sizes, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
     if not predictions:
-        mixture = constant(np.eye(len(fitted))[0])
+        mixture = constant(np.eye(len(parts))[0])
     used = [name for name, most in zip(names, mixture.weights.max(axis=0), strict=True) if most >= NEGLIGIBLE]
     if RESIDUAL in used and PATHS not in used:
         used.insert(0, PATHS)
     used = [*(name for name in used if name != RESIDUAL), *([RESIDUAL] if RESIDUAL in used else [])]
     kept = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
-    for name in set(fitted) - set(used):
+    for name in set(parts) - set(used):
         shutil.rmtree(session.folder / FOLDER / name, ignore_errors=True)
     if KRIGING in names and len(names) > 1:
         gained = task_of(record).in_decibel or KRIGING in used or RESIDUAL in used
@@ -319,12 +327,13 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
         "held_out": scores,
         "weights": _stated(kept, used),
     }
-    parts = {name: fitted[name] for name in used if name != RESIDUAL}
-    return FittedHybrid(problem, rows, parts, kept, residuals if RESIDUAL in used else None, intervals, facts)
+    whole = {name: fitted.get(name) or fit_part(name) for name in used if name != RESIDUAL}
+    return FittedHybrid(problem, rows, whole, kept, residuals if RESIDUAL in used else None, intervals, facts)
 
 
-def _inside(session: Session, name: str) -> Session:
-    return replace(session, folder=session.folder / name, run=session.folder / name)
+def _inside(session: Session, *names: str) -> Session:
+    place = session.folder.joinpath(*names)
+    return replace(session, folder=place, run=place)
 
 
 def _residuals(

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+from pydantic import Field
 
 from ...core import InputError, Split
 from ...core.settings import CheckedSettings
@@ -33,10 +36,12 @@ class HybridSettings(CheckedSettings):
         stages: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and
             residual; null: all that the data allow; without a scene the field, which takes minutes and which
             interpolation surpasses near measurements, is used where it is named.
+        steps: optimiser steps of the graph of paths and Gaussians; null: the default of `TrainConfig` for the task.
         deterministic: bit-identical results from run to run, on one thread of the CPU.
     """
 
     stages: str | None = None
+    steps: Annotated[int | None, Field(ge=1, description="1 or more")] = None
     deterministic: bool = False
 
     def __post_init__(self) -> None:

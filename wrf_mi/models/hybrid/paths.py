@@ -36,7 +36,9 @@ def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainC
         parts = ["gain", *(["materials"] if CALIBRATION in wanted else [])]
         config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.image)
         config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
-    own = [f"seed={problem.seed}", f"deterministic={str(problem.settings.deterministic).lower()}"]
+    settings = problem.settings
+    own = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]
+    own += [] if settings.steps is None else [f"steps={settings.steps}"]
     return with_settings(config, own).resolved(problem.record.tx_pos_m[split.all_train])
 
 

@@ -1,0 +1,155 @@
+"""The stages of a fit in a scene: what is kept, restored, resumed and refused, for every task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import contents, refused
+from traced_rooms import SHOEBOX, write_xml
+
+import wrf_mi
+from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core.antenna import UPRIGHT
+from wrf_mi.core.arrays import planar_array
+from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.models import Interrupted
+from wrf_mi.models.hybrid.scene_side import STAGES
+from wrf_mi.tasks import instrument_of
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+
+HZ = 920e6
+SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
+TRACE = TraceOptions(max_depth=2, rays=1 << 12)
+QUICK = ("steps=60",)
+FLOAT32_GREY = 1e-4
+"""Of greys that a batch of transmitters and a single one give: sums in single precision."""
+CLEAR_GREY = 0.05
+"""Gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows."""
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A room, and what is thought of it: walls of wood."""
+    folder = tmp_path_factory.mktemp("rooms")
+    thought = {name: ("itu_wood", mesh) for name, (_, mesh) in SHOEBOX.items()}
+    return {"true": write_xml(folder / "true", SHOEBOX), "thought": write_xml(folder / "thought", thought)}
+
+
+def measured(scenes: dict[str, Path], task: str, train: int = 30) -> tuple[Record, Split]:
+    """Observations traced by Sionna RT in the true room, and a split with test rows on one side."""
+    near, far = ([1.7, 2.6, 1.4], [2.1, 3.0, 1.5]) if task == "csi" else ([1.2, 2.0, 1.2], [4.5, 3.8, 1.9])
+    tx = np.random.default_rng(4).uniform(near, far, (60, 3))
+    tx = tx[np.argsort(tx[:, 0])]
+    array = planar_array(4, 4, 0.16) if task == "spectrum" else None
+    receiver = Receiver("rx0", np.array([5.2, 2.4, 1.1]), np.asarray(UPRIGHT), array_m=array)
+    empty = np.zeros((1, len(tx), *SHAPES[task]), np.complex64 if task == "csi" else np.float32)
+    hz = HZ + 1e6 * np.arange(6) if task == "csi" else np.array([HZ])
+    record = Record("room", task, tx, (receiver,), empty, frequencies_hz=hz)
+    paths = trace_paths(open_scene(scenes["true"], HZ), tx, (receiver,), TRACE).paths
+    record = replace(record, observation=instrument_of(record).observe(paths).astype(empty.dtype))
+    rows = np.random.default_rng(0).permutation(np.arange(12, 60))
+    return record, Split("side", 0, np.sort(rows[:train]), rows[:0], np.arange(12))
+
+
+@pytest.fixture(scope="module")
+def spectra(scenes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[wrf_mi.Run, Record]:
+    record, split = measured(scenes, "spectrum")
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return wrf_mi.train(record, folder, scene=scenes["thought"], split=split, settings=QUICK), record
+
+
+def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tuple[wrf_mi.Run, Record]) -> None:
+    reports = {one["stage"]: one for one in spectra[0].metrics["stages"]}
+    assert list(reports) == [stage for stage in STAGES if stage in reports]
+    assert reports["mean"]["kept"]
+    corrected = max(reports[stage]["held_out"] for stage in ("calibration", "correction"))
+    assert corrected > reports["mean"]["held_out"] + CLEAR_GREY
+    assert {"surfaces", "field", "residual"} <= set(reports)
+    for before, stage in (("surfaces", "field"),):
+        if reports[stage]["kept"]:
+            assert reports[stage]["held_out"] > reports[before]["held_out"]
+
+
+def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(
+    spectra: tuple[wrf_mi.Run, Record], scenes: dict[str, Path], tmp_path: Path
+) -> None:
+    run, record = spectra
+    split = measured(scenes, "spectrum")[1]
+    for model, scene in (("ray-tracing", scenes["thought"]), ("kriging", None)):
+        other = wrf_mi.train(record, tmp_path / model, model, scene=scene, split=split)
+        assert run.metrics["ssim"]["mean"] > other.metrics["ssim"]["mean"]
+
+
+def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Record]) -> None:
+    run, record = spectra
+    again = wrf_mi.open_run(run.folder, record)
+    position = record.tx_pos_m[:4]
+    whole = again.predict(position)
+    np.testing.assert_allclose(whole.mean, run.predict(position).mean, atol=FLOAT32_GREY)
+    single = [again.predict(one[None]).mean[0] for one in position]
+    np.testing.assert_allclose(whole.mean, np.stack(single), atol=FLOAT32_GREY)
+    assert whole.std is not None
+    assert (run.folder / "parts" / "paths" / "scene" / "correction.md").exists()
+
+
+def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path], tmp_path: Path) -> None:
+    """Stopped in the correction or after it, in training, and while it interpolates."""
+    record, split = measured(scenes, "spectrum", 16)
+    record = replace(record, official=(split.train, split.test))
+    data = str(write_spectrum_folder(tmp_path / "room", record))
+    how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
+    calls = 0
+
+    def counted() -> bool:
+        nonlocal calls
+        calls += 1
+        return False
+
+    whole = wrf_mi.train(data, tmp_path / "whole", **how, stop=counted)
+    position = record.tx_pos_m[:6]
+    for at in (1, calls // 2, calls - 2):
+        asked, out = iter(range(calls)), tmp_path / f"stopped{at}"
+        with pytest.raises(Interrupted):
+            wrf_mi.train(data, out, **how, stop=lambda asked=asked, at=at: next(asked) >= at)
+        resumed = wrf_mi.resume(out)
+        np.testing.assert_array_equal(resumed.predict(position).mean, whole.predict(position).mean)
+
+
+@pytest.mark.parametrize("task", ["rssi", "csi"])
+def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str, Path], tmp_path: Path) -> None:
+    record, split = measured(scenes, task)
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=("steps=200",))
+    names = [one["stage"] for one in run.metrics["stages"]]
+    assert names[0] == "mean"
+    assert names[-1] == "residual"
+    assert ("field" in names) == (task == "csi")  # powers of uncertain positions have none
+    again = wrf_mi.open_run(run.folder, record)
+    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
+
+
+def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path: Path) -> None:
+    record, split = measured(scenes, "spectrum", 5)
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split)
+    assert [one["stage"] for one in run.metrics["stages"]] == ["surfaces", "residual"]
+    assert run.metrics["inside_90"] > 0.5
+
+
+def test_stages_that_are_not_wanted_are_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:
+    record, split = measured(scenes, "spectrum", 16)
+    asked = ("stages=mean,calibration", "steps=20")
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=asked)
+    assert [one["stage"] for one in run.metrics["stages"]] == ["mean", "calibration"]
+    assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
+
+
+def test_unknown_stages_and_stages_of_other_models_are_refused(
+    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "run")]
+    refused(["train", flat_folder, "--stages", "mean,sixth", *out], "'sixth' is unknown", capsys)
+    refused(["train", flat_folder, "--fast", "--stages", "mean", *out], "one of --stages and --fast", capsys)
+    refused(["train", flat_folder, "--fast", "--model", "idw", *out], "belong to --model hybrid", capsys)
+    assert not contents(tmp_path)
