@@ -108,9 +108,7 @@ def test_train_prints_a_table_and_progress_elsewhere(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out_folder = tmp_path / "run"
-    status, out, err = call(
-        ["train", folder, "--model", "wrf-gs+", "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys
-    )
+    status, out, err = call(["train", folder, "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys)
     assert status == 0
     head, own, blend, facts, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]

@@ -317,8 +317,7 @@ def _parts(record: Record, split: Split) -> _Parts:
     groups = hold_out_groups(split, record.tx_pos_m)
     if groups is split:
         raise InputError(f"{record.name}: {len(split.train)} training rows are too few to hold some out; give more")
-    rows = np.setdiff1d(groups.validation, split.validation)
-    return _Parts(record, np.setdiff1d(split.all_train, rows), record, rows)
+    return _Parts(record, groups.train, record, groups.validation)
 
 
 def _at_most(split: Split, count: int) -> Split:

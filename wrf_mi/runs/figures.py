@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
 from ..gaussians.oracle import Projection
+from ..models.hybrid.scene_side import STAGES
 
 PANEL_IN = 2.3
 """Side of a polar plot in inches."""
@@ -214,6 +216,41 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
         axes.plot(seconds, score, marker=".", label=name)
     axes.set_xlabel("training time (s)")
     axes.set_ylabel(f"{label} on held-out validation rows")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def stage_steps(
+    stages: Mapping[str, Sequence[Mapping[str, Any]]], test: Mapping[str, float], label: str = "SSIM"
+) -> Figure:
+    """Mean score of held-out training rows by the stages up to each; hollow where a stage was not kept.
+
+    Args:
+        stages: entries ``stages`` of ``metrics.json`` of each run by its name.
+        test: mean score of the test rows of each run, which is drawn behind the last stage.
+        label: name of the score.
+    """
+    judged = {name: [one for one in reports if one["held_out"] is not None] for name, reports in stages.items()}
+    order = list(dict.fromkeys(one["stage"] for reports in judged.values() for one in reports))
+    order.sort(key=[*STAGES, *order].index)
+    figure = Figure(figsize=(1.2 * len(order) + 3.5, 4), layout="constrained")
+    axes = figure.subplots()
+    for name, reports in judged.items():
+        kept = [one for one in reports if one["kept"]]
+        places, scores = [order.index(one["stage"]) for one in kept], [one["held_out"] for one in kept]
+        (line,) = axes.plot([*places, len(order)], [*scores, test[name]], drawstyle="steps-post", label=name)
+        axes.scatter([*places, len(order)], [*scores, test[name]], color=line.get_color(), zorder=3)
+        others = [one for one in reports if not one["kept"]]
+        where, found = [order.index(one["stage"]) for one in others], [one["held_out"] for one in others]
+        axes.scatter(where, found, facecolors="none", edgecolors=line.get_color(), zorder=3)
+        for one in reports:
+            if one["seconds"] is not None:
+                at = order.index(one["stage"]), one["held_out"]
+                text = f"{one['seconds']:.0f} s"
+                axes.annotate(text, at, (4, 4), textcoords="offset points", fontsize=7, color=line.get_color())
+    axes.set_xticks(range(len(order) + 1), [*order, "test rows"])
+    axes.set_ylabel(f"mean {label}, held-out training rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -279,6 +279,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     predictions: dict[str, Prediction] = {}
     reports: list[StageReport] = []
     residuals, begun = None, time.perf_counter()
+    of_scene = 0.0
     # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
     interpolates = RESIDUAL in problem.settings.wanted and not task_of(record).in_decibel and record.carriers_hz is None
 
@@ -292,6 +293,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
         if name == PATHS:
             # Its stages are chosen by the held-out rows, which it predicts on the way.
             fitted[name] = one = fit_part(name)
+            of_scene = time.perf_counter() - begun
             assert isinstance(one, SceneSide)
             reports += one.stages
             entry, inner = SCENE_SIDES[task_of(record).in_decibel][1], one.problem  # the scene is corrected once
@@ -306,7 +308,6 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
         if name == PATHS and interpolates:
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
     names = [*predictions] if predictions else [*parts]
-    interpolating = time.perf_counter()
     form, sizes, mixture, intervals, scores = _weights(record, predictions, held, bool(split.held_receivers), session)
     if not predictions:
         mixture = constant(np.eye(len(parts))[0])
@@ -319,7 +320,8 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
         shutil.rmtree(session.folder / FOLDER / name, ignore_errors=True)
     if KRIGING in names and len(names) > 1:
         gained = task_of(record).in_decibel or KRIGING in used or RESIDUAL in used
-        reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), interpolating - begun))
+        seconds = time.perf_counter() - begun - of_scene
+        reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), seconds))
     facts = {
         "stages": stated_reports(reports),
         "form": form,
