@@ -45,7 +45,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
     add("--model", choices=list(MODELS), help="model to fit (default: wrf-gs+); baselines: docs/baselines.md")
-    text = "scene to trace: beside wrf-gs, wrf-gs+, factorised, r2f2, for physics and hybrid, or alone for ray-tracing"
+    text = "scene to trace: beside wrf-gs, wrf-gs+, factorised, r2f2, for hybrid, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     add("--receiver", metavar="NAME", help=text)
@@ -72,7 +72,7 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     add("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections among these (default: all)")
-    text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/physics.md; default: 0)"
+    text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/scenes.md; default: 0)"
     add("--phase-error", type=float, metavar="RAD", help=text)
     fit = "what to train on the training rows, separated by commas: gain, materials, planes, patterns, pose, surface"
     add("--calibrate", metavar="LIST", help=fit)
