@@ -34,7 +34,6 @@ CELL_SECONDS = 900
 THUMBNAIL_PIXELS = (480, 270)
 GALLERY_ORDER = (
     "first_field",
-    "physics_first",
     "learned_against_traced",
     "scene_corrected_by_radio",
     "without_measurements",
