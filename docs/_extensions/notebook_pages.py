@@ -36,6 +36,7 @@ GALLERY_ORDER = (
     "first_field",
     "learned_against_traced",
     "scene_corrected_by_radio",
+    "few_measurements",
     "without_measurements",
     "rssi_and_csi",
     "what_the_array_sees",
