@@ -84,10 +84,11 @@ def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, t
     assert near["abs_error_db"]["median"] < run.metrics["abs_error_db"]["median"]
 
 
-def test_the_hybrid_chooses_on_a_receiver_held_out(law: Record, tmp_path: Path) -> None:
+def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, tmp_path: Path) -> None:
+    """Offsets of the receivers are unlike: a law with an offset of each is as good as one law at a new receiver."""
     run = train(law, tmp_path / "run", "hybrid", split="receiver:1")
     assert set(run.metrics["held_out"]) == {"kriging", "hybrid"}
-    assert run.metrics["held_out"]["hybrid"] < 10  # at most the 9 dB between offsets of receivers
+    assert run.metrics["held_out"]["hybrid"] < 10  # an offset of 9 dB
     assert run.metrics["inside_90"] == 1
     found = read_run(run.folder)
     again = open_run(run.folder, law).predict(law.tx_pos_m[found.row], "anchor1")
@@ -106,19 +107,19 @@ def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path)
     assert hybrid["abs_error_db"]["median"] < 1
 
 
-def test_some_rows_left_to_new_receivers_are_held_out(law: Record) -> None:
+def test_a_part_of_the_rows_left_to_new_receivers_is_held_out(law: Record) -> None:
     (split,) = make_splits(law, "receiver+12:3")
     record = law.seen(split)
     fold = hold_out(record, split)
     assert fold is not None
-    held_out = HeldOut.of(record, fold, 0)
+    held = HeldOut.of(record, fold, 0)
     (other,) = (one for one in fold.held_receivers if one != 3)
     assert (fold.left[:, 0] == other).sum() == 12
-    left = {tuple(pair) for pair in fold.left.tolist()}
-    assert not left & set(zip(held_out.receiver.tolist(), held_out.row.tolist(), strict=True))
-    assert set(held_out.receiver.tolist()) == {3, other}
-    rows = np.concatenate([fold.left[fold.left[:, 0] == 3, 1], held_out.row[held_out.receiver == 3]])
-    assert sorted(rows) == sorted(split.left[:, 1])  # each of them trains or is held out
+    kept = {tuple(pair) for pair in fold.left.tolist()}
+    assert not kept & set(zip(held.receiver.tolist(), held.row.tolist(), strict=True))
+    assert set(held.receiver.tolist()) == {3, other}
+    own = held.row[held.receiver == 3]
+    assert set(own) < set(split.left[:, 1])  # the others train
 
 
 @pytest.mark.parametrize("name", ["kriging", "mri", "hybrid"])
@@ -135,7 +136,7 @@ def test_rows_that_are_not_left_change_no_fit(name: str, law: Record, tmp_path: 
 
 
 def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
-    """Receivers in any order: a prediction stands beside what its receiver observed."""
+    """Two receivers a fold, in an order of its own: a prediction stands beside what its receiver observed."""
     places = np.concatenate([[one.position_m for one in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])
     receivers = tuple(replace(law.receivers[0], name=f"anchor{k}", position_m=place) for k, place in enumerate(places))
     distance = np.linalg.norm(law.tx_pos_m - places[:, None], axis=2)
@@ -145,7 +146,8 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
     problem = Problem(record, default_settings(entry, (), {})).seen(split)
     fold = hold_out(problem.record, split)
     assert fold is not None
-    fold = replace(fold, held_receivers=tuple(sorted(fold.held_receivers, reverse=True)))
+    assert len(fold.held_receivers) > 2
+    fold = replace(fold, held_receivers=tuple(reversed(fold.held_receivers)))
     held = HeldOut.of(problem.record, fold, 0)
     with tempfile.TemporaryDirectory() as folder:
         session = Session(Path(folder), Path(folder))
@@ -155,8 +157,8 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
 
 def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:
     run = train(law, tmp_path / "run", "mri", split="receiver", intervals=True)
-    # Held-out offsets of -3, 1, 2 and 9 dB: the intervals of three receivers know the fourth's but for 9 dB.
-    assert run.metrics["inside_90"] == pytest.approx(0.75, abs=0.15)
+    # Offsets of -3, 1, 2 and 9 dB: one receiver of three is held out, whose error says little of the fourth's.
+    assert run.metrics["inside_90"] >= 0.5
     two = Split("two", 0, np.arange(40), np.zeros(0, np.int64), np.arange(40, 60), (0, 1, 2))
     with pytest.raises(InputError, match="one receiver trains; intervals at others need two at least"):
         train(law, tmp_path / "two", "mri", split=two, intervals=True)

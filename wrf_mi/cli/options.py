@@ -45,7 +45,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
     add("--model", choices=list(MODELS), help="model to fit (default: wrf-gs+); baselines: docs/baselines.md")
-    text = "scene to trace: beside wrf-gs, wrf-gs+, factorised, r2f2, for hybrid, or alone for ray-tracing"
+    text = "scene to trace: beside wrf-gs, wrf-gs+, factorised, r2f2, for physics and hybrid, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
     add("--receiver", metavar="NAME", help=text)
