@@ -1,4 +1,4 @@
-"""A bare room of concrete walls, with or without a metal ceiling, for the tests of the physics model."""
+"""A bare room of concrete walls, with or without a metal ceiling, for tests of traced paths."""
 
 from __future__ import annotations
 

@@ -109,18 +109,8 @@ _OWN: Mapping[str, Check] = {
     "operator": _here("prediction by operator", "operator:main"),
     "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
-    "ingredients": _here(
-        "hybrid and its ingredients",
-        "ingredients:main",
-        RFID,
-        FLAT,
-        CONFERENCE,
-        resumes=True,
-        table="ingredients:table",
-    ),
-    "intervals": _here(
-        "intervals of four models", "coverage:main", RFID, FLAT, CONFERENCE, resumes=True, table="coverage:table"
-    ),
+    "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
+    "intervals": _here("intervals of three models", "coverage:main", RFID, FLAT, resumes=True, table="coverage:table"),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "new-carriers": _here(
         "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"

@@ -1,7 +1,7 @@
-"""Shares of test values inside the 90 % intervals of four models, over data sets and both kinds of split.
+"""Shares of test values inside the 90 % intervals of three models, over data sets and both kinds of split.
 
 Standard deviations are those of errors on training rows that are held out in space: the hybrid has its own, other
-models are fitted to the folds as ``wrf-mi train --intervals`` does. Each run is stored when it is measured
+models are fitted once more, as ``wrf-mi train --intervals`` does. Each run is stored when it is measured
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
@@ -17,31 +17,26 @@ from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 
-from .bench import CONFERENCE, FLAT, RFID
+from .bench import FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part
-from .ingredients import HYBRID, INSIDE, LAB, RUNS, Cell, run_of_cell, run_of_ingredient, scene_of_cell
+from .stages import CHANNELS, HYBRID, INSIDE, JOINT, LAB, RUNS, Cell, data_of, run_alone, run_of_cell
 
 CELLS = tuple(
     Cell(dataset, split, n_train)
-    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CONFERENCE: None}.items()
+    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CHANNELS: None}.items()
     for split in ("official", "blocked")
 )
-MODELS = ("kriging", "physics", "joint", HYBRID)
-"""Ingredients of the hybrid, and the hybrid."""
-
-
-def models_of(cell: Cell, scene: str | None) -> list[str]:
-    """Models that serve a cell: physics and the joint field need a scene."""
-    return [name for name in MODELS if scene is not None or name not in ("physics", "joint")]
+MODELS = ("kriging", JOINT, HYBRID)
+"""Models; Gaussians are trained jointly with the paths of the scene where there is one."""
 
 
 def measured(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
     """Score, share inside the 90 % intervals, CRPS and time of training of a model, as they are stored."""
-    scene = scene_of_cell(cell, folder.parent)
+    data, scene = data_of(cell, folder)
     if name == HYBRID:
-        run = run_of_cell(cell, folder, HYBRID, HYBRID, scene=scene)
+        run = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
     else:
-        run = run_of_ingredient(cell, folder, name, scene, intervals=True)
+        run = run_alone(cell, data, folder, name, scene, intervals=True)
     block = TASKS[run.task].block
     return {"block": block, "score": run.metrics[block]} | {
         key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")
@@ -55,13 +50,13 @@ def main() -> dict[str, Any]:
         ``rows``; ``inside``: number of runs whose intervals cover 85 to 95 %, of ``runs``; and ``failed``, where some
         do not.
     """
-    for cell in CELLS:
-        data_folder(cell.dataset)
+    for name in (RFID, FLAT):
+        data_folder(name)
     place = RUNS / fit_key(source_files())
     place.mkdir(parents=True, exist_ok=True)
     rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
     for cell in CELLS:
-        for name in models_of(cell, scene_of_cell(cell, place)):
+        for name in MODELS:
             print(f"intervals: {cell.title}: {name}", file=sys.stderr, flush=True)
             part = stored_part("intervals", f"{cell.name}-{name}", partial(measured, cell, name, place / cell.name))
             parts.append(part)

@@ -24,7 +24,6 @@ SIZES = {
     "transmitters-field": (1, 256, 4096),
     "transmitters-tracer": (1, 16, 256),
     "triangles-clutter": (1000, 100_000),
-    "transmitters-physics": (16, 256),
 }
 """Axes of `wrf_mi_bench.scaling` and their sizes here."""
 

@@ -70,12 +70,12 @@ class Cell:
         return f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
 
 
-PHYSICS = partial(Cell, "physics, knows walls", "physics")
+HYBRID = partial(Cell, "hybrid, knows walls", "hybrid")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
 SEEDS = (0, 1, 2)
 CELLS = (
-    *(kind(ROWS, seed) for kind in (PHYSICS, KRIGING) for seed in SEEDS),
-    PHYSICS(None),
+    *(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS),
+    HYBRID(None),
 )
 
 

@@ -1,7 +1,7 @@
 """Spectra of random rooms, predicted from scans with several phase errors of reflections.
 
-A mesh from a scan knows the powers of paths better than their phases. The phase error of the hybrid's ingredient
-``ray-tracing`` was chosen from these rooms, whose seeds no other figure uses.
+A mesh from a scan knows the powers of paths better than their phases. No other
+figure uses the seeds of these rooms.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
 from .stock import StockRenderer, rgb_variant
-from .workloads import HEIGHT, WIDTH, field, integrator, physics, record, splatting, tracer
+from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"
 WORSE = 2.0
@@ -143,11 +143,6 @@ def _gains() -> tuple[Call, Call]:
     return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, next(new))
 
 
-def _physics() -> tuple[Call, Call]:
-    traced, tx_pos_m = tracer(OPTIONS), transmitter_path(1)
-    return physics(1), lambda: traced(tx_pos_m)
-
-
 def _paths_alone() -> tuple[Call, Call]:
     """Ours trains the paths of spectra by the graph, theirs by Adam on paths, receiver and loss as such: without
     Gaussians a step should cost at most 1.05 times as much.
@@ -210,7 +205,6 @@ PAIRS: list[Pair] = [
     ),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
-    Pair("physics", "a physics model's prediction over the ray tracer's, one transmitter", _physics),
 ]
 """All pairs, ours and the other call."""
 

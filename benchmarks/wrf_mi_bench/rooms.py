@@ -37,8 +37,7 @@ LIMITS_DB = 0.0, 40.0
 SCAN, CORRECTED = "trace, scan", "trace, corrected"
 MODELS: Mapping[str, tuple[str, str]] = {
     "kriging": ("kriging", ""),
-    "physics, scan": ("physics", "scan"),
-    "physics, corrected": ("physics", "corrected"),
+    "hybrid, scan": ("hybrid", "scan"),
 }
 """Model, and the scene that it is given or "", by the column of the table."""
 COLUMNS = (SCAN, CORRECTED, *MODELS)
@@ -125,10 +124,11 @@ def main() -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the accuracy in each room, its scan's errors and the duration of the correction."""
-    head = [*COLUMNS, "paths missing", "wrong", "phase error", "correction"]
+    columns = [column for column in COLUMNS if all(column in row["cea_db"] for row in rows)]
+    head = [*columns, "paths missing", "wrong", "phase error", "correction"]
     lines = [f"| room | {' | '.join(head)} |", "| --- |" + " ---: |" * len(head)]
     for row in rows:
-        cells = [f"{row['cea_db'][column]:.1f}" for column in COLUMNS]
+        cells = [f"{row['cea_db'][column]:.1f}" for column in columns]
         name = f"**median**; {row['what']}: {row['value']}"
         if "scan" in row:
             name = row["what"]

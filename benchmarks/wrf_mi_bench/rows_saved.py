@@ -24,7 +24,7 @@ from wrf_mi.tasks.task import Task
 
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line
-from .ingredients import LAB, Cell, scene_of_cell
+from .stages import LAB, Cell, scene_of_cell
 from .table_plan import SEEDS
 
 RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")

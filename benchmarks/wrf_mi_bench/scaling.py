@@ -29,7 +29,7 @@ from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line
-from .workloads import HEIGHT, WIDTH, field, integrator, parameters, physics, size_deg, splatting, tracer
+from .workloads import HEIGHT, WIDTH, field, integrator, parameters, size_deg, splatting, tracer
 
 logger = logging.getLogger(__name__)
 
@@ -154,7 +154,6 @@ AXES: list[Axis] = [
     Axis("antennas-paths", "paths", "antennas", ANTENNAS, _antennas_of_paths),
     Axis("antennas-spectrum", "Bartlett spectrum", "antennas", ANTENNAS, _bartlett),
     Axis("transmitters-field", "WRF-GS+ of 90 Gaussians", "transmitters", TRANSMITTERS, _field),
-    Axis("transmitters-physics", "physics", "transmitters", TRANSMITTERS, physics),
     Axis("transmitters-tracer", "ray tracer", "transmitters", TRANSMITTERS, _tracer),
     Axis("triangles-planes", "finding planes, divided walls", "triangles", TRIANGLES, partial(_planes, "walls")),
     Axis("triangles-walls", "one trace, divided walls", "triangles", TRIANGLES, partial(_trace, "walls")),

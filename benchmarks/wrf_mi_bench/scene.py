@@ -35,8 +35,7 @@ SCANNER_CLEAR_M = 0.4
 SCANNER_HEIGHTS_M = (1.2, 1.8)
 """Least distance of a scanner from surfaces, and range of its height above the floor."""
 POSES = 6
-SCANNED = "scene"
-"""Number of a scan's poses, and folder of the scene that `scanned_scene` makes."""
+"""Number of a scan's poses."""
 
 
 def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, seed: int = 1) -> dict[str, Any]:
@@ -118,12 +117,6 @@ def scanned_points(
     clear = _clearance(scene_surfaces(scene).triangles)(places) > SCANNER_CLEAR_M
     stands = spread(places[high & clear], poses)
     return simulate_scan(scene.mi_scene, stands, rays_per_pose=rays_per_pose, seed=seed), frequency_hz
-
-
-def scanned_scene(room: Path, work: Path, seed: int) -> Path:
-    """Scene of a NeWRF room made of a simulated scan from `POSES` poses, in the folder `SCANNED` of ``work``."""
-    scan = write_arrays(work / "scan.npz", {"points": scanned_points(room, POSES, seed=seed)[0]})
-    return make_scene(scan, work / SCANNED).folder
 
 
 def clear_of_walls(position_m: FloatArray, others_m: FloatArray, triangles: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.runs.fit_key import dataset_files, fit_key, source_files
 from wrf_mi.tasks import TASKS
 
-from .bench import CONFERENCE, FLAT, OFFICE, RFID, BenchFailed
+from .bench import FLAT, RFID, BenchFailed
 from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure
@@ -39,10 +39,8 @@ STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
 TABLE_ROWS = (
     *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
-    *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "physics", "wrf-gs", "nerf2")),
+    *(f"rssi-{FLAT}-official-{name}" for name in ("idw", "kriging", "trees", "mri", "wrf-gs", "nerf2")),
     *(f"csi-traced-csi-flat-official-{name}" for name in ("linear", "fire", "optml", "wrf-gs")),
-    *(f"csi-{CONFERENCE}-official-{name}" for name in ("kriging", "ray-tracing", "physics", "wrf-gs+")),
-    *(f"csi-{OFFICE}-official-{name}" for name in ("physics", "wrf-gs")),
 )
 """Rows of the tables with all training rows and seed 0, of at most five minutes each."""
 CONFIDENCE = 0.95

@@ -12,8 +12,6 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.physics.spectrum_waves import Grid
 from wrf_mi.tasks.losses import SSIM_WEIGHT, absolute_error, spectrum_loss
 
 from .stress_fields import SIZE, Rng
@@ -73,7 +71,6 @@ def losses(count: int) -> list[Row]:
         alone.row(f"loss: derivatives of the similarity alone, {cases}"),
         received.row(f"loss: absolute error of what was received, and derivatives, {cases}", GRADIENT),
         _differences(count),
-        _searches(max(count, 9)),
     ]
 
 
@@ -114,28 +111,3 @@ def _differences(count: int) -> Row:
     worst = Worst()
     worst.add(np.median(errors))
     return worst.row(f"loss: derivatives of the similarity against scikit-image's differences, {count} cases", EXACT)
-
-
-def _searches(count: int) -> Row:
-    """Derivative of the loss of the physics model's searches, in NumPy, against central differences."""
-    of = Grid.of(30, 60, planar_array(4, 4, 0.16), 920e6)
-    worst, cases = Worst(), 0
-    for size in (1e-12, 1.0, 1e12):
-        errors = []
-        for seed in range(count):
-            rng = np.random.default_rng(seed)
-            shapes = of.shapes(rng.uniform(size=(3, 30, 60)).astype(np.float32) * np.array([1, 1, 0])[:, None, None])
-            parts = size * rng.normal(size=(4, 3, 16))
-            h, way = parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
-            slope = 2 * (of.loss_and_slope(h, shapes)[1].conj() * way).sum(axis=1).real
-            up, down = (of.loss(h + s * way, shapes) for s in (1e-6, -1e-6))
-            difference = (up - down) / 2e-6
-            # The last of the three spectra is dark, so its loss is constant.
-            errors.append(np.abs(slope - difference) / np.maximum(np.abs(difference), 1.0))
-            cases += 3
-        worst.add(np.median(np.array(errors).max(axis=1)), f"signals of {size:g}")
-    dark, zero = of.loss_and_slope(np.zeros((1, 16), complex), of.shapes(np.ones((1, 30, 60), np.float32)))
-    worst.add(0.0 if np.isfinite(dark).all() and np.isfinite(zero).all() else np.nan, "no signal")
-    return worst.row(
-        f"loss: derivatives of that of the physics model's searches against differences, {cases} cases", EXACT
-    )

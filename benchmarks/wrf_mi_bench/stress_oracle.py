@@ -24,12 +24,14 @@ from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PowerR
 from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
 from wrf_mi.tracing.traced_field import TX_PATTERN, TracedField
-from wrf_mi.tracing.walls import Walls, walls_of
+from wrf_mi.tracing.walls import moved_planes, plane_centres
 
 from .stress_rows import relative
 
 ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
+Planes = tuple[FloatArray, FloatArray]
+"""Unit normals [q, 3] and offsets [q] of planes."""
 ACROSS = 1e-6
 """Sine of the angle to a wall's normal below which the polarisation basis is arbitrary."""
 
@@ -60,7 +62,7 @@ class TracedOracle:
     """Paths of a traced field as a function of its parameters."""
 
     def __init__(self, traced: TracedField) -> None:
-        self._traced, self._walls = traced, walls_of(traced.surfaces)
+        self._traced = traced
         chains = traced.chains
         self._source = np.stack([c.numpy() for c in chains.source_m], axis=-1)
         self._heading = np.stack([c.numpy() for c in chains.heading], axis=-1)
@@ -72,7 +74,7 @@ class TracedOracle:
 
     def __call__(self, values: Values) -> OraclePaths:
         """Paths with parameters ``values``; missing parameters keep their stated values."""
-        traced, walls = self._traced, self._moved(values)
+        traced, planes = self._traced, self._moved(values)
         receiver = traced.receiver
         turn = values.get(f"receiver.{receiver.name}.turn", np.zeros(3))
         to_world = receiver.to_world @ Rotation.from_quat([*(0.5 * turn), 1.0]).as_matrix()
@@ -80,9 +82,9 @@ class TracedOracle:
 
         images, mirrored = [self._source], [np.broadcast_to(position, self._source.shape)]
         for plane, _, reflects, _ in self._levels:
-            images.append(_mirror(walls, plane, reflects, images[-1]))
+            images.append(_mirror(planes, plane, reflects, images[-1]))
         for plane, _, reflects, _ in reversed(self._levels):
-            mirrored.insert(0, _mirror(walls, plane, reflects, mirrored[0]))
+            mirrored.insert(0, _mirror(planes, plane, reflects, mirrored[0]))
         length = np.linalg.norm(mirrored[-1] - images[-1], axis=-1)
         ways = [(end - start) / length[:, None] for start, end in zip(images, mirrored, strict=True)]
 
@@ -92,7 +94,7 @@ class TracedOracle:
         departure = np.einsum("ijp,pj->pi", turned, ways[0])
         sent = np.einsum("ijp,pi->pj", turned, traced.options.tx_antenna.field(departure)).astype(complex)
         for level, before, after in zip(self._levels, ways, ways[1:], strict=False):
-            sent = self._interact(walls, level, before, after, sent, values)
+            sent = self._interact(planes, level, before, after, sent, values)
         antenna = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
         taken = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
         loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
@@ -105,10 +107,12 @@ class TracedOracle:
                 gain = gain * pattern(values[name], direction)
         return OraclePaths(gain, length, arrival, len(length) // len(traced))
 
-    def _moved(self, values: Values) -> Walls:
-        count = len(self._walls)
+    def _moved(self, values: Values) -> Planes:
+        surfaces = self._traced.surfaces
+        count = len(surfaces.normal)
         shift, tilt = values.get("plane.shift", np.zeros(count)), values.get("plane.tilt", np.zeros((count, 2)))
-        return self._walls.moved(np.column_stack([shift, tilt]))
+        centre_m, _ = plane_centres(surfaces)
+        return moved_planes(surfaces.normal, surfaces.axes, centre_m, np.column_stack([shift, tilt]))
 
     def _constant(self, quantity: str, stated: FloatArray, least: float, values: Values) -> FloatArray:
         slabs = self._traced.slabs
@@ -121,11 +125,11 @@ class TracedOracle:
         )
 
     def _interact(
-        self, walls: Walls, level: Any, before: FloatArray, after: FloatArray, sent: ComplexArray, values: Values
+        self, planes: Planes, level: Any, before: FloatArray, after: FloatArray, sent: ComplexArray, values: Values
     ) -> ComplexArray:
         plane, material, reflects, transmits = level
         slabs, met = self._traced.slabs, reflects | transmits
-        normal = walls.normal[plane]
+        normal = planes[0][plane]
         permittivity = self._constant("permittivity", slabs.permittivity, 1.0, values)[material]
         conductivity = self._constant("conductivity", slabs.conductivity, 0.0, values)[material]
         hz = self._traced.frequency_hz
@@ -190,10 +194,11 @@ def report_error(model: Any, found: FloatArray, truth: FloatArray, waves: FloatA
     return float((np.abs(found - truth).reshape(len(waves), -1) / waves[:, None]).max())
 
 
-def _mirror(walls: Walls, plane: NDArray[Any], reflects: NDArray[np.bool_], points: FloatArray) -> FloatArray:
+def _mirror(planes: Planes, plane: NDArray[Any], reflects: NDArray[np.bool_], points: FloatArray) -> FloatArray:
     """Points [p, 3] mirrored in planes [p] where they reflect."""
-    height = (points * walls.normal[plane]).sum(axis=-1) - walls.offset_m[plane]
-    return points - 2 * np.where(reflects, height, 0)[:, None] * walls.normal[plane]
+    normal, offset = planes[0][plane], planes[1][plane]
+    height = (points * normal).sum(axis=-1) - offset
+    return points - 2 * np.where(reflects, height, 0)[:, None] * normal
 
 
 def slab(

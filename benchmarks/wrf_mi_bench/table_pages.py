@@ -59,7 +59,6 @@ OVERVIEWS = {
     "carriers": "spectra at carriers that are held out",
     "receivers": "signal strengths at receivers that are held out",
     "uplink": "downlink channels from the uplink",
-    "positions": "channels from positions",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
 IN_README = ("spectrum", "rssi", "uplink")

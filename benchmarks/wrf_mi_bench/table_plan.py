@@ -75,7 +75,6 @@ FURNISHED = {
     "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
     "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
     "hybrid": Entry("hybrid, knows the scan", _model("hybrid", "--scene", NAMED)),
-    "physics": Entry("physics, knows the scan", _model("physics", "--scene", NAMED), (), SEEDS),
     "ray-tracing": Entry(
         "ray tracing in the scan", _model("ray-tracing", "--scene", NAMED, *THROUGH_WALLS), published="0.38, p90 0.61"
     ),
@@ -98,7 +97,6 @@ RSSI: Mapping[str, Entry] = {
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
     "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
     "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED)),
-    "physics": Entry("physics, knows walls and heading", _model("physics", "--scene", NAMED), (), SEEDS),
     "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
     "ray-tracing": Entry(
         "ray tracing, calibrated, knows walls and heading",
@@ -115,20 +113,6 @@ RSSI: Mapping[str, Entry] = {
     "kriging": Entry("kriging, knows the heading", _model("kriging")),
     "idw": Entry("IDW", _model("idw")),
     "mri": Entry("MRI", _model("mri"), published="8.3"),
-}
-POSITION: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS),
-    "wrf-gs+-joint": Entry("WRF-GS+ with the scanned room's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
-    "hybrid": Entry("hybrid, in the scanned room", _model("hybrid", "--scene", NAMED)),
-    "physics": Entry("physics, in the scanned room", _model("physics", "--scene", NAMED), (), SEEDS),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, SEEDS, ONE),
-    "ray-tracing": Entry("ray tracing, in the scanned room", _model("ray-tracing", "--scene", NAMED), few_seeds=ONE),
-    "ray-tracing-corrected": Entry(
-        "ray tracing, in the scanned room, corrected", _model("ray-tracing", "--scene", CORRECTED)
-    ),
-    "kriging": Entry("kriging", _model("kriging")),
-    "idw": Entry("IDW", _model("idw")),
 }
 UPLINK: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="23.91, p10 20.85, p90 25.52"),
@@ -157,16 +141,15 @@ KNOWN_POSITIONS = {name: entry for name, entry in NEW_CARRIERS.items() if not na
 NEW_RECEIVERS: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
     "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),
-    "physics": Entry("physics, knows walls", _model("physics", "--scene", NAMED)),
     "kriging": Entry("kriging, pooled over receivers", _model("kriging")),
     "ray-tracing": Entry(
         "ray tracing, mean offset of the receivers", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
     ),
     "mri": Entry("one path-loss law (MRI)", _model("mri")),
 }
-CHEAP = ("physics", "ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
+CHEAP = ("ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
-FEW = ("wrf-gs+", "physics", "nerf2", "linear", "kriging", "idw", "ray-tracing")
+FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")
 """Methods measured with fewer rows too."""
 
 
@@ -198,22 +181,12 @@ class Part:
 PARTS = (
     Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
     Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
-    Part(
-        "spectrum",
-        "spectrum",
-        "traced-room",
-        "official",
-        FURNISHED,
-        scene="lidar",
-        once=("wrf-gs+", "wrf-gs", "physics"),
-    ),
+    Part("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="lidar", once=("wrf-gs+", "wrf-gs")),
     Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
     Part("spectrum", "carriers", "traced-room-bands", "frequency", NEW_CARRIERS, scene="lidar"),
     Part("spectrum", "carriers", "traced-room-bands", "frequency-known", KNOWN_POSITIONS, scene="lidar"),
     Part("rssi", "receivers", "traced-floor-receivers", "receiver", NEW_RECEIVERS, scene="lidar"),
     Part("rssi", "receivers", "flat-ble", "receiver", NEW_RECEIVERS, scene="flat"),
-    Part("csi", "positions", "newrf-conference", "official", POSITION, True, "scan", once=("nerf2",)),
-    Part("csi", "positions", "newrf-office", "official", POSITION, scene="scan"),
     Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
     Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
 )

@@ -38,7 +38,6 @@ from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
-from .scene import SCANNED, scanned_scene
 from .sources import modules_of_command, source_digests
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
@@ -51,8 +50,6 @@ FLAT_HEIGHT_M = 2.7
 """Height of the ceiling of the flat, which its layout lacks."""
 FAR_M, PLATE_M = 100.0, 0.01
 """Distance and size of the only surface of the open scene; Sionna RT needs one."""
-SCAN_SEED = 1
-"""Seed of the noise of simulated scans."""
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 
@@ -64,20 +61,14 @@ def scene_of(part: Part, folder: Path) -> list[str]:
         return ["--scene", str(meshed_scan(part.dataset, folder))]
     if part.scene == "floor":
         load_record(part.dataset)  # made where needed
-    place = data_folder(part.dataset)
-    if part.scene == "floor":
-        return ["--scene", str(place / MEASURED)]
+        return ["--scene", str(data_folder(part.dataset) / MEASURED)]
     if part.scene == "flat":
-        layout = place / "layout.csv"
+        layout = data_folder(part.dataset) / "layout.csv"
         made = folder / f"flat-{fit_key(layout, FLAT_HEIGHT_M)}"
         if not made.exists():
             make_scene(layout, made, height_m=FLAT_HEIGHT_M)  # whole, or not at all
         return ["--scene", str(made)]
-    # Models use a mesh made from a scan, as the data were computed with the room's own mesh.
-    paths = place / f"{part.dataset.removeprefix('newrf-')}.npz"
-    place = folder / f"{part.dataset}-{fit_key(place, SCAN_SEED)}"
-    scanned = _once(place, lambda made: scanned_scene(paths, made, SCAN_SEED))
-    return ["--scene", str(scanned / SCANNED)]
+    raise ValueError(f"{part.scene}: no scene of a part")
 
 
 def meshed_scan(dataset: str, folder: Path) -> Path:

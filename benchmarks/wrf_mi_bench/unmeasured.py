@@ -1,8 +1,9 @@
 """Carriers and receivers without measurements: the hybrid beside ray tracing and interpolation, three seeds.
 
-Scenes are made from scans or plans and corrected by the training rows of each fold. Scores of the same rows are
-compared in pairs, as means over seeds and pooled over folds; intervals are 95 % bootstrap intervals over rows. Each
-fold of each seed is stored when it is measured (`wrf_mi_bench.comparison.stored_part`).
+Scenes are made from scans or plans; the training rows of each fold correct them, within the hybrid's fit, and for ray
+tracing by `correct_scene`. Scores of the same rows are compared in pairs, as means over seeds and pooled over folds;
+intervals are 95 % bootstrap intervals over rows. Each fold of each seed is stored when it is measured
+(`wrf_mi_bench.comparison.stored_part`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from wrf_mi.models.hybrid.ingredients import TRANSMISSION
 
 from wrf_mi.core import Record, Split
 from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
@@ -31,6 +31,7 @@ from wrf_mi.tasks import TASKS
 
 from .bench import FLAT
 from .comparison import MEASURED, data_folder, line, measured_on, stored_part
+from .stages import TRANSMISSION
 from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
 
@@ -45,9 +46,6 @@ SCORE_DIGITS = 4
 PAIRS = "pairs"
 FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 """What is known of a measurement beside the scores of the methods."""
-AT_CARRIERS = "kriging,idw,ray-tracing"
-AT_RECEIVERS = "physics,mri,ray-tracing"
-"""Ingredients of the hybrid at a new carrier, and at a receiver without any row."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +111,7 @@ def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
     (rows,) = make_splits(record, split, seed, held.n_train)
     better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
     given: dict[str, Any] = {"n_train": held.n_train}
-    ingredients = {"settings": (f"ingredients={AT_CARRIERS}",)}
-    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=better, **ingredients, **given)
+    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **given)
     traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **given)
     again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **given)
     kriging = _run(folder, held.dataset, split, seed, "kriging", **given)
@@ -140,8 +137,7 @@ def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> d
     better = corrected(held, scene, record, none, folder.parent / name)
     split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
     (rows,) = make_splits(record, split, seed, held.n_train)
-    ingredients = () if left else (f"ingredients={AT_RECEIVERS}",)
-    hybrid = _run(folder, record, rows, seed, "hybrid", scene=better, settings=ingredients)
+    hybrid = _run(folder, record, rows, seed, "hybrid", scene=scene)
     found: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
         alone, these = only(record, rows)

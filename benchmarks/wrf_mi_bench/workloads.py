@@ -15,11 +15,10 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.models.physics.spectrum import fit_spectrum
 from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.runs.timing import Call
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
-from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.step import device_pose
 
@@ -81,12 +80,3 @@ def record(rows: int, **more: Any) -> Record:
     observation = np.random.default_rng(0).random((1, rows, HEIGHT, WIDTH)).astype(np.float32)
     given = {"receivers": (RECEIVER,)} | more
     return Record("random", "spectrum", transmitter_path(rows), observation=observation, **given)
-
-
-def physics(transmitters: int) -> Call:
-    """Prediction by a physics model without training rows, which evaluates traced paths in NumPy."""
-    receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
-    known = record(1, receivers=receivers, frequencies_hz=np.array([FREQUENCY_HZ]))
-    model = fit_spectrum(known, np.zeros(0, np.int64), open_scene("laboratory", FREQUENCY_HZ))
-    tx_pos_m = transmitter_path(transmitters)
-    return lambda: model.predict(tx_pos_m, 0).mean

@@ -34,9 +34,9 @@ CELL_SECONDS = 900
 THUMBNAIL_PIXELS = (480, 270)
 GALLERY_ORDER = (
     "first_field",
-    "physics_first",
     "learned_against_traced",
     "scene_corrected_by_radio",
+    "few_measurements",
     "without_measurements",
     "rssi_and_csi",
     "what_the_array_sees",

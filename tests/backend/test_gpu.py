@@ -75,12 +75,12 @@ def test_a_run_predicts_alike(model: str, folder: Path, tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize(
     ("model", "given"),
-    [("ray-tracing", ["--calibrate", "gain,materials"]), ("physics", []), ("wrf-gs+", ["--set", "steps=200"])],
+    [("ray-tracing", ["--calibrate", "gain,materials"]), ("hybrid", []), ("wrf-gs+", ["--set", "steps=200"])],
 )
 def test_models_of_a_scene_score_alike(
     model: str, given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Traced, physics and joint."""
+    """Traced, in stages and joint."""
     words = ["train", "laboratory", "--scene", "laboratory", "--n-train", "24", "--seed", "1", "--model", model, *given]
     assert run_module("wrf_mi.cli", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")
     on_cpu([*words, "--out", str(tmp_path / "cpu")], monkeypatch)

@@ -54,16 +54,18 @@ ON_PAGE = {
     "stress": "numerics.md",
     "elsewhere": "numerics.md",
     "rooms": "correction.md",
-    "ingredients": "hybrid.md",
+    "stages": "hybrid.md",
     "intervals": "hybrid.md",
     "new-carriers": "hybrid.md",
     "new-receivers": "hybrid.md",
     "locate": "locate.md",
-    "phase-error": "physics.md",
+    "phase-error": "scenes.md",
     "sentinels": "results.md",
     "robustness": "robustness.md",
 }
 """Pages that show a check's table; all others are in `docs/results.md`."""
+OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
+"""Blocks of pages that are made from several results."""
 
 
 def result(case: str, median: float) -> dict[str, object]:
@@ -154,6 +156,13 @@ def test_documents_show_the_stored_results() -> None:
             assert f"<!-- {name} -->\n{own_table(one)}\n<!-- /{name} -->" in page
     for name, text in (("figures", table(trained)), ("checks", check_table(others))):
         assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
+
+
+def test_documents_show_no_check_without_a_stored_result() -> None:
+    measured = {one["case"] for one in read_results(RESULTS)[1]}
+    for page in (CHECKOUT / "docs").glob("*.md"):
+        blocks = set(re.findall(r"^<!-- ([\w-]+) -->$", page.read_text(), re.MULTILINE))
+        assert blocks <= {*measured, *OTHER_BLOCKS}, page.name
 
 
 def test_documents_show_the_fronts_of_the_stored_tables() -> None:

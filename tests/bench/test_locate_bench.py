@@ -28,12 +28,12 @@ def test_draws_are_pooled_and_judged_together() -> None:
     found = {cell: measured(1.0 + cell.seed, shares[cell.seed]) for cell in CELLS}
     made = summary(found)
     rows = {row["what"]: row for row in made["rows"]}
-    pooled = rows["64 rows, physics, knows walls, 3 draws"]
+    pooled = rows["64 rows, hybrid, knows walls, 3 draws"]
     assert pooled["mean_m"] == pytest.approx(2.0)
     assert pooled["gain_m"] == pytest.approx([0.5] * 3)
     assert pooled["inside"][0] == pytest.approx(0.9)
-    assert "all rows, physics, knows walls, seed 0" in rows
-    assert made["coverage_outside"] == ["all rows, physics, knows walls, seed 0"]  # 80 %; of 64 rows 90 % in the mean
+    assert "all rows, hybrid, knows walls, seed 0" in rows
+    assert made["coverage_outside"] == ["all rows, hybrid, knows walls, seed 0"]  # 80 %; of 64 rows 90 % in the mean
     assert made["not_clearly_better"] == []
     assert "failed" in made
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from wrf_mi_bench import rows_saved
-from wrf_mi_bench.ingredients import LAB, Cell
 from wrf_mi_bench.rows_saved import CURVES, IDW, JOINT, ROWS, measure, picture, rows_needed, saved
+from wrf_mi_bench.stages import LAB, Cell
 
 
 @pytest.mark.parametrize(

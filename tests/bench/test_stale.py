@@ -28,8 +28,8 @@ def test_digest_ignores_comments_and_docstrings() -> None:
 
 
 def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_names() -> None:
-    files = needed_files(*modules_of("ingredients"))
-    assert {"wrf_mi_bench/ingredients.py", "wrf_mi/core/files.py", "wrf_mi/models/hybrid/model.py"} <= files.keys()
+    files = needed_files(*modules_of("stages"))
+    assert {"wrf_mi_bench/stages.py", "wrf_mi/core/files.py", "wrf_mi/models/hybrid/model.py"} <= files.keys()
     assert "wrf_mi/gaussians/blend.py" in needed_files(*modules_of("elsewhere"))  # of its child process
     assert "wrf_mi_bench/bench.py" not in files  # a new benchmark makes no other one stale
     rows = [
@@ -41,18 +41,19 @@ def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_n
 def test_results_of_changed_source_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scan, plan = (provenance(*modules_of(name)) for name in ("large-scan", "flat-plan"))
     scan[SOURCE] |= {"wrf_mi/scene": "changed"}
-    results = {"flat-plan": plan, "large-scan": scan, "rooms": {"date": DATE}, "ingredients/part": {"measured": scan}}
-    (tmp_path / "ingredients").mkdir()
+    results = {"flat-plan": plan, "large-scan": scan, "rooms": {"date": DATE}, "stages/part": {"measured": scan}}
+    (tmp_path / "stages").mkdir()
     for name, content in results.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
     assert main(["bench", "--stale", "--out", str(tmp_path)]) == 0
     *lines, summary = capsys.readouterr().out.splitlines()
-    part, date = tmp_path / "ingredients" / "part.json", scan["date"]
-    assert lines[0].startswith(f"ingredients/part: {date}; rm {part}; wrf-mi bench ingredients; changed: wrf_mi")
-    assert lines[1:] == [
+    part, date = tmp_path / "stages" / "part.json", scan["date"]
+    assert lines[:2] == [
         f"large-scan: {date}; wrf-mi bench large-scan; changed: wrf_mi/scene",
         f"rooms: {DATE}; wrf-mi bench rooms; changed: {UNKNOWN}",
     ]
+    assert lines[2].startswith(f"stages/part: {date}; rm {part}; wrf-mi bench stages; changed: wrf_mi")
+    assert len(lines) == 3
     assert summary == "2 of 4 results are older than their source, 1 unknown"
     assert main(["bench", "demo", "--stale", "--out", str(tmp_path)]) == 2
 

@@ -166,7 +166,7 @@ def test_quick_stress_command_prints_rows_and_fails_beyond_a_bound(
     monkeypatch.setattr(bench_stress, "PARTS", parts)
     assert cli(["bench", "stress", "--quick"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 + 1 + 7 + 1
+    assert len(lines) == 2 + 1 + 6 + 1
     assert lines[2].startswith("| numbers under stress: image, ordinary, 2 cases | **worst ")
     monkeypatch.setattr(stress_fields, "IMAGE", 1e-12)
     assert cli(["bench", "stress", "--quick"]) == 1

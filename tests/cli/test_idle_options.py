@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 from calling import call, refused
-from wrf_mi.models.hybrid.ingredients import INGREDIENTS, problems
 
-from wrf_mi.models.model import Problem
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.scene.make import make_scene
@@ -98,15 +96,6 @@ def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: 
     assert caplog.text == ""
     plan_run(flat_folder, "wrf-gs+", settings=["traced.depth=5", "traced.rays=64"])
     assert "traced.depth, traced.rays: no effect without a scene" in caplog.text
-
-
-def test_hybrid_of_strengths_traces_without_a_phase_error(flat_folder: Path, room: Path) -> None:
-    assert INGREDIENTS["ray-tracing"].of_spectra
-    problem = Problem(flat_folder, None, scene=str(room))
-    entry, found = problems(problem, ["ray-tracing"])["ray-tracing"]
-    assert found.settings.phase_error == 0
-    assert found.settings.transmission
-    entry.check(found, [])
 
 
 def test_other_commands_refuse_or_name_options_without_effect(

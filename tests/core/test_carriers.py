@@ -76,7 +76,7 @@ def test_models_of_several_carriers_are_named(flat: Record) -> None:
     with pytest.raises(
         InputError, match=r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
     ):
-        plan_run(flat, "physics")
+        plan_run(flat, "nerf2")
 
 
 def test_inconsistent_carriers_are_refused(flat: Record) -> None:

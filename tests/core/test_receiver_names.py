@@ -50,15 +50,10 @@ def test_example() -> None:
 
 def public_functions() -> dict[str, Callable[..., Any]]:
     """Functions of the library that take a receiver from a user."""
-    from wrf_mi.models.physics.csi import CsiPhysics
-    from wrf_mi.models.physics.selection import PhysicsModel
-    from wrf_mi.models.physics.spectrum import SpectrumPhysics
     from wrf_mi.runs.api import Run
     from wrf_mi.training.predictor import Predictor
 
-    models = (CsiPhysics, SpectrumPhysics, PhysicsModel, Run)
-    found = {model.__name__: model.predict for model in models}
-    return {**found, "Predictor": Predictor.__call__}
+    return {"Run": Run.predict, "Predictor": Predictor.__call__}
 
 
 def test_functions_say_that_they_take_names() -> None:

@@ -48,14 +48,11 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
-@pytest.mark.parametrize("model", ["ray-tracing", "physics", "kriging", "mri"])
+@pytest.mark.parametrize("model", ["ray-tracing", "kriging", "mri"])
 def test_a_gateway_without_training_rows_is_left_out(
     model: str, silent: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings, scene = (
-        (DIRECT if model == "ray-tracing" else ()),
-        (room if model in ("ray-tracing", "physics") else None),
-    )
+    settings, scene = (DIRECT, room) if model == "ray-tracing" else ((), None)
     left_out, alone = (
         train(data, tmp_path / name, model, scene=scene, settings=settings)
         for name, data in (("run", silent), ("alone", load(silent).at_receivers([0])))

@@ -29,11 +29,10 @@ SETTINGS = {
     "fire": (*STEPS, "width=8"),
     "optml": (*STEPS, "max_paths=2"),
     "r2f2": ("max_paths=2",),
-    "hybrid": ("ingredients=kriging,idw",),
     "ray-tracing": ("rays=1000", "max_depth=1"),
 }
 """Settings of short fits; the others have none that matter."""
-TASK = {"ray-tracing": "rssi", "hybrid": "rssi", "physics": "rssi", "nerf2": "rssi", "wrf-gs+": "spectrum"}
+TASK = {"ray-tracing": "rssi", "hybrid": "rssi", "nerf2": "rssi", "wrf-gs+": "spectrum"}
 """Task where a model serves several; the first one else."""
 WRONG = np.array([np.nan, np.inf, -np.inf])
 

@@ -151,7 +151,7 @@ def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any
         ),
         (folder, {"model": "factorised", "evaluation": "splatted", "split": "blocked:1"}),
         (flat_folder, {"model": "kriging", "intervals": True, "n_train": 20}),
-        (flat_folder, {"model": "physics", "scene": flat_folder / "room", "antennas": antennas}),
+        (flat_folder, {"model": "hybrid", "scene": flat_folder / "room", "antennas": antennas}),
         (
             flat_folder,
             {"model": "ray-tracing", "scene": flat_folder / "room", "settings": ["max_depth=1", "rays=4096"]},

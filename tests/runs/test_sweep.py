@@ -34,14 +34,14 @@ VARY = ["--vary", "seed=0,1", "--vary", "loss.ssim_weight=0.1,0.2"]
 
 
 def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) -> None:
-    options = {"dataset": "rfid-lab", "model": "physics"}
+    options = {"dataset": "rfid-lab", "model": "mri"}
     plan = plan_sweep(
         tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["holdout_steps_fraction=0"], ["--flag"]
     )
     assert plan.varied == ["split", "steps"]
     names = ["split=official,steps=1", "split=official,steps=2", "split=blocked-2,steps=1", "split=blocked-2,steps=2"]
     assert [run.folder for run in plan.runs] == [tmp_path / name for name in names]
-    command = "train rfid-lab --model physics --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
+    command = "train rfid-lab --model mri --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
     assert " ".join(plan.runs[2].arguments) == command
     assert not any(tmp_path.iterdir())
 
@@ -55,7 +55,7 @@ def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) ->
         (["seed=1,2,1"], "a value is given twice"),
         (["seed=1", "seed=2"], "seed is given already"),
         (["steps=1"], "steps is given already"),
-        (["model=physics"], "model is given already"),
+        (["model=mri"], "model is given already"),
         (["scene=a/b,a b"], "two runs would be named scene=a-b"),
         (["intervals=true,maybe"], "intervals is on or off; give true, false"),
         (["deterministic=true,false"], "deterministic is given already"),

@@ -125,7 +125,7 @@ def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_
 
 def test_unsupported_tasks_are_refused_in_one_line(installed: tuple[dict[str, str], Path], tmp_path: Path) -> None:
     environment, data = installed
-    served = {"trees": "rssi", "physics": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
+    served = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
     done = commands(environment, *(["train", data, "--model", model, "--out", tmp_path / model] for model in served))
     for (model, tasks), (status, _, err) in zip(served.items(), done, strict=True):
         assert (status, err.count("\n")) == (2, 1), err

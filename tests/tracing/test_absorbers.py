@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from correction_rooms import TRUE_MATERIALS, channels, stated_scene
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, write_xml
 from wrf_mi_scenes.mitsuba_xml import ABSORBER
@@ -17,11 +16,9 @@ from wrf_mi.core import Paths
 from wrf_mi.correction.correct import correct_scene, default_options
 from wrf_mi.correction.page import write_page
 from wrf_mi.datasets.splits import make_splits
-from wrf_mi.models.physics.spectrum_rays import Room
 from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.materials import read_materials
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.slab import slab
 
 BRICK = '<bsdf type="diffuse" id="mat-itu_brick"/>'
 SOAK = '<bsdf type="absorber-radio-material" id="mat-soak"><rgb name="color" value="0.1 0.2 0.3"/></bsdf>'
@@ -87,12 +84,3 @@ def test_correction_leaves_absorbers_alone(tmp_path: Path) -> None:
     write_page(correction, tmp_path / "page")
     assert read_materials(tmp_path / "page").surfaces["wall_02"] == ABSORBER
     assert open_scene(tmp_path / "page", FREQUENCY_HZ).objects["wall_02"].radio_material.name == ABSORBER
-
-
-def test_slab_in_an_absorbers_place_reflects_and_transmits_almost_nothing(tmp_path: Path) -> None:
-    """The physics model of spectra has slabs alone."""
-    room = Room.of(open_scene(absorbing(write_xml(tmp_path, SHOEBOX)), FREQUENCY_HZ))
-    constants = (np.array([value]) for value in room.slabs[:, room.names.index("west")])
-    amplitudes = vars(slab(np.sin(np.radians([6.0])), *constants, FREQUENCY_HZ))
-    assert all(abs(value[0]) < 0.03 for value in amplitudes.values())
-    assert amplitudes["transmitted_te"][0] == pytest.approx(0, abs=1e-9)

@@ -172,7 +172,7 @@ def test_run_predicts_with_its_antennas(scene: Any, xml: Path, turned_folder: Pa
     [
         (["--model", "wrf-gs+", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
         (["--model", "kriging", "--tx-pattern", "dipole"], "antenna options belong to a scene that is traced"),
-        (["--model", "physics", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
+        (["--model", "hybrid", "--rx-polarization", "H"], "antenna options belong to a scene that is traced"),
     ],
 )
 def test_antenna_options_are_refused_where_nothing_is_traced(
@@ -189,18 +189,6 @@ def test_directional_pattern_needs_a_frame(xml: Path, turned_folder: Path, tmp_p
     with pytest.raises(InputError, match="state frame array"):
         train(turned_folder, tmp_path / "run", "ray-tracing", scene=xml, settings=OPTIONS, antennas=antennas)
     assert not (tmp_path / "run").exists()
-
-
-def test_physics_has_the_stated_antennas_and_warns_of_crossed_ones(
-    xml: Path, turned_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: Any
-) -> None:
-    """Physics alone: its spectra are those of the ray tracer with the same antennas."""
-    for name, stated in (("vertical", []), ("crossed", ["--rx-frame", "array"])):
-        asked = ["train", turned_folder, "--model", "physics", "--scene", xml, "--n-train", "0", *stated]
-        status, _, err = call([*asked, "--set", "reflections=1", "--out", tmp_path / name], capsys)
-        assert status == 0, err
-        assert (WARNING in caplog.text) is (name == "crossed")
-    assert median(tmp_path / "vertical") > median(tmp_path / "crossed") + 0.1
 
 
 def test_joint_training_warns_of_crossed_polarisation(

@@ -75,7 +75,7 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     add("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections among these (default: all)")
-    text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/physics.md; default: 0)"
+    text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/scenes.md; default: 0)"
     add("--phase-error", type=float, metavar="RAD", help=text)
     fit = "what to train on the training rows, separated by commas: gain, materials, planes, patterns, pose, surface"
     add("--calibrate", metavar="LIST", help=fit)

@@ -127,10 +127,6 @@ class MountedAntenna:
     antenna: Antenna
     to_world: FloatArray
 
-    def field(self, directions: ArrayLike) -> FloatArray:
-        """Real field vectors [..., 3] in directions [..., 3] (unit vectors), both in the world's frame."""
-        return self.antenna.field(np.asarray(directions, float) @ self.to_world) @ self.to_world.T
-
 
 ANTENNA = Antenna()
 """The default: isotropic, polarised along the vertical of the world."""

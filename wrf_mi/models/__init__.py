@@ -16,7 +16,6 @@ _OWN: Mapping[str, Model | str] = {
     "wrf-gs": "wrf_mi.models.gaussian.model:WRF_GS",
     "wrf-gs+": "wrf_mi.models.gaussian.model:WRF_GS_PLUS",
     "factorised": "wrf_mi.models.gaussian.model:FACTORISED",
-    "physics": "wrf_mi.models.physics.model:MODEL",
     "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
     "hybrid": "wrf_mi.models.hybrid.model:MODEL",
     "idw": "wrf_mi.models.interpolation.idw:MODEL",

@@ -20,9 +20,8 @@ WORDS = {
     "wrf-gs": "3D Gaussians with complex attenuation, signals by networks",
     "wrf-gs+": "3D Gaussians with static attributes and a deformation network",
     "factorised": "static 3D Gaussians, signals are mixtures of a few functions of the transmitter",
-    "physics": "planes and materials fitted to the measurements, kriging of the rest",
     "ray-tracing": "Sionna RT in the scene",
-    "hybrid": "several models mixed by the distance to the training rows",
+    "hybrid": "one fit in stages: paths of a scene, its correction, Gaussians, interpolation of the rest",
     "idw": "inverse-distance weighting",
     "kriging": "kriging (Gaussian process)",
     "trees": "extremely randomised trees",
@@ -60,7 +59,7 @@ def stored_versions(folder: Path) -> dict[str, str]:
 def model_words(config: RunConfig) -> str:
     """The model in words, with its scene."""
     words = WORDS.get(config.model, config.entry.source)
-    if config.scene is not None and config.model not in ("ray-tracing", "physics", "hybrid"):
+    if config.scene is not None and config.model not in ("ray-tracing", "hybrid"):
         words += ", trained jointly with the paths of the scene"
     return words
 

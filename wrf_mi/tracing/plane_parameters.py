@@ -5,7 +5,7 @@ A plane n . x = d with unit vectors a, b in it and the centroid c of its faces b
     n' = (n + t_a a + t_b b) / abs(n + t_a a + t_b b),   d' = n' . c + s
 
 with the shift s in metres and the tilts t_a, t_b in rad: small tilts are rotations about b and -a through c.
-`wrf_mi.tracing.walls.Walls.moved` is the NumPy version.
+`wrf_mi.tracing.walls.moved_planes` is the NumPy version.
 
 The chains of surfaces are searched for on the mesh as stated and kept when planes move, as a moved mesh has gaps at its
 corners through which rays leave. Paths follow their planes continuously. Not modelled are paths that appear or vanish

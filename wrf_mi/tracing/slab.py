@@ -39,7 +39,7 @@ def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, fr
     arguments.
 
     Args:
-        cosine: cosine of the angle of incidence theta, NumPy's or Dr.Jit's array of any float type, [p].
+        cosine: cosine of the angle of incidence theta, a Dr.Jit array of either float type, [p].
         permittivity: relative permittivity eps_r, [p].
         conductivity: sigma, S/m, [p].
         thickness_m: d, metres, [p].
@@ -47,17 +47,13 @@ def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, fr
 
     Source: ITU-R P.2040-3, equations 37, 43 and 44.
     """
-    functions: Any = np
-    j: Any = 1j
-    if not isinstance(cosine, np.ndarray):
-        functions = dr
-        kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)
-        j = kind(0, 1)
+    kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)
+    j = kind(0, 1)
     eta = permittivity - j * (conductivity / (2 * np.pi * frequency_hz * epsilon_0))
-    root = functions.sqrt(eta - (1 - cosine * cosine))
+    root = dr.sqrt(eta - (1 - cosine * cosine))
     te = (cosine - root) / (cosine + root)
     tm = (eta * cosine - root) / (eta * cosine + root)
-    once = functions.exp(-j * (2 * np.pi * frequency_hz / speed_of_light) * thickness_m * root)
+    once = dr.exp(-j * (2 * np.pi * frequency_hz / speed_of_light) * thickness_m * root)
     twice = once * once
     through_te, through_tm = (1 / (1 - r * r * twice) for r in (te, tm))
     return SlabCoefficients(

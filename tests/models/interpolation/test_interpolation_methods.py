@@ -32,7 +32,7 @@ ROUNDING = 1e-4
 
 
 def test_entries_of_the_registry_are_consistent() -> None:
-    assert {"wrf-gs", "wrf-gs+", "factorised", "physics", "ray-tracing", "idw", "kriging"} <= set(MODELS)
+    assert {"wrf-gs", "wrf-gs+", "factorised", "hybrid", "ray-tracing", "idw", "kriging"} <= set(MODELS)
     for name, model in MODELS.items():
         assert model.name == name
         assert set(model.tasks or ()) <= set(TASKS)

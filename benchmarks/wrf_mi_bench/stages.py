@@ -1,0 +1,277 @@
+"""The hybrid beside its parts alone, over data sets, splits and numbers of rows.
+
+Each cell is a run of the hybrid and one of each part on the same rows. Scores are compared row by row; a part is
+*clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
+is measured (`wrf_mi_bench.comparison.stored_part`).
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wrf_mi.core import Record
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.runs.api import resume, train
+from wrf_mi.runs.fit_key import fit_key, source_files
+from wrf_mi.runs.folder import CONFIG, is_finished
+from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.timing import bootstrap
+from wrf_mi.synthetic.furnished_room import NAME as ROOM
+from wrf_mi.synthetic.random_room import random_room_record
+from wrf_mi.tasks import TASKS
+
+from .bench import FLAT, RFID
+from .comparison import data_folder, measured_on, stored_part
+from .table_plan import PARTS
+from .tables import meshed_scan, scene_of
+
+RUNS = Path("runs/bench/stages")
+LAB, CHANNELS = "laboratory", "random-room"
+CHANNELS_SEED = 12
+"""Seed of the room of `CHANNELS`: none of `wrf_mi_bench.rooms`."""
+ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
+    (RFID, "official"): (5, 15, 48, None),
+    (RFID, "blocked"): (None,),
+    (LAB, "official"): (5, 15, 48, None),
+    (LAB, "blocked"): (None,),
+    (FLAT, "official"): (5, 15, 64, 400),
+    (FLAT, "blocked"): (400,),
+    (CHANNELS, "official"): (15, 100, None),
+}
+"""Numbers of training rows by data set and split; None: all."""
+LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
+"""Largest loss against a part that is allowed, in the unit of the score."""
+WORSE_SHARE = 0.02
+"""Largest share of comparisons in which the hybrid may be clearly worse."""
+INSIDE = (0.85, 0.95)
+"""Limits of the share of test values inside the 90 % intervals."""
+HYBRID, JOINT, CALIBRATED = "hybrid", "wrf-gs+", "ray-tracing, calibrated"
+TRANSMISSION = ("transmission=true",)
+"""Waves pass the slabs of a scene, furniture among them."""
+
+
+@dataclass(frozen=True)
+class Alone:
+    """A part of the hybrid by itself: model, whether it needs the scene, and settings."""
+
+    model: str
+    scene: bool = False
+    settings: tuple[str, ...] = ()
+
+
+IN_A_FLAT = (*TRANSMISSION, "calibration=gain,patterns", "max_depth=6", "max_reflections=2")
+ALONE: Mapping[str, Alone] = {
+    "kriging": Alone("kriging"),
+    "idw": Alone("idw"),
+    "ray-tracing": Alone("ray-tracing", True, TRANSMISSION),
+    JOINT: Alone("wrf-gs+", True),
+    CALIBRATED: Alone("ray-tracing", True, IN_A_FLAT),
+}
+"""Parts by name. Strengths have calibrated ray tracing in place of Gaussians, as the hybrid has none of strengths."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Data set, split and number of training rows; None: all."""
+
+    dataset: str
+    split: str
+    n_train: int | None
+
+    @property
+    def name(self) -> str:
+        """Name for files and progress."""
+        return f"{self.dataset}-{self.split}-{'all' if self.n_train is None else self.n_train}"
+
+    @property
+    def title(self) -> str:
+        """Label in the table."""
+        return f"{self.dataset}, {self.split}, {'all' if self.n_train is None else self.n_train} rows"
+
+
+CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
+
+
+def scene_of_cell(cell: Cell, folder: Path) -> str | None:
+    """Scene of a cell's data set, made where needed; None: none is known."""
+    if cell.dataset in (LAB, ROOM):
+        return str(meshed_scan(cell.dataset, folder))
+    part = next(part for part in PARTS if part.dataset == cell.dataset)
+    return None if part.scene == "open" else scene_of(part, folder)[1]
+
+
+def data_of(cell: Cell, folder: Path) -> tuple[str | Record, str | None]:
+    """Data of a cell and their scene; both of a random room are made in ``folder``, the same ones each time."""
+    if cell.dataset != CHANNELS:
+        return cell.dataset, scene_of_cell(cell, folder.parent)
+    record, _, measured = random_room_record(CHANNELS_SEED, folder / CHANNELS)
+    return record, str(measured)
+
+
+def differences(hybrid: Results, part: Results) -> FloatArray:
+    """Scores of the hybrid minus those of a part at the same receivers and rows, the higher the better."""
+    task = TASKS[hybrid.task]
+    pair = [np.clip(run.score[:, np.argsort(run.row)], *task.limits) for run in (hybrid, part)]
+    gain = (1 if task.higher_is_better else -1) * (pair[0] - pair[1])
+    return np.asarray(gain[np.isfinite(gain)], float)
+
+
+def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, Any]]:
+    """Scores, intervals and mean differences of the hybrid and its parts; ``stages`` of the hybrid."""
+    block = TASKS[hybrid.task].block
+    figures = []
+    for name, run in {HYBRID: hybrid, **others}.items():
+        one = {"model": name, "score": run.metrics[block], "block": block}
+        keys = ("train_seconds", "inside_90", "crps", "ms_per_sample")
+        one |= {key: run.metrics.get(key) for key in keys}
+        if name == HYBRID:
+            one["stages"] = run.metrics["stages"]
+        else:
+            gain = bootstrap(differences(hybrid, run), np.mean)
+            one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
+        figures.append(one)
+    return figures
+
+
+def run_of_cell(cell: Cell, data: str | Record, place: Path, model: str, **more: Any) -> Results:
+    """Run of a model in a folder on the rows of a cell, seed 0: finished, continued or new."""
+    if not (place / CONFIG).exists():
+        shutil.rmtree(place, ignore_errors=True)  # stopped before its configuration was written
+        train(data, place, model, split=cell.split, n_train=cell.n_train, seed=0, **more)
+    elif not is_finished(place):
+        resume(place, record=data if isinstance(data, Record) else None)
+    return read_run(place)
+
+
+def run_alone(
+    cell: Cell, data: str | Record, folder: Path, name: str, scene: str | None, intervals: bool = False
+) -> Results:
+    """Run of a part by itself, as `run_of_cell`, with intervals of its own or without."""
+    part = ALONE[name]
+    place = folder / (f"{name}-intervals" if intervals else name).replace(", ", "-")
+    more: dict[str, Any] = {"scene": scene if part.scene else None, "settings": part.settings}
+    return run_of_cell(cell, data, place, part.model, intervals=intervals, **more)
+
+
+def parts_of(task: str, scene: str | None) -> list[str]:
+    """Parts that serve a task, with or without a scene."""
+    unused = JOINT if TASKS[task].in_decibel else CALIBRATED
+    return [name for name, part in ALONE.items() if name != unused and (scene is not None or not part.scene)]
+
+
+def measured(cell: Cell, folder: Path) -> dict[str, Any]:
+    """``models``: a cell as it is stored, from runs in ``folder``, of which finished ones are used again."""
+    data, scene = data_of(cell, folder)
+    hybrid = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
+    others = {name: run_alone(cell, data, folder, name, scene) for name in parts_of(hybrid.task, scene)}
+    return {"models": compared(hybrid, others)}
+
+
+def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of the table: the hybrid, then each part with the hybrid's gain over it."""
+    rows = []
+    for one in figures:
+        score, inside = one["score"], one["inside_90"]
+        value = f"median {score['median']:.4g}, mean {score['mean']:.4g}"
+        value += "" if inside is None else f", {inside:.0%} inside, CRPS {one['crps']:.3g}"
+        asked = "85 to 95 % inside"
+        if "gain" in one:
+            limit = LIMITS[one["block"]]
+            interval = f"{one['gain_low']:.3g} to {one['gain_high']:.3g}"
+            asked = f"hybrid better by {one['gain']:.3g} ({interval}), at most {limit} worse"
+        rows.append({"what": f"{cell.title}: {one['model']}", "value": value, "asked": asked, **one, "cell": cell.name})
+    return rows
+
+
+def main() -> dict[str, Any]:
+    """Measure all cells that are not stored; `InputError` where data are not on this machine.
+
+    Returns:
+        ``rows``; ``worse``: number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside``:
+        number of runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; and ``failed``, where a limit is
+        exceeded.
+    """
+    for name in (RFID, FLAT):
+        data_folder(name)
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    for count, cell in enumerate(CELLS, 1):
+        print(f"stages: {count} of {len(CELLS)}: {cell.title}", file=sys.stderr, flush=True)
+        parts.append(stored_part("stages", cell.name, partial(measured, cell, place / cell.name)))
+        lines = rows_of(cell, parts[-1]["models"])
+        rows += lines
+        for row in lines:
+            print(f"stages: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
+    return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
+
+
+def stages_text(stages: Sequence[Mapping[str, Any]]) -> str:
+    """Stages of a hybrid with the scores of held-out training rows by the stages up to each; those not kept struck."""
+    texts = []
+    for stage in stages:
+        score = "" if stage["held_out"] is None else f" {stage['held_out']:.3g}"
+        texts.append(f"{stage['stage']}{score}" if stage["kept"] else f"~~{stage['stage']}{score}~~")
+    return ", ".join(texts)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table, a line for each cell: the hybrid, its stages, its best part by mean score, kriging and IDW."""
+    head = (
+        "data",
+        "hybrid",
+        "inside",
+        "CRPS",
+        "stages, held-out score",
+        "best part alone",
+        "gain over it",
+        "kriging",
+        "IDW",
+        "clearly worse than",
+    )
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        hybrid, *others = (row for row in rows if row["cell"] == cell)
+        medians = {row["model"]: f"{row['score']['median']:.3g}" for row in others}
+        best = min(others, key=lambda row: row["gain"])
+        worse = [row["model"] for row in others if row["gain_high"] < 0]
+        inside, crps = hybrid["inside_90"], hybrid["crps"]
+        cells = (
+            hybrid["what"].rpartition(":")[0],
+            f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
+            "" if inside is None else f"{inside:.0%}",
+            "" if crps is None else f"{crps:.3g}",
+            stages_text(hybrid["stages"]),
+            f"{best['model']} {medians[best['model']]} ({best['score']['mean']:.3g})",
+            f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
+            *(medians.get(name, "") for name in ("kriging", "idw")),
+            ", ".join(worse),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    pairs = [row for row in rows if "gain" in row]
+    worse = [row for row in pairs if row["gain_high"] < 0]
+    beyond = [row for row in pairs if row["gain"] < -LIMITS[row["block"]]]
+    hybrids = [row for row in rows if "gain" not in row and row["inside_90"] is not None]
+    inside = [row for row in hybrids if INSIDE[0] <= row["inside_90"] <= INSIDE[1]]
+    counts: dict[str, Any] = {
+        "comparisons": len(pairs),
+        "worse": len(worse),
+        "cells": len(hybrids),
+        "inside": len(inside),
+    }
+    if len(worse) > WORSE_SHARE * len(pairs) or beyond:
+        text = f"clearly worse than a part alone in {len(worse)} of {len(pairs)} comparisons"
+        counts["failed"] = f"{text}, by more than the limit in {len(beyond)}"
+    return counts
