@@ -49,7 +49,7 @@ def test_training_rows_are_refused_before_anything_is_written(
     row = int(getattr(official(two_gateways), part)[0])
     name = two_gateways.receivers[1].name
     with pytest.raises(InputError) as error:
-        train(changed(two_gateways, ((1, row, 4, 5), value)), tmp_path / "run", "wrf-gs+")
+        train(changed(two_gateways, ((1, row, 4, 5), value)), tmp_path / "run")
     message = f"made-here, receiver {name}, row {row}: 1 of 800 values are not finite; correct or remove the row"
     assert str(error.value) == message
     assert not (tmp_path / "run").exists()
@@ -77,7 +77,7 @@ def test_test_rows_that_are_not_finite_are_counted_and_not_scored(
 ) -> None:
     a, b, c = (int(row) for row in official(two_gateways).test[:3])
     broken = changed(two_gateways, ((0, a, 4, 5), np.nan), ((1, b), np.inf), ((1, c), np.nan))
-    whole, found = train(two_gateways, tmp_path / "whole", "wrf-gs+"), train(broken, tmp_path / "broken", "wrf-gs+")
+    whole, found = train(two_gateways, tmp_path / "whole"), train(broken, tmp_path / "broken")
     metrics = json.loads((found / "metrics.json").read_text())
     assert metrics["n_not_scored"] == 2
     assert json.loads((whole / "metrics.json").read_text())["n_not_scored"] == 0

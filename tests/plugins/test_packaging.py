@@ -108,7 +108,7 @@ receiver = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 spectra = rng.random((1, 6, 8, 16)).astype(np.float32)
 record = Record("noise", "spectrum", rng.normal(size=(6, 3)), (receiver,), spectra)
 split = Split("own", 0, np.arange(3), np.arange(3, 4), np.arange(4, 6))
-run = train(record, "run", settings=["steps=2", "initial.gaussians=5"], split=split)
+run = train(record, "run", "wrf-gs+", settings=["steps=2", "initial.gaussians=5"], split=split)
 assert run.metrics["steps"] == 2 and run.metrics["n_test"] == 2
 assert [json.loads(line)["step"] for line in Path("run/log.jsonl").read_text().splitlines()] == [2]
 assert run.predictor()(record.tx_pos_m[:1]).shape == (1, 8, 16)

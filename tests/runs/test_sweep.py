@@ -77,7 +77,7 @@ def test_every_option_of_train_may_vary(tmp_path: Path) -> None:
 def option_value(action: argparse.Action) -> list[str]:
     """A value of an option that is not its default, in words."""
     known = {"model": "ray-tracing", "calibrate": "gain", "n_train": "7", "rays": "64", "paths": "line-of-sight"}
-    known |= {"phase_error": "0.5", "preset": "quick", "set": "batch=3"}
+    known |= {"phase_error": "0.5", "preset": "quick", "set": "stages=mean", "stages": "mean"}
     if action.nargs == 0:
         return []
     return [known[action.dest] if action.dest in known else str(list(action.choices)[-1]) if action.choices else "9"]
@@ -109,6 +109,7 @@ def test_each_run_has_every_option_of_the_sweep(
     monkeypatch.setattr(module, "check_run", stop)
     # The tracer's options belong to its model.
     model = ["--model", "ray-tracing"] if action.dest in TRACING else []
+    model = ["--model", "wrf-gs+"] if action.dest in ("preset", "receiver", "evaluation") else model
     option = [action.option_strings[0], *option_value(action)]
     other = "loss.ssim_weight" if action.dest == "seed" else "seed"
     common = ["sweep", "data", *model, "--vary", f"{other}=0,1", "--out", str(tmp_path / "sweep")]
@@ -144,7 +145,8 @@ def test_bad_input_is_refused_before_anything_starts(
         (tmp_path / "none", ["seed=0,1"], "none"),
     ):
         vary = [part for one in wrong for part in ("--vary", one)]
-        refused(["sweep", data, *vary, "--out", out], message, capsys)
+        model = [] if any(one.startswith("model") for one in wrong) else ["--model", "wrf-gs+"]
+        refused(["sweep", data, *model, *vary, "--out", out], message, capsys)
         assert not out.exists(), wrong
 
 
@@ -154,7 +156,7 @@ def swept(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sweeps") / "serial"
     vary = [VARY[1], VARY[3]]
     settings = [part for part in SET if part != "--set"]
-    rows = run_sweep(plan_sweep(out, vary, {"dataset": str(folder)}, settings, ["--deterministic"]))
+    rows = run_sweep(plan_sweep(out, vary, {"dataset": str(folder), "model": "wrf-gs+"}, settings, ["--deterministic"]))
     assert [row["status"] for row in rows] == ["done"] * 4
     return out
 
@@ -204,7 +206,20 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
     killer = threading.Thread(target=kill_one)
     killer.start()
     varied = ["--set", "loss.ssim_weight=0.1", "--vary", "seed=0,1"]
-    command = ["sweep", folder, *SET, "--deterministic", *varied, "--out", out, "--scheduler", "local:2", "--json"]
+    command = [
+        "sweep",
+        folder,
+        "--model",
+        "wrf-gs+",
+        *SET,
+        "--deterministic",
+        *varied,
+        "--out",
+        out,
+        "--scheduler",
+        "local:2",
+        "--json",
+    ]
     status, printed, err = call(command, capsys)
     killer.join()
     assert status == 0, err
@@ -231,7 +246,7 @@ def test_finished_runs_are_kept_and_others_added_or_done_again(
     (out / NAMES[1] / "config.yaml").unlink()  # as if stopped before it began
     (out / NAMES[1] / "metrics.json").unlink()
     dates = {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]}
-    command = ["sweep", folder, *SET, "--deterministic", *VARY, "--out", out, "--json"]
+    command = ["sweep", folder, "--model", "wrf-gs+", *SET, "--deterministic", *VARY, "--out", out, "--json"]
     status, printed, err = call(command, capsys)
     assert status == 0, err
     assert [row["status"] for row in json.loads(printed)] == ["done", "done", "kept", "kept"]

@@ -69,8 +69,8 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path, tmp_p
     assert stored_arrays(whole / "model.npz")["param/position"].shape[1] > 8
 
 
-@pytest.mark.parametrize("model", ["physics", "ray-tracing"])
-def test_physics_and_paths_do_not_depend_on_the_number_of_threads(
+@pytest.mark.parametrize("model", ["kriging", "ray-tracing"])
+def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(
     model: str, flat_folder: Path, tmp_path: Path
 ) -> None:
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
@@ -129,7 +129,7 @@ def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> N
         assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("model", ["wrf-gs+", "physics", "ray-tracing"])
+@pytest.mark.parametrize("model", ["wrf-gs+", "kriging", "ray-tracing"])
 def test_deterministic_command_initialises_the_cpu_first(
     model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

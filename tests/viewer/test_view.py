@@ -46,7 +46,7 @@ def traced(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFacto
 def joint(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, depth = tmp_path_factory.mktemp("runs") / "joint", ["traced.depth=1", "traced.rays=4096"]
     return wrf_mi.train(
-        flat_folder, folder, "wrf-gs+", scene=room, settings=[*SMALL, *depth, "density.max_gaussians=8"]
+        flat_folder, folder, "wrf-gs+", scene=room, settings=[*SMALL, *depth, "density.max_gaussians=8", "patience=0"]
     ).folder
 
 

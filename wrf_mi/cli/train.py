@@ -85,7 +85,7 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
     """
     model = a.model or HYBRID
     settings = [*a.set]
-    if a.stages is not None or a.fast:
+    if getattr(a, "stages", None) is not None or getattr(a, "fast", False):  # trace has neither
         settings = [*_stages(a, model), *settings]
     if model == RAY_TRACING:
         settings = [*_tracing_settings(a), *settings]

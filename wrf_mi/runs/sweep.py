@@ -34,12 +34,24 @@ from .folder import CONFIG, METRICS, is_finished, package_versions
 from .results import write_csv
 
 OPTIONS = (
-    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed", "preset", "receiver"),
+    *(
+        "dataset",
+        "model",
+        "scene",
+        "material",
+        "evaluation",
+        "split",
+        "n-train",
+        "seed",
+        "preset",
+        "receiver",
+        "stages",
+    ),
     *("paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
-FLAGS = ("deterministic", "intervals")
+FLAGS = ("deterministic", "intervals", "fast")
 """Options without a value that may vary: ``true`` gives them."""
 FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""

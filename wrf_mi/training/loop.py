@@ -147,7 +147,7 @@ class TrainingLoop(ABC):
         if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
             return False
         self.state = state.go_back()
-        self.state.chosen = self.state.step
+        self.state.chosen = max(self.state.step, 1)  # 0 means that none is
         self.schedule, self.state.step = self.schedule.after(self.state.chosen)
         self.record_functions()
         return True

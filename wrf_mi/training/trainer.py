@@ -32,7 +32,7 @@ from .adam import NonFiniteReport
 from .config import TrainConfig
 from .fields import check_memory, check_params, field_of
 from .initial import initial_gaussians
-from .loop import TrainingLoop
+from .loop import Progress, TrainingLoop
 from .predictor import Predictor
 from .reach import Reach, choose_reach, hold_out_groups, improves
 from .state import FitState
@@ -368,6 +368,25 @@ class Trainer(TrainingLoop):
             weight = None if reach is None else reach.weight(self.record.tx_pos_m[some], receiver)
             found.append(self._traced(predict, port, some, weight))
         return np.concatenate(found)
+
+    def run(
+        self,
+        on_progress: Callable[[Progress], None] = lambda progress: None,
+        save: Callable[[], None] = lambda: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train from the current step to the last (`TrainingLoop.run`); beside paths, from a state that is judged.
+
+        Parameters of paths may fit few rows and be wrong elsewhere, so that they have to improve on the stated ones.
+        """
+        state = self.state
+        if self._in_groups and self.graph.scene is not None and not state.step and not len(state.baseline):
+            self.validate()
+            if len(self._held_scores):
+                score = float(np.nanmean(self._held_scores))
+                state.keep_best(score if self.higher_is_better else -score)
+                state.baseline = state.best_scores = self._held_scores
+        return super().run(on_progress, save, stop)
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""

@@ -54,7 +54,7 @@ from ..model import (
     under,
 )
 from .mixture import Mixture, choose, constant
-from .parts import KRIGING, PATHS, SCENE_SIDES, TRACED, UPLINK_PARTS, HybridSettings, parts_of, stored_parts
+from .parts import KRIGING, PATHS, TRACED, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
 from .scene_side import RESIDUAL, SceneSide, StageReport, stated_reports
 
 logger = logging.getLogger(__name__)
@@ -296,7 +296,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
             of_scene = time.perf_counter() - begun
             assert isinstance(one, SceneSide)
             reports += one.stages
-            entry, inner = SCENE_SIDES[task_of(record).in_decibel][1], one.problem  # the scene is corrected once
+            entry, inner = scene_side(record)[1], one.problem  # the scene is corrected once
             unseen = None if held is None else one.held_out_at(held.receiver, held.row)
         if fold is None or held is None:
             continue

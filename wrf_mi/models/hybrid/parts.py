@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from ...core import InputError, Split
+from ...core import InputError, Record, Split
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
 from .. import MODELS
@@ -20,8 +20,6 @@ from .scene_side import FIELD, RESIDUAL, STAGES, needs_scene
 logger = logging.getLogger(__name__)
 
 PATHS, KRIGING = "paths", "kriging"
-SCENE_SIDES = {True: (strengths.TRACED_STRENGTHS, strengths.IN_SCENE), False: (paths.PATHS, paths.IN_SCENE)}
-"""Entries of the scene's side, with and without its correction, by whether observations are in decibels."""
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
 TRACED = (PATHS, "r2f2-scene")
@@ -60,11 +58,18 @@ class HybridSettings(CheckedSettings):
         return STAGES if self.stages is None else tuple(stage.strip() for stage in self.stages.split(","))
 
 
+def scene_side(record: Record) -> tuple[Model, Model]:
+    """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
+    if task_of(record).in_decibel and record.frequencies_hz is not None:
+        return strengths.TRACED_STRENGTHS, strengths.IN_SCENE
+    return paths.PATHS, paths.IN_SCENE
+
+
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
     """Entry and problem of each part that serves the data, the trusted one first.
 
     Raises:
-        InputError: no part serves the data.
+        InputError: no part serves the data, or a scene that cannot be used.
     """
     settings: HybridSettings = problem.settings
     record, task, wanted = problem.record, task_of(problem.record), settings.wanted
@@ -91,7 +96,7 @@ def stored_parts(problem: Problem, names: list[str]) -> dict[str, tuple[Model, P
 
 def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     if name == PATHS:
-        return SCENE_SIDES[task_of(problem.record).in_decibel][0], problem
+        return scene_side(problem.record)[0], problem
     model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
     given = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
@@ -100,7 +105,11 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
 
 
 def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, split: Split, scene: bool) -> None:
-    """Add a part that the data allow; others are left out with a line in the log."""
+    """Add a part that the data allow; others are left out with a line in the log, but not one with the scene.
+
+    Raises:
+        InputError: a scene that cannot be used.
+    """
     try:
         entry, inner = _part(problem, name, scene)
         check_record(entry, problem.record)
@@ -108,6 +117,8 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
         if entry.check is not None:
             entry.check(inner, [split])
     except InputError as error:
+        if scene:
+            raise
         logger.info("hybrid without %s: %s", name, error)
     else:
         parts[name] = entry, inner
