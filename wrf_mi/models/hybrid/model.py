@@ -403,6 +403,9 @@ def _stated(mixture: Mixture, names: Sequence[str]) -> list[dict[str, float]]:
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
     """The hybrid that `FittedHybrid.arrays` described."""
+    facts = json.loads(str(arrays["facts"]))
+    if "sizes" not in facts:
+        raise InputError(f"{folder}: a hybrid of an earlier version, which mixed other models; train the run anew")
     parts: dict[str, Fitted] = {}
     for name, (entry, inner) in stored_parts(problem, [str(name) for name in arrays["names"]]).items():
         parts[name] = entry.load(under(f"{name}/", arrays), inner, folder / FOLDER / name)
@@ -410,7 +413,6 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
     stored, left = under("intervals/", arrays), under("residuals/", arrays)
     residuals = Residuals.from_arrays(left, problem.record) if left else None
     intervals = from_field_arrays(Intervals, stored) if stored else None
-    facts = json.loads(str(arrays["facts"]))
     return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts)
 
 
