@@ -317,7 +317,9 @@ def _parts(record: Record, split: Split) -> _Parts:
     groups = hold_out_groups(split, record.tx_pos_m)
     if groups is split:
         raise InputError(f"{record.name}: {len(split.train)} training rows are too few to hold some out; give more")
-    return _Parts(record, groups.train, record, groups.validation)
+    # The regions alone judge: validation rows lie among those that the correction is fitted to, and add to few.
+    rows = np.setdiff1d(groups.validation, split.validation)
+    return _Parts(record, np.setdiff1d(split.all_train, rows), record, rows)
 
 
 def _at_most(split: Split, count: int) -> Split:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
+DEFAULT = StrengthSettings()
 
 
 class FittedStrengths(SceneSide):
@@ -79,7 +81,7 @@ def _gains(stated: Problem, inner: Problem, split: Split, session: Session) -> b
     held, scores = HeldOut.of(record, fold, stated.seed), list[FloatArray]()
     for name, problem in (("stated", stated), ("corrected", inner)):
         place = replace(session, folder=session.folder / name, run=session.folder / name)
-        means = held_out_predictions(IN_SCENE, problem, fold, held, place, f"{name} scene").mean
+        means = held_out_predictions(AT_START, problem, fold, held, place, f"{name} scene").mean
         shutil.rmtree(place.folder)
         each = task_of(record).mixtures(means[None], held.observed(record))
         unit = held.receiver if split.held_receivers else held.row
@@ -89,13 +91,15 @@ def _gains(stated: Problem, inner: Problem, split: Split, session: Session) -> b
     return improves(scores[1], scores[0], True)
 
 
-def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedStrengths:
+def fit_in_scene(
+    problem: Problem, split: Split, session: Session, settings: StrengthSettings = DEFAULT
+) -> FittedStrengths:
     """`fit` without the correction."""
     session.report("tracing a map", 0.0)
     reach = STRENGTHS.depth, STRENGTHS.reflections
     power_map = trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, *reach)
     rows = problem.rows(split)
-    return FittedStrengths(fit_strengths(problem.record, rows, power_map, StrengthSettings(), session.report), problem)
+    return FittedStrengths(fit_strengths(problem.record, rows, power_map, settings, session.report), problem)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
@@ -128,3 +132,5 @@ TRACED_STRENGTHS = replace(
 """The scene's side for strengths as an entry, which no name of the registry has."""
 IN_SCENE: Model = replace(TRACED_STRENGTHS, fit=fit_in_scene)
 """The same in a scene that is corrected already."""
+AT_START = replace(IN_SCENE, fit=partial(fit_in_scene, settings=StrengthSettings(search_rows=2**31)))
+"""The same with hyperparameters as they are stated: which scene is better does not depend on their search."""
