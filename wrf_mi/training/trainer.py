@@ -377,15 +377,15 @@ class Trainer(TrainingLoop):
     ) -> bool:
         """Train from the current step to the last (`TrainingLoop.run`); beside paths, from a state that is judged.
 
-        Parameters of paths may fit few rows and be wrong elsewhere, so that they have to improve on the stated ones.
+        Parameters of paths may fit few rows and be wrong elsewhere: the stated ones are kept where they score better.
         """
         state = self.state
-        if self._in_groups and self.graph.scene is not None and not state.step and not len(state.baseline):
+        if self._in_groups and self.graph.scene is not None and not state.step and state.best is None:
             self.validate()
             if len(self._held_scores):
                 score = float(np.nanmean(self._held_scores))
                 state.keep_best(score if self.higher_is_better else -score)
-                state.baseline = state.best_scores = self._held_scores
+                state.best_scores = self._held_scores
         return super().run(on_progress, save, stop)
 
     def validate(self) -> float:
