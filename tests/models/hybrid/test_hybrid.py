@@ -46,6 +46,12 @@ def test_two_rows_are_interpolated_by_kriging(flat_folder: Path, tmp_path: Path)
     assert "inside_90" not in run.metrics
 
 
+def test_five_spectra_have_intervals(folder: Path, tmp_path: Path):
+    """Three remain where two are held out, through which kriging may pass without any deviation."""
+    run = wrf_mi.train(folder, tmp_path / "run", n_train=5)
+    assert 0 < run.metrics["inside_90"] <= 1
+
+
 def test_field_alone_is_a_part_where_it_is_named(folder: Path, tmp_path: Path):
     asked = HybridSettings(stages="field,residual")
     problem = Problem(wrf_mi.load(str(folder)), asked)

@@ -38,7 +38,7 @@ from ..held_out import (
     predicted_rows,
 )
 from ..interpolation.kriging import Kriged, Kriging
-from ..intervals import GAPS, Intervals, expected_size, fit_intervals
+from ..intervals import GAPS, LEAST, Intervals, expected_size, fit_intervals
 from ..model import (
     Arrays,
     Decomposition,
@@ -236,7 +236,8 @@ class FittedHybrid(Fitted):
         whole = Prediction(mean)
         if self.intervals is not None and std:
             if self._facts["sizes"] == STATED:
-                whole = Prediction(mean, size * self.intervals(mean, np.ones(mean.shape), distance_m).stated_std)
+                factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
+                whole = Prediction(mean, np.maximum(size * factor, LEAST))
             else:
                 whole = self.intervals(mean, expected_size(task_of(self._problem.record), whole), distance_m)
         if not (totals[0].any() and totals[1].any()):
@@ -377,9 +378,10 @@ def _weights(
     stds = [one.std for one in predictions.values()]
     known = [std for std in stds if std is not None]
     sizes = PREDICTED
-    if len(known) == len(stds):
+    std = np.einsum("qk,kq...->q...", mixture(held.distance_m), np.stack(known)) if len(known) == len(stds) else None
+    if std is not None and (std > 0).all():  # kriging of two or three rows may pass through all of them
         # Few rows tell a factor of stated deviations, not how errors depend on them.
-        sizes, std = STATED, np.einsum("qk,kq...->q...", mixture(held.distance_m), np.stack(known))
+        sizes = STATED
         intervals = fit_intervals(mean / std, observed / std, np.ones(mean.shape), held.distance_m, held.row)
     else:
         size = expected_size(task, Prediction(mean))
