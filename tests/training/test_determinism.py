@@ -76,7 +76,7 @@ def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
     for threads in (1, 2):
         backend.set_threads(threads)
-        train(flat_folder, tmp_path / f"on-{threads}", model, scene=scene)
+        train(flat_folder, tmp_path / f"on-{threads}", model, scene=None if model == "kriging" else scene)
     assert_same_bits(tmp_path / "on-1", tmp_path / "on-2")
 
 
