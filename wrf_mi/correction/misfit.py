@@ -41,7 +41,7 @@ from .frame import rigid_motions, scene_entries
 from .options import PATTERNS, CorrectionOptions
 
 LATTICE = (12, 40)
-"""Most elevations and azimuths of the lattice of directions; with half of these, scenes of 15 rows are worse."""
+"""Most elevations and azimuths of the lattice of directions."""
 FLOOR = 0.5
 """Share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels."""
 

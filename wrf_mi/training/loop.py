@@ -74,6 +74,9 @@ class TrainingLoop(ABC):
     def record_functions(self) -> None:
         """Discard recorded kernels, which are valid for the former state only."""
 
+    def begin(self) -> None:  # noqa: B027 - most fits have nothing to prepare
+        """Prepare the first or the next sitting, before its first step."""
+
     def adapt(self) -> None:
         """Run a round of density control, after a step of ``schedule.density``."""
         raise NotImplementedError("no density control without Gaussians")
@@ -98,6 +101,7 @@ class TrainingLoop(ABC):
             NumericsError: a loss or gradient is not finite, raised right after that step, which leaves the parameters
                 unchanged; or parameters or moments are not finite, found before a score or checkpoint.
         """
+        self.begin()
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
         losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)

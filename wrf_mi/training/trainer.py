@@ -32,7 +32,7 @@ from .adam import NonFiniteReport
 from .config import TrainConfig
 from .fields import check_memory, check_params, field_of
 from .initial import initial_gaussians
-from .loop import Progress, TrainingLoop
+from .loop import TrainingLoop
 from .predictor import Predictor
 from .reach import Reach, choose_reach, hold_out_groups, improves
 from .state import FitState
@@ -369,13 +369,8 @@ class Trainer(TrainingLoop):
             found.append(self._traced(predict, port, some, weight))
         return np.concatenate(found)
 
-    def run(
-        self,
-        on_progress: Callable[[Progress], None] = lambda progress: None,
-        save: Callable[[], None] = lambda: None,
-        stop: Callable[[], bool] = lambda: False,
-    ) -> bool:
-        """Train from the current step to the last (`TrainingLoop.run`); beside paths, from a state that is judged.
+    def begin(self) -> None:
+        """Judge the state that a fit beside paths starts from.
 
         Parameters of paths may fit few rows and be wrong elsewhere: the stated ones are kept where they score better.
         """
@@ -386,7 +381,6 @@ class Trainer(TrainingLoop):
                 score = float(np.nanmean(self._held_scores))
                 state.keep_best(score if self.higher_is_better else -score)
                 state.best_scores = self._held_scores
-        return super().run(on_progress, save, stop)
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""

@@ -344,8 +344,8 @@ def _residuals(
 ) -> tuple[Residuals, Prediction]:
     """Residuals of the training rows, and predictions of held-out rows with those of the others.
 
-    Both are residuals of the final parameters: to keep those of the chosen state would take the other rows' reports,
-    too, and residuals of rows that both have been fitted to hardly differ.
+    Both are residuals of the final parameters, which have seen the held-out rows, too: an approximation. To keep
+    those of the chosen state would take the reports of all rows.
     """
     among_known, mean = Residuals.of(fitted, record, fold, problem.seed), np.array(before.mean)
     for receiver in np.unique(held.receiver):

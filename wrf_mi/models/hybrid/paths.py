@@ -18,14 +18,15 @@ from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..gaussian.model import check as check_graph
 from ..gaussian.model import fit as fit_graph
 from ..model import Arrays, Decomposition, Inputs, Problem, Session, settings_array, stored_settings
-from .scene_side import CALIBRATION, FIELD, SURFACES, SceneSide, StageReport, corrected, in_scene, too_few
+from .scene_side import CALIBRATION, CORRECTED, FIELD, SURFACES, SceneSide, StageReport, corrected, in_scene, too_few
 
 
 def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainConfig:
     """Settings of the graph: Gaussians beside paths, or paths alone.
 
     Where rows are too few to choose stages, materials of each surface and Gaussians on surfaces are trained together
-    from the first step: of six ways this was the best on 5 rows of the laboratory (docs/hybrid.md).
+    from the first step: of six ways the best in the mean of three draws of 5 of the laboratory's training rows, judged
+    by 60 others.
     """
     task, few = task_of(problem.record), too_few(problem.record, split)
     if FIELD in wanted and not few:
@@ -33,7 +34,7 @@ def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainC
         if SURFACES not in wanted:
             config = with_settings(config, ["traced.surface=0"])
     else:
-        parts = ["gain", *(["materials"] if CALIBRATION in wanted else [])]
+        parts = ["gain", *(["materials"] if {CALIBRATION, CORRECTED} & {*wanted} else [])]
         config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.image)
         config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
     settings = problem.settings

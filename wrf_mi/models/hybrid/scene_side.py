@@ -103,7 +103,8 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
         return in_scene(problem, session.folder), [StageReport(**one) for one in json.loads(path.read_text())]
     reports: list[StageReport] = []
     wanted = problem.settings.wanted
-    if CALIBRATION in wanted and (split.held_receivers or not too_few(record, split)):
+    # A correction changes materials, too: it contains the calibration.
+    if not {CALIBRATION, CORRECTED}.isdisjoint(wanted) and (split.held_receivers or not too_few(record, split)):
         options = default_options(record)
         if CORRECTED not in wanted:
             options = replace(options, parts=tuple(part for part in options.parts if part not in OF_GEOMETRY))
@@ -116,7 +117,7 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
             if correction.kept:
                 write_page(correction, session.folder / SCENE, replace=True)
             reports = _reports(correction, task_of(record).higher_is_better)
-    write_atomically(path, json.dumps(stated_reports(reports)) + "\n")
+    write_reports(session.folder, reports)
     return in_scene(problem, session.folder), reports
 
 
@@ -132,6 +133,11 @@ def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport
             kept = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
             reports.append(StageReport(stage, kept, judged.get(correction.kept, best)))
     return [*reports[:-1], replace(reports[-1], seconds=correction.seconds)]
+
+
+def write_reports(folder: Path, reports: Collection[StageReport]) -> None:
+    """Keep the reports of stages 1 to 3 for a resumed fit."""
+    write_atomically(folder / STAGES_FILE, json.dumps(stated_reports(reports)) + "\n")
 
 
 def stated_reports(reports: Collection[StageReport]) -> list[dict[str, Any]]:

@@ -28,7 +28,7 @@ from .. import MODELS
 from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
-from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene
+from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
@@ -66,8 +66,9 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
     inner, reports = corrected(problem, split, session)
     if inner is not problem and not _gains(problem, inner, split, session):
         # A trace that gains may have nothing to add to kriging, which knows the level around each row.
-        shutil.rmtree(session.folder / SCENE)
         inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
+        write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
+        shutil.rmtree(session.folder / SCENE)
     fitted = fit_in_scene(inner, split, session)
     fitted.stages = tuple(reports)
     return fitted
