@@ -89,7 +89,10 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     single = [again.predict(one[None]).mean[0] for one in position]
     np.testing.assert_allclose(whole.mean, np.stack(single), atol=FLOAT32_GREY)
     assert whole.std is not None
-    assert (run.folder / "parts" / "paths" / "scene" / "correction.md").exists()
+    scene = run.folder / "parts" / "paths" / "scene"
+    assert (scene / "correction.md").exists()
+    # Training alone could find the materials in the stated scene, too.
+    assert all(one.fitted.parts["paths"].problem.scene == str(scene) for one in (run, again))
 
 
 def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path], tmp_path: Path) -> None:
