@@ -6,13 +6,12 @@ import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import trimesh
 from trimesh.triangles import closest_point
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from .surfaces import Surfaces
+from .surfaces import Solid, Surfaces
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +47,10 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
         what = surfaces.called(int(thing[first]))
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
-    beyond = _beyond(surfaces, positions_m)
+    if not len(surfaces.triangles):
+        return
+    low, high = surfaces.bounds_m
+    beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
         text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres"
@@ -95,17 +97,23 @@ def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     return np.where(behind[:, None], moved, positions_m)
 
 
+def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -> Iterator[tuple[Solid, IntArray]]:
+    """Solids with the positions [n, 3] that lie within their bounds and a margin."""
+    low, high = surfaces.solid_bounds_m
+    near = np.ones((len(positions_m), len(low)), bool)
+    for axis, here in enumerate(positions_m.T):
+        near &= (here[:, None] >= low[:, axis] - margin_m) & (here[:, None] <= high[:, axis] + margin_m)
+    for number in np.flatnonzero(near.any(axis=0)):
+        yield surfaces.solids[number], np.flatnonzero(near[:, number])
+
+
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Positions [n, 3], moved before the nearest face where they are on a solid, or up to `BEHIND_M` inside."""
     moved, clear = positions_m.copy(), clear_m(surfaces)
-    for faces in surfaces.solids:
-        corners = surfaces.triangles[faces]
-        low, high = corners.min(axis=(0, 1)) - clear, corners.max(axis=(0, 1)) + clear
-        rows = np.flatnonzero(((moved >= low) & (moved <= high)).all(axis=1))
-        normal, _ = trimesh.triangles.normals(corners)
-        if not len(rows) or len(normal) < len(corners):
+    # What one solid moves may come to lie at the next one.
+    for (_, corners, normal), rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
+        if len(normal) < len(corners):
             continue
-        normal *= np.sign(np.einsum("fc,fc->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))  # outwards
         # Most positions are far from all planes of the faces, which is told faster than distances from faces.
         height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
         inside = winding_number(corners, moved[rows]) > 0.5
@@ -121,8 +129,9 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.surfaces.Surfaces`."""
     thing = np.full(len(positions_m), -1)
-    for face in surfaces.solids:
-        thing[winding_number(surfaces.triangles[face], positions_m) > 0.5] = surfaces.object_of(face[:1])[0]
+    for solid, rows in _near_solids(surfaces, positions_m, 0.0):
+        inside = winding_number(solid.corners, positions_m[rows]) > 0.5
+        thing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
     return thing
 
 
@@ -143,14 +152,6 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
         solid = np.arctan2(dot(a, np.cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
         number[part] = np.abs(solid.sum(axis=1)) / (2 * np.pi)
     return number
-
-
-def _beyond(surfaces: Surfaces, points: FloatArray) -> FloatArray:
-    """Distance [n] of points beyond the box around the scene along the worst axis, at most 0 inside; 0 without one."""
-    if not len(surfaces.triangles):
-        return np.zeros(len(points))
-    low, high = surfaces.triangles.min(axis=(0, 1)), surfaces.triangles.max(axis=(0, 1))
-    return np.asarray(np.maximum(low - points, points - high).max(axis=1))
 
 
 def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -33,6 +33,20 @@ MERGED_COUNT = 1000
 SOLID_M = 0.5
 """Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
 room of 3 x 3 x 2.5 m 0.94 m."""
+
+
+class Solid(NamedTuple):
+    """A closed body that is an object.
+
+    Attributes:
+        face: its faces [f].
+        corners: their corners [f, 3, 3], metres.
+        normal: their normals [f, 3], outwards; fewer where faces have no area.
+    """
+
+    face: IntArray
+    corners: FloatArray
+    normal: FloatArray
 
 
 @dataclass(frozen=True)
@@ -138,11 +152,26 @@ class Surfaces:
         return mi.Vector3f(*x[:3]), x[3], *axes, mi.Point2f(*x[10:12]), mi.Point2f(*x[12:])
 
     @cached_property
-    def solids(self) -> list[IntArray]:
-        """Faces of each closed, consistently oriented body that is an object rather than a room."""
-        area = trimesh.triangles.area(self.triangles)
-        found = bodies(self.triangles)
-        return [face for face, closed, volume in found if closed and 0 < 2 * abs(volume) < SOLID_M * area[face].sum()]
+    def solids(self) -> list[Solid]:
+        """Each closed, consistently oriented body that is an object rather than a room."""
+        area, solids = trimesh.triangles.area(self.triangles), []
+        for face, closed, volume in bodies(self.triangles):
+            if closed and 0 < 2 * abs(volume) < SOLID_M * area[face].sum():
+                corners = self.triangles[face]
+                solids.append(Solid(face, corners, np.sign(volume) * trimesh.triangles.normals(corners)[0]))
+        return solids
+
+    @cached_property
+    def solid_bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates of the solids [s, 3], metres."""
+        empty = [np.zeros((0, 3))]
+        low, high = ([getattr(one.corners, side)((0, 1))[None] for one in self.solids] for side in ("min", "max"))
+        return np.concatenate(empty + low), np.concatenate(empty + high)
+
+    @cached_property
+    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates of the faces [3], metres."""
+        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
 
     def called(self, thing: int) -> str:
         """Name of an object in error messages, with its mesh file if that has another name."""
