@@ -11,7 +11,7 @@ from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import Receiver, Record
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.power_map import PowerMap, trace_map
+from wrf_mi.tracing.power_map import PowerMap, TracedPower, trace_map
 
 FREQUENCY_HZ = 2.44e9
 
@@ -21,6 +21,25 @@ def test_map_is_linear_between_its_points() -> None:
     power = PowerMap(x, y, z, (x[:, None, None] * 10 + y[None, :, None])[None])
     where = np.array([[0.5, 1.0, 1.0], [1.5, 0.0, 9.0], [9.0, 9.0, 1.0]])
     np.testing.assert_allclose(power(where, 0), [6.0, 15.0, 22.0])
+
+
+def test_traced_power_asks_for_each_position_once_and_falls_back_to_the_local_mean() -> None:
+    axis = np.array([0.0, 2.0])
+    local = PowerMap(axis, axis, np.array([1.0]), np.stack([np.full((2, 2, 1), -50.0), np.full((2, 2, 1), -70.0)]))
+    asked: list[int] = []
+
+    def trace(position_m: np.ndarray) -> np.ndarray:
+        asked.append(len(position_m))
+        power = np.stack([-position_m[:, 0], -2 * position_m[:, 0]])
+        power[1, position_m[:, 1] > 1] = np.nan  # without a path
+        return power
+
+    power, where = TracedPower(local, trace, ["r0", "r1"]), np.array([[0.5, 0.0, 1.0], [1.5, 2.0, 1.0]])
+    receivers = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in ("r1", "r0")]
+    np.testing.assert_allclose(power(where, 0), [-0.5, -1.5])
+    np.testing.assert_allclose(power(where[::-1], 1), [-70.0, -1.0])
+    np.testing.assert_allclose(power.at(receivers[:1])(where, 0), [-1.0, -70.0])
+    assert asked == [2]
 
 
 def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,12 +1,14 @@
-"""Local mean of traced power on a grid.
+"""Local mean of traced power on a grid, and power traced at positions themselves.
 
 For a position known to a decimetre ray tracing gives the mean over some wavelengths, so powers are averaged over the
-neighbourhood before they are converted to decibels. The scene is traced once on a grid and needed only then.
+neighbourhood before they are converted to decibels. The scene is traced once on a grid and needed only then. Where
+positions are exact, edges of shadows are sharper than such means.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,17 +16,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from ..core import InputError, Record
+from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
+from ..receivers import rssi_dbm
 from .devices import solid_around
 from .kept_powers import traced_powers
 from .options import TraceOptions
-from .solve import Prepared
+from .solve import Prepared, trace_paths
 
 MOST_POINTS = 6000
 """Most traced positions; the grid becomes wider for larger scenes."""
 LAYER_M = 0.5
 """Greatest distance of the grid's layers over the transmitter's heights."""
+MOST_KNOWN = 50_000
+"""Positions whose traced power is kept in memory: 6 MB for 16 receivers."""
 SAME_HEIGHT_M = 0.02
 LEAST_SHARE = 1e-3
 """Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
@@ -45,6 +50,76 @@ class PowerMap:
         inside = [np.clip(position_m[:, k], axis[0], axis[-1]) for k, axis in axes]
         grid = RegularGridInterpolator([axis for _, axis in axes], self.power_dbm[receiver].squeeze())
         return np.asarray(grid(np.stack(inside, axis=-1)))
+
+
+class TracedPower:
+    """Power traced at each position itself, and the local mean where no path arrives and inside solids.
+
+    Args:
+        local: local means.
+        trace: ``trace(position_m)``: power [n_rx, m] in dBm at positions [m, 3], NaN where the local mean is asked for.
+        names: names of the receivers.
+    """
+
+    def __init__(self, local: PowerMap, trace: Callable[[FloatArray], FloatArray], names: Sequence[str] = ()) -> None:
+        self.local, self._trace, self._names = local, trace, tuple(names)
+        self._known: dict[bytes, FloatArray] = {}
+
+    def know(self, position_m: FloatArray, traced_dbm: FloatArray) -> None:
+        """Keep powers [n_rx, k] at positions [k, 3], as of `traced_dbm`."""
+        self._known |= {row.tobytes(): power for row, power in zip(position_m, traced_dbm.T, strict=True)}
+
+    @property
+    def power_dbm(self) -> FloatArray:
+        """Powers of the local means [n_rx, x, y, z], dBm."""
+        return self.local.power_dbm
+
+    def traced_dbm(self, position_m: FloatArray) -> FloatArray:
+        """Power [n_rx, m] at positions [m, 3], each traced once for all receivers."""
+        keys = [row.tobytes() for row in position_m]
+        new = [place for place, key in enumerate(keys) if key not in self._known]
+        if new:
+            if len(self._known) > MOST_KNOWN:
+                self._known = {key: self._known[key] for key in keys if key in self._known}
+            self.know(position_m[new], self._trace(position_m[new]))
+        return np.stack([self._known[key] for key in keys], axis=1)
+
+    def __call__(self, position_m: FloatArray, receiver: int) -> FloatArray:
+        """Power in dBm at positions [m, 3]."""
+        if not len(position_m):
+            return np.zeros(0)
+        traced = self.traced_dbm(np.ascontiguousarray(position_m))[receiver]
+        return np.where(np.isnan(traced), self.local(position_m, receiver), traced)
+
+    def at(self, receivers: Sequence[Receiver]) -> TracedPower:
+        """The power at some of the receivers."""
+        some = [self._names.index(receiver.name) for receiver in receivers]
+        local = replace(self.local, power_dbm=self.local.power_dbm[some])
+        return TracedPower(local, lambda position_m: self.traced_dbm(position_m)[some])
+
+
+Traced = PowerMap | TracedPower
+"""Mean of signal strengths."""
+
+
+def power_tracer(
+    scene: Any, record: Record, max_depth: int, max_reflections: int
+) -> Callable[[FloatArray], FloatArray]:
+    """Function of `TracedPower` that traces a scene for a record's receivers."""
+    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
+    prepared = Prepared(scene)
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
+
+    def trace(position_m: FloatArray) -> FloatArray:
+        power = np.full((len(record.receivers), len(position_m)), np.nan)
+        outside = solid_around(prepared.surfaces, position_m) < 0
+        if outside.any():
+            power[:, outside] = rssi_dbm(
+                trace_paths(scene, position_m[outside], record.receivers, options, **how).paths
+            )
+        return power
+
+    return trace
 
 
 def trace_map(

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from ...core import Prediction, Split
 from ...core.settings import with_settings
-from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.config import TrainConfig, calibration_config, task_settings
 from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..gaussian.model import check as check_graph
 from ..gaussian.model import fit as fit_graph
+from ..held_out import HeldOut, as_unseen
 from ..model import Arrays, Decomposition, Inputs, Problem, Session, settings_array, stored_settings
 from .scene_side import CALIBRATION, CORRECTED, FIELD, SURFACES, SceneSide, StageReport, corrected, in_scene, too_few
 
@@ -68,14 +65,14 @@ class FittedPaths(SceneSide):
         """Arrays of the graph, and its settings."""
         return self.graph.arrays() | {"settings": settings_array(self.graph.config)}
 
-    def held_out_at(self, receiver: IntArray, row: IntArray) -> NDArray[Any] | None:
-        """Reports [q, ...] of training rows that the stages were chosen by; None: not all of these rows are."""
+    def held_out_at(self, held: HeldOut) -> Prediction | None:
+        """Reports of the rows that the stages were chosen by; None: not all held-out rows are among these."""
         reports = self.graph.held_out
         if reports is None:
             return None
         place = {pair: number for number, pair in enumerate(zip(reports.receiver, reports.row, strict=True))}
-        wanted = list(zip(receiver, row, strict=True))
-        return reports.report[[place[pair] for pair in wanted]] if all(pair in place for pair in wanted) else None
+        numbers = [place.get(pair, -1) for pair in zip(held.receiver, held.row, strict=True)]
+        return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held))
 
 
 def fit(problem: Problem, split: Split, session: Session) -> FittedPaths:

@@ -13,16 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...core import InputError, Record, Split
+from ...core import InputError, Prediction, Record, Split
 from ...core.files import write_atomically
-from ...core.types import IntArray
 from ...correction import Correction, correct_scene, default_options, write_page
 from ...correction.options import FRAME, HIDDEN, PLANES
 from ...scene.correction_data import FILE as CORRECTION
 from ...tasks import task_of
 from ...training.reach import hold_out_groups
+from ..held_out import HeldOut
 from ..model import Fitted, Problem, Session
 
 logger = logging.getLogger(__name__)
@@ -72,9 +71,17 @@ class SceneSide(Fitted):
     problem: Problem
     stages: tuple[StageReport, ...] = ()
 
-    def held_out_at(self, receiver: IntArray, row: IntArray) -> NDArray[Any] | None:
-        """Reports [q, ...] of training rows by a fit that had not seen them; None: another fit has to predict them."""
+    def held_out_at(self, held: HeldOut) -> Prediction | None:
+        """Predictions of held-out rows, as large in error as if the scene had not seen them; None: a further fit has to
+        make them.
+        """
         return None
+
+
+def inside(session: Session, *names: str) -> Session:
+    """The session with a folder inside its own."""
+    place = session.folder.joinpath(*names)
+    return replace(session, folder=place, run=place)
 
 
 def too_few(record: Record, split: Split) -> bool:

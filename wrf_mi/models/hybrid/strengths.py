@@ -1,14 +1,16 @@
-"""The scene's side for signal strengths: kriging about the local mean of the power traced in the corrected scene.
+"""The scene's side for signal strengths: kriging about the power traced in the corrected scene.
 
 For a transmitter whose position is known to a decimetre, ray tracing gives the mean over some wavelengths: single
-paths, and Gaussians that change them, say nothing of the fading about it. So stages 4 and 5 are not tried.
+paths, and Gaussians that change them, say nothing of the fading about it. So stages 4 and 5 are not tried, and the mean
+is local, unless power at the stated positions themselves predicts held-out rows better.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,21 +20,25 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Split
 from ...core.angles import FloatArray
+from ...core.files import write_atomically
 from ...correction.options import STRENGTHS
 from ...tasks import task_of
 from ...tracing.polarization import check_polarization
-from ...tracing.power_map import trace_map
+from ...tracing.power_map import PowerMap, TracedPower, power_tracer, trace_map
 from ...tracing.solve import Prepared
-from ...training.reach import improves
 from .. import MODELS
-from ..held_out import HeldOut, held_out_predictions, hold_out
+from ..held_out import HeldOut, fit_fold, held_out_predictions, hold_out, labelled
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
-from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, write_reports
+from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
+REACH = STRENGTHS.depth, STRENGTHS.reflections
+"""Interactions of a path at most, and reflections among them."""
 DEFAULT = StrengthSettings()
+NEVER = 2**31
+"""`StrengthSettings.search_rows` above any number of rows."""
 
 
 class FittedStrengths(SceneSide):
@@ -46,6 +52,7 @@ class FittedStrengths(SceneSide):
 
     def __init__(self, strengths: Strengths, problem: Problem, stages: Sequence[StageReport] = ()) -> None:
         self.strengths, self.problem, self.stages = strengths, problem, tuple(stages)
+        self.unseen: Prediction | None = None
         self.receivers, self.uses_heading = strengths.receivers, strengths.uses_heading
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -56,6 +63,10 @@ class FittedStrengths(SceneSide):
         """The mean of `predict`, which takes a fraction of its time."""
         return self.strengths.predict_mean(inputs, receiver)
 
+    def held_out_at(self, held: HeldOut) -> Prediction | None:
+        """Predictions of the rows that were held out, see `SceneSide`."""
+        return self.unseen
+
     def arrays(self) -> Arrays:
         """Arrays of the kriging, the map among them."""
         return self.strengths.arrays()
@@ -64,48 +75,93 @@ class FittedStrengths(SceneSide):
 def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
     """Correct the scene, trace a map in it, and fit kriging about it."""
     inner, reports = corrected(problem, split, session)
-    if inner is not problem and not _gains(problem, inner, split, session):
-        # A trace that gains may have nothing to add to kriging, which knows the level around each row.
-        inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
-        write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
-        shutil.rmtree(session.folder / SCENE)
-    fitted = fit_in_scene(inner, split, session)
+    fold = hold_out(problem.record, split)
+    if fold is None:
+        fitted = fit_in_scene(inner, split, session)
+    else:
+        held, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
+        if not path.exists():
+            write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held, session)) + "\n")
+        choice = json.loads(path.read_text())
+        if inner is not problem and not choice["corrected"]:
+            inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
+            write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
+            shutil.rmtree(session.folder / SCENE)
+        settings = StrengthSettings(**choice["hyperparameters"], search_rows=NEVER)
+        mean = _traced(inner) if choice["exact"] else None
+        entry, place = _with(settings, mean), inside(session, "held")
+        unseen = held_out_predictions(entry, inner, fold, held, place, "paths")
+        fitted = fit_in_scene(inner, split, session, settings, mean)
+        fitted.unseen = unseen
     fitted.stages = tuple(reports)
     return fitted
 
 
-def _gains(stated: Problem, inner: Problem, split: Split, session: Session) -> bool:
-    """Whether kriging about the power of the corrected scene predicts held-out rows clearly better."""
+def _chosen(
+    stated: Problem, inner: Problem, split: Split, fold: Split, held: HeldOut, session: Session
+) -> dict[str, Any]:
+    """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
     record = stated.record
-    if (fold := hold_out(record, split)) is None:
-        return False
-    held, scores = HeldOut.of(record, fold, stated.seed), list[FloatArray]()
-    for name, problem in (("stated", stated), ("corrected", inner)):
-        place = replace(session, folder=session.folder / name, run=session.folder / name)
-        means = held_out_predictions(AT_START, problem, fold, held, place, f"{name} scene").mean
+    _, unit = np.unique(held.receiver if split.held_receivers else held.row, return_inverse=True)
+
+    def scores(problem: Problem, mean: TracedPower | None = None) -> FloatArray:
+        # Which mean is better does not depend on a search for hyperparameters.
+        entry, place = _with(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
+        means = held_out_predictions(entry, problem, fold, held, place, "mean").mean
         shutil.rmtree(place.folder)
-        each = task_of(record).mixtures(means[None], held.observed(record))
-        unit = held.receiver if split.held_receivers else held.row
-        _, number = np.unique(unit, return_inverse=True)
-        values = each(np.ones((len(held), 1)), np.arange(len(held)))
-        scores.append(np.bincount(number, values) / np.bincount(number))
-    return improves(scores[1], scores[0], True)
+        of_row = task_of(record).mixtures(means[None], held.observed(record))
+        values = of_row(np.ones((len(held), 1)), np.arange(len(held)))
+        return np.asarray(np.bincount(unit, values) / np.bincount(unit))
+
+    problem, best = inner, scores(inner)
+    if inner is not stated:
+        # The correction has gained as a trace, but may add nothing to kriging, which knows the level around each row.
+        before = scores(stated)
+        if before.mean() >= best.mean():
+            problem, best = stated, before
+    mean = None
+    if record.tx_heading_rad is None:
+        # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
+        exact = _traced(problem)
+        mean = exact if scores(problem, exact).mean() > best.mean() else None
+    fitted = fit_fold(_with(DEFAULT, mean), problem, fold, labelled(session, "held-out rows"))[0]
+    assert isinstance(fitted, FittedStrengths)
+    hyperparameters = asdict(fitted.strengths.field.hyperparameters)
+    return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
+
+
+def _traced(problem: Problem) -> TracedPower:
+    """Power at positions themselves, which fits of a problem share."""
+    trace = power_tracer(problem.opened_scene, problem.record, *REACH)
+    return TracedPower(_local_mean(problem), trace, names=[receiver.name for receiver in problem.record.receivers])
+
+
+def _local_mean(problem: Problem) -> PowerMap:
+    return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, *REACH)
 
 
 def fit_in_scene(
-    problem: Problem, split: Split, session: Session, settings: StrengthSettings = DEFAULT
+    problem: Problem,
+    split: Split,
+    session: Session,
+    settings: StrengthSettings = DEFAULT,
+    mean: TracedPower | None = None,
 ) -> FittedStrengths:
-    """`fit` without the correction."""
+    """`fit` without the correction, about a mean of all receivers; None: about the local mean."""
     session.report("tracing a map", 0.0)
-    reach = STRENGTHS.depth, STRENGTHS.reflections
-    power_map = trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, *reach)
-    rows = problem.rows(split)
-    return FittedStrengths(fit_strengths(problem.record, rows, power_map, settings, session.report), problem)
+    record = problem.record
+    power = _local_mean(problem) if mean is None else mean.at(record.receivers)
+    return FittedStrengths(fit_strengths(record, problem.rows(split), power, settings, session.report), problem)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
     """The kriging that `FittedStrengths.arrays` described."""
-    return FittedStrengths(Strengths.from_arrays(arrays), in_scene(problem, folder))
+    inner = in_scene(problem, folder)
+
+    def trace(position_m: FloatArray) -> FloatArray:
+        return power_tracer(inner.opened_scene, inner.record, *REACH)(position_m)
+
+    return FittedStrengths(Strengths.from_arrays(arrays, trace), inner)
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
@@ -133,5 +189,7 @@ TRACED_STRENGTHS = replace(
 """The scene's side for strengths as an entry, which no name of the registry has."""
 IN_SCENE: Model = replace(TRACED_STRENGTHS, fit=fit_in_scene)
 """The same in a scene that is corrected already."""
-AT_START = replace(IN_SCENE, fit=partial(fit_in_scene, settings=StrengthSettings(search_rows=2**31)))
-"""The same with hyperparameters as they are stated: which scene is better does not depend on their search."""
+
+
+def _with(settings: StrengthSettings, mean: TracedPower | None) -> Model:
+    return replace(IN_SCENE, fit=partial(fit_in_scene, settings=settings, mean=mean))

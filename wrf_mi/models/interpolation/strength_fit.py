@@ -29,7 +29,7 @@ from .kriging_equations import KrigingSystem
 from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
 
 if TYPE_CHECKING:
-    from ...tracing.power_map import PowerMap
+    from ...tracing.power_map import Traced
 
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
@@ -131,7 +131,7 @@ class PriorMean:
     receivers_m: FloatArray
     transmit_dbm: float
     frequency_hz: float
-    traced: PowerMap | None
+    traced: Traced | None
     sd: FloatArray
     rx_sd_db: float
 

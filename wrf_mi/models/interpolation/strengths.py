@@ -7,6 +7,7 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ from .strength_fit import Field, Fit, PriorMean, shift_of, widening
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
-    from ...tracing.power_map import PowerMap
+    from ...tracing.power_map import Traced
 
 HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""
@@ -155,17 +156,23 @@ class Strengths(Fitted):
             **field_arrays(field.hyperparameters, "knob."),
         }
         if prior.traced is not None:
-            arrays |= field_arrays(prior.traced, "map.")
+            arrays |= field_arrays(getattr(prior.traced, "local", prior.traced), "map.")
+            if hasattr(prior.traced, "traced_dbm"):
+                arrays["exact.traced_dbm"] = prior.traced.traced_dbm(stops.poses.position_m)
         return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays) -> Strengths:
-        """The model that `arrays` stored."""
-        traced = None
+    def from_arrays(cls, arrays: Arrays, trace: Callable[[FloatArray], FloatArray] | None = None) -> Strengths:
+        """The model that `arrays` stored; ``trace`` of `wrf_mi.tracing.power_map.TracedPower`, if that is its mean."""
+        traced: Traced | None = None
         if "map.power_dbm" in arrays:
-            from ...tracing.power_map import PowerMap  # the tracer is imported where there is a scene
+            from ...tracing.power_map import PowerMap, TracedPower  # the tracer is imported where there is a scene
 
             traced = from_field_arrays(PowerMap, arrays, "map.")
+            if "exact.traced_dbm" in arrays:
+                assert trace is not None
+                traced = TracedPower(traced, trace)
+                traced.know(arrays["stop.position_m"], arrays["exact.traced_dbm"])
         transmit_dbm, frequency_hz = map(float, arrays["base"])
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
@@ -195,7 +202,7 @@ class Strengths(Fitted):
 def fit_strengths(
     record: Record,
     rows: IntArray,
-    power_map: PowerMap | None = None,
+    power_map: Traced | None = None,
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
 ) -> Strengths:
@@ -206,7 +213,7 @@ def fit_strengths(
     Args:
         record: signal strengths with a single, known carrier.
         rows: numbers of training rows, in the order of time (`wrf_mi.models.interpolation.strength_fit.folds`).
-        power_map: local mean of traced power; None: free space is expected.
+        power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings.
         on_progress: progress callback.
 
@@ -256,7 +263,7 @@ def fit_strengths(
     return Strengths(field, shift, widen, facts)
 
 
-def _prior(record: Record, measured: Measured, power_map: PowerMap | None, settings: StrengthSettings) -> PriorMean:
+def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:
     """Expected signal strength before the fit."""
     assert record.frequencies_hz is not None
     receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
