@@ -59,14 +59,15 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
 
 
 def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
-    """Print what each stage of a fit contributes on held-out training rows."""
+    """Print what each stage of a fit contributes on held-out training rows and on test rows, and what it costs."""
     if not reports:
         return
-    print(f"{'stage':<16}{'held-out rows, mean ' + label:>32}{'seconds':>10}")
+    scores = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f")
+    columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".2g")
+    print(f"{'stage, mean ' + label:<24}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for one in reports:
-        score = "" if one["held_out"] is None else f"{one['held_out']:.3f}"
-        seconds = "" if one["seconds"] is None else f"{one['seconds']:.0f}"
-        print(f"{one['stage']:<16}{score:>32}{seconds:>10}{'' if one['kept'] else '  not kept'}")
+        cells = [f"{one[key]:{form}}" if one.get(key) is not None else "" for key, _, form in columns]
+        print(f"{one['stage']:<24}" + "".join(f"{cell:>15}" for cell in cells) + ("" if one["kept"] else "  not kept"))
 
 
 @contextmanager

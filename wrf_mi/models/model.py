@@ -174,6 +174,10 @@ class Decomposition:
     paths: PathStatistics | None = None
 
 
+PredictAll = Callable[[Inputs], NDArray[Any]]
+"""Observations of all receivers [n_rx, m, ...] for inputs [m]."""
+
+
 class Fitted(ABC):
     """A fitted model.
 
@@ -217,6 +221,10 @@ class Fitted(ABC):
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Stored predictions for rows of the record; None: `predict` makes them."""
         return None
+
+    def by_stage(self, split: Split) -> dict[str, PredictAll]:
+        """Predictions by the stages up to each but the last, for a fit in stages (entry ``stages`` of `facts`)."""
+        return {}
 
     def facts(self) -> dict[str, Any]:
         """Further entries of ``metrics.json``."""

@@ -46,10 +46,7 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     found.append((f"{slug}-time.png", "Time against error", scatter))
     staged = {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}
     if staged:
-        test = {run.name: run.metrics[task.block]["mean"] for run in runs}
-        found.append(
-            (f"{slug}-stages.png", "What each stage contributes", figures.stage_steps(staged, test, task.label))
-        )
+        found.append((f"{slug}-stages.png", "What each stage contributes", figures.stage_steps(staged, task.label)))
     if np.isfinite(runs[0].tx_pos_m).all():
         found += _error_maps(slug, runs)
     if (view := _scene(runs)) is not None:

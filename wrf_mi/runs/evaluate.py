@@ -22,7 +22,7 @@ from ..datasets.observations import scorable
 from ..models import Fitted, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
-from ..models.model import default_settings, inputs_of
+from ..models.model import PredictAll, default_settings, inputs_of
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from ..training.trainer import peak_memory_mb
@@ -45,6 +45,8 @@ SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
 """Arrays of ``predictions.npz`` without an axis of receivers."""
 REPEATS = 20
 """Largest number of single predictions that are timed."""
+MOST_OF_STAGES = 400
+"""Test rows by which the stages of a fit are scored."""
 TIMED_S = 2.0
 """Time after which no further single prediction is begun: some models optimise for each sample."""
 
@@ -210,7 +212,38 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
     metrics, arrays = evaluate(record, part.split, predict, single)
     if not problem.use_rows:
         metrics["n_train"] = 0  # those of the references
-    return metrics, arrays
+    return metrics | _stage_scores(record, part, metrics, arrays), arrays
+
+
+def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
+    """``stages`` of a fit in stages with ``test`` and ``ms`` of those that were kept.
+
+    They are the mean score of test rows and the milliseconds of a prediction by the stages up to each; of many test
+    rows `MOST_OF_STAGES`, evenly spaced, are scored.
+    """
+    predictions = part.fitted.by_stage(part.split)
+    if not predictions:
+        return {}
+    task, rows = TASKS[record.task], arrays["row"]
+    some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
+    truth = arrays["truth"][:, some]
+    reports = [dict(one) for one in part.fitted.facts()["stages"]]
+    kept = [one for one in reports if one["kept"]]
+    for one in kept:
+        if one["stage"] in predictions:
+            predict = predictions[one["stage"]]
+            found = np.asarray(predict(inputs_of(record, rows[some])))
+
+            def single(row: IntArray, receiver: int, predict: PredictAll = predict) -> NDArray[Any]:
+                return predict(inputs_of(record, row))
+
+            milliseconds = _milliseconds_per_sample(single, rows, 0) / len(truth)
+        elif one is kept[-1]:
+            found, milliseconds = arrays["prediction"][:, some], metrics["ms_per_sample"]
+        else:
+            continue
+        one |= {"test": float(np.nanmean(task.of_rows(found, truth))), "ms": milliseconds}
+    return {"stages": reports}
 
 
 def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str, Any]:

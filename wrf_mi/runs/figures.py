@@ -221,36 +221,37 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
     return figure
 
 
-def stage_steps(
-    stages: Mapping[str, Sequence[Mapping[str, Any]]], test: Mapping[str, float], label: str = "SSIM"
-) -> Figure:
-    """Mean score of held-out training rows by the stages up to each; hollow where a stage was not kept.
+def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = "SSIM") -> Figure:
+    """Mean scores by the stages up to each, of held-out training rows (line; hollow where a stage was not kept) and of
+    test rows (dashed); seconds of a stage's fit and milliseconds of a prediction beside.
 
     Args:
         stages: entries ``stages`` of ``metrics.json`` of each run by its name.
-        test: mean score of the test rows of each run, which is drawn behind the last stage.
         label: name of the score.
     """
-    judged = {name: [one for one in reports if one["held_out"] is not None] for name, reports in stages.items()}
-    order = list(dict.fromkeys(one["stage"] for reports in judged.values() for one in reports))
-    order.sort(key=[*STAGES, *order].index)
+    names = list(dict.fromkeys(one["stage"] for reports in stages.values() for one in reports))
+    order = sorted(names, key=[*STAGES, *names].index)
     figure = Figure(figsize=(1.2 * len(order) + 3.5, 4), layout="constrained")
     axes = figure.subplots()
-    for name, reports in judged.items():
-        kept = [one for one in reports if one["kept"]]
-        places, scores = [order.index(one["stage"]) for one in kept], [one["held_out"] for one in kept]
-        (line,) = axes.plot([*places, len(order)], [*scores, test[name]], drawstyle="steps-post", label=name)
-        axes.scatter([*places, len(order)], [*scores, test[name]], color=line.get_color(), zorder=3)
-        others = [one for one in reports if not one["kept"]]
-        where, found = [order.index(one["stage"]) for one in others], [one["held_out"] for one in others]
-        axes.scatter(where, found, facecolors="none", edgecolors=line.get_color(), zorder=3)
+    for name, reports in stages.items():
+        kept, color = [one for one in reports if one["kept"]], None
+        for key, style, what in (("held_out", "-", "held-out rows"), ("test", "--", "test rows")):
+            scored = [one for one in kept if one.get(key) is not None]
+            places, scores = [order.index(one["stage"]) for one in scored], [one[key] for one in scored]
+            (line,) = axes.plot(places, scores, style, marker="o", color=color, label=f"{name}, {what}")
+            color = line.get_color()
+        left = [one for one in reports if not one["kept"] and one["held_out"] is not None]
+        where, scores = [order.index(one["stage"]) for one in left], [one["held_out"] for one in left]
+        axes.scatter(where, scores, facecolors="none", edgecolors=color, zorder=3)
         for one in reports:
-            if one["seconds"] is not None:
-                at = order.index(one["stage"]), one["held_out"]
-                text = f"{one['seconds']:.0f} s"
-                axes.annotate(text, at, (4, 4), textcoords="offset points", fontsize=7, color=line.get_color())
-    axes.set_xticks(range(len(order) + 1), [*order, "test rows"])
-    axes.set_ylabel(f"mean {label}, held-out training rows")
+            costs = [f"{one[key]:.2g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if one.get(key)]
+            score = one["held_out"] if one["held_out"] is not None else one.get("test")
+            if costs and score is not None:
+                at = order.index(one["stage"]), score
+                text = ", ".join(costs)
+                axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
+    axes.set_xticks(range(len(order)), order)
+    axes.set_ylabel(f"mean {label}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

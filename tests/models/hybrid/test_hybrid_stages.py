@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,6 +69,10 @@ def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tu
     corrected = max(reports[stage]["held_out"] for stage in ("calibration", "correction"))
     assert corrected > reports["mean"]["held_out"] + CLEAR_GREY
     assert {"surfaces", "field", "residual"} <= set(reports)
+    kept = [one for one in reports.values() if one["kept"]]
+    # Test rows lie in the same part of the wrong scene.
+    assert kept[0]["test"] + CLEAR_GREY < kept[-1]["test"] == pytest.approx(spectra[0].metrics["ssim"]["mean"])
+    assert all(one["ms"] > 0 for one in kept)
 
 
 def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(
@@ -126,6 +131,8 @@ def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str
     assert names[0] == "mean"
     assert names[-1] == "residual"
     assert ("field" in names) == (task == "csi")  # powers of uncertain positions have none
+    if task == "rssi":  # traced at exact positions in a scene that is close to the true one
+        assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
     again = wrf_mi.open_run(run.folder, record)
     assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
 

@@ -107,6 +107,12 @@ class FittedField(Fitted):
         gaussians = {} if self.field is None else {"gaussians": int(self.params["position"].shape[1])}
         return {"steps": self.config.steps} | gaussians
 
+    def without_gaussians(self) -> FittedField:
+        """The same paths without the Gaussians beside them."""
+        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, PACKED, REACH))}
+        params = {name: values for name, values in self.params.items() if name.startswith(TRACED_NAMES)}
+        return FittedField(other | keyed(PARAM, params), self.config, self._problem, self._store)
+
     def packed(self, params: Params, precision: str) -> Arrays:
         """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
         kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, PACKED))}

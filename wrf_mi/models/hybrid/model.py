@@ -30,7 +30,6 @@ from .. import MODELS
 from ..held_out import (
     HeldOut,
     RowDistance,
-    as_unseen,
     fit_model,
     held_out_predictions,
     hold_out,
@@ -45,6 +44,7 @@ from ..model import (
     Fitted,
     Inputs,
     Model,
+    PredictAll,
     Problem,
     Session,
     field_arrays,
@@ -53,9 +53,10 @@ from ..model import (
     known_positions,
     under,
 )
+from .contributions import by_stage
 from .mixture import Mixture, choose, constant
 from .parts import KRIGING, PATHS, TRACED, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
-from .scene_side import RESIDUAL, SceneSide, StageReport, stated_reports
+from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
 
 logger = logging.getLogger(__name__)
 FOLDER = "parts"
@@ -259,6 +260,11 @@ class FittedHybrid(Fitted):
             arrays |= keyed(f"{name}/", fitted.arrays())
         return arrays
 
+    def by_stage(self, split: Split) -> dict[str, PredictAll]:
+        """Predictions of the stages up to each but the last, see `wrf_mi.models.hybrid.contributions`."""
+        side, kept = self.parts.get(PATHS), [one["stage"] for one in self._facts["stages"] if one["kept"]]
+        return by_stage(self._problem, split, side, kept) if isinstance(side, SceneSide) and kept else {}
+
     def facts(self) -> dict[str, Any]:
         """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
         return self._facts
@@ -285,7 +291,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     interpolates = RESIDUAL in problem.settings.wanted and not task_of(record).in_decibel and record.carriers_hz is None
 
     def fit_part(name: str) -> Fitted:
-        place = _inside(session, FOLDER, name)
+        place = inside(session, FOLDER, name)
         place.folder.mkdir(parents=True, exist_ok=True)
         return fit_model(*parts[name], split, labelled(place, name))[0]
 
@@ -298,13 +304,13 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
             assert isinstance(one, SceneSide)
             reports += one.stages
             entry, inner = scene_side(record)[1], one.problem  # the scene is corrected once
-            unseen = None if held is None else one.held_out_at(held.receiver, held.row)
+            unseen = None if held is None else one.held_out_at(held)
         if fold is None or held is None:
             continue
         if unseen is not None:
-            predictions[name] = Prediction(as_unseen(unseen, inner, held))
+            predictions[name] = unseen
         else:
-            place = _inside(session, FOLDER, name, "held")
+            place = inside(session, FOLDER, name, "held")
             predictions[name] = held_out_predictions(entry, inner, fold, held, place, name)
         if name == PATHS and interpolates:
             residuals, predictions[RESIDUAL] = _residuals(one, record, split, fold, held, predictions[name], problem)
@@ -332,11 +338,6 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedHybrid:
     }
     whole = {name: fitted.get(name) or fit_part(name) for name in used if name != RESIDUAL}
     return FittedHybrid(problem, rows, whole, kept, residuals if RESIDUAL in used else None, intervals, facts)
-
-
-def _inside(session: Session, *names: str) -> Session:
-    place = session.folder.joinpath(*names)
-    return replace(session, folder=place, run=place)
 
 
 def _residuals(

@@ -1,0 +1,69 @@
+"""Predictions by the stages of a hybrid up to each, for their scores and times on test rows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import Split
+from ...correction import default_options
+from ...tasks import instrument_of, task_of
+from ...tracing import TraceOptions
+from ...tracing.offsets import fit_offsets
+from ...tracing.tracer import RayTracer
+from ..model import Fitted, Inputs, PredictAll, Problem
+from .paths import FittedPaths
+from .scene_side import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, SceneSide
+
+
+def by_stage(problem: Problem, split: Split, side: SceneSide, kept: Collection[str]) -> dict[str, PredictAll]:
+    """Predictions of the stages up to each but the last.
+
+    Args:
+        problem: problem of the hybrid, with the scene as it is stated.
+        split: its training rows fit offsets of traced signal strengths.
+        side: the fitted scene's side.
+        kept: stages that are used.
+    """
+    predictions: dict[str, PredictAll] = {}
+    if MEAN in kept:
+        predictions[MEAN] = _traced(problem, split)
+    if side.problem.scene != problem.scene:
+        predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in kept}
+    if isinstance(side, FittedPaths):
+        if SURFACES in kept:
+            predictions[SURFACES] = _of_all(side.graph.without_gaussians() if FIELD in kept else side)
+        if FIELD in kept:
+            predictions[FIELD] = _of_all(side)
+    predictions.pop([stage for stage in STAGES if stage in kept][-1], None)
+    return predictions
+
+
+def _of_all(fitted: Fitted) -> PredictAll:
+    def predict(inputs: Inputs) -> NDArray[np.generic]:
+        assert fitted.receivers is not None
+        return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(len(fitted.receivers))])
+
+    return predict
+
+
+def _traced(problem: Problem, split: Split) -> PredictAll:
+    """Traced reports; strengths with the offset of each receiver that fits its training rows."""
+    record, how = problem.record, default_options(problem.record)
+    stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
+    options = TraceOptions(transmission=True, max_depth=how.depth, max_reflections=how.reflections)
+    assert problem.scene is not None
+    tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
+    offsets = None
+    if task_of(record).in_decibel:
+        rows = split.all_train
+        offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])
+
+    def predict(inputs: Inputs) -> NDArray[np.generic]:
+        traced = tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row, carriers_hz=inputs.carriers_hz)
+        observed = tracer.observe(traced)
+        return observed if offsets is None else offsets(observed)
+
+    return predict
