@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.blend_rays import Walls
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.tracing.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
 from wrf_mi.tracing.slab import slab
 
+from .blend_rays import Walls
 from .shape import interleave
 
 ITU_PREFIX = "mat-itu_"

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_fields import BATCH, COUNT, POSE, RECEIVER, SIZE, Float64, fields
 from scipy.special import logit
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core.angles import pixel_directions
-from wrf_mi.gaussians import oracle
 from wrf_mi.gaussians.density import adapt
 from wrf_mi.gaussians.footprint import depth_order, project, ranked_order
 from wrf_mi.gaussians.footprint_constants import CUTOFF

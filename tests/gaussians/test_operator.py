@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import (
     Gaussians,
-    oracle,
 )
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat

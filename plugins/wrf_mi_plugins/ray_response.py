@@ -24,9 +24,9 @@ from typing import Any
 
 import drjit as dr
 
-from .footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
-from .footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
-from .parameters import Gaussians
+from wrf_mi.gaussians.footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
+from wrf_mi.gaussians.footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.parameters import Gaussians
 
 RAY_FIELDS = 12
 """Numbers of one Gaussian's response along any ray: n, a, b (3 each), k1, k2 and 1 / L^2."""
