@@ -13,10 +13,6 @@ from typing import Any
 
 from .errors import DataFault, InputError
 
-LONGEST = 300
-"""Most characters of another library's message: some hold the damaged content."""
-
-
 MOST_MESSAGE = 400
 """Characters that are shown of another library's message: some repeat the content of a file."""
 
@@ -130,7 +126,7 @@ def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[Non
     except InputError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise DataFault(path, f"not readable ({one_line(error)[:LONGEST]}); {remedy}") from None
+        raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
 
 
 LEFTOVER = re.compile(r"\.(.+)\.(\d+)\.(part|old)")

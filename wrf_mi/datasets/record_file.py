@@ -7,7 +7,7 @@ names; ``train`` and ``test`` are the official rows, ``tx_antenna`` the attribut
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,7 @@ from ..core.files import readable
 from .folder_files import single_file
 
 VERSION, FORMAT = "record_format", 1
-OPTIONAL = (
-    "folds",
-    "frequencies_hz",
-    "tx_heading_rad",
-    "uplink",
-    "uplink_hz",
-    "truth",
-    "n_readings",
-    "std",
-    "carriers_hz",
-    "runs",
-)
+OPTIONAL = tuple(one.name for one in fields(Record) if one.default is None and one.name != "official")
 """Attributes of a record that may be None."""
 
 
