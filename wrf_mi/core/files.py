@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from .errors import DataFault, InputError
 
 MOST_MESSAGE = 400
@@ -129,19 +131,8 @@ def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[Non
         raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
 
 
-LEFTOVER = re.compile(r"\.(.+)\.(\d+)\.(part|old)")
+LEFTOVER = re.compile(r"\.(.+)\.(\d{1,9})\.(part|old)")
 """Name of a temporary file or folder: the name that it is to take or had, and the number of its process."""
-
-
-def _is_running(process: int) -> bool:
-    """Whether a process of that number runs; this one does not count, as it makes each temporary file once."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return process != os.getpid()
 
 
 def remove_leftovers(folder: Path, name: str | None = None) -> None:
@@ -155,7 +146,10 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
         found = LEFTOVER.fullmatch(path.name)
-        if found is None or _is_running(int(found[2])):
+        if found is None:
+            continue
+        # Files of this process count: it makes each temporary file once.
+        if (process := int(found[2])) != os.getpid() and psutil.pid_exists(process):
             continue
         last = found[1]
         while inner := LEFTOVER.fullmatch(last):  # a temporary folder that is written atomically itself
