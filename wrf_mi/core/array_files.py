@@ -41,11 +41,7 @@ class ArrayStream:
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
     """Write an ``.npz`` file of plain arrays, or of `ArrayStream`, atomically.
 
-    Args:
-        path: file to write.
-        arrays: arrays by their names.
-        compressed: compress them.
-        checksum: add a checksum, which `stored_arrays` compares; not for `ArrayStream`.
+    `stored_arrays` compares the checksum, which `ArrayStream` cannot have.
     """
     stored = dict(arrays)
     if checksum:

@@ -53,12 +53,9 @@ _REMEDIES = {
 
 
 def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
-    """An error of the operating system and its remedy, on one line.
+    """An error of the operating system and its remedy, on one line, beside a ``path`` or the one that it names.
 
-    Args:
-        error: error of the system.
-        path: file or folder; None: the one that the error names.
-        what: verb phrase, such as "cannot be written".
+    ``what`` is a verb phrase, such as "cannot be written".
     """
     file = path or (error.filename2 if error.filename2 is not None else error.filename)
     text = one_line(error.strerror or error)
@@ -74,12 +71,7 @@ MOST_NAME = 1024
 
 
 def inside(folder: Path, name: object, source: str | Path) -> Path:
-    """The path of a file that another file names, below its folder.
-
-    Args:
-        folder: folder that the file has to be in.
-        name: stated name.
-        source: file that states it, for the message.
+    """The path in a folder of the file that another file, the ``source``, names.
 
     Raises:
         InputError: no name, or one that leaves the folder.
@@ -138,11 +130,8 @@ LEFTOVER = re.compile(r"\.(.+)\.(\d{1,9})\.(part|old)")
 def remove_leftovers(folder: Path, name: str | None = None) -> None:
     """Remove temporary files and folders that killed processes left in a folder, at any depth.
 
-    A folder that was to be replaced, and had lost its name, takes it again.
-
-    Args:
-        folder: the folder.
-        name: only leftovers beside the file or folder of this name in ``folder``, not below it.
+    A folder that was to be replaced, and had lost its name, takes it again. With a ``name`` only leftovers beside the
+    file or folder of this name are removed.
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
         found = LEFTOVER.fullmatch(path.name)
@@ -180,10 +169,6 @@ def atomic_file(path: Path) -> Iterator[Path]:
 @contextmanager
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its name if the block succeeds and is removed otherwise.
-
-    Args:
-        path: the folder to make.
-        replace: replace an existing folder.
 
     Raises:
         InputError: ``path`` exists and may not be replaced, or cannot be written.

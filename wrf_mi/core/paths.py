@@ -41,6 +41,9 @@ class Paths:
         object_names: names of the scene's surfaces.
         n_tx: transmitters traced, with or without a path.
         n_rx: receivers traced, with or without a path.
+
+    Raises:
+        ValueError: arrays of inconsistent shapes.
     """
 
     tx: IntArray
@@ -61,11 +64,6 @@ class Paths:
         return len(self.tx)
 
     def __post_init__(self) -> None:
-        """Reject arrays of inconsistent shapes.
-
-        Raises:
-            ValueError: naming the array.
-        """
         depth = self.interactions.shape[1] if self.interactions.ndim == 2 else -1
         more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
         more |= {"objects": (depth,), "vertices_m": (depth, 3)}

@@ -84,21 +84,13 @@ class CheckedSettings:
     """Base of settings whose numbers are checked (`check`) when they are made."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
         check(self)
 
 
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
-    """Settings from a nested dictionary; what it does not name keeps its default.
+    """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
-    Args:
-        kind: dataclass of the settings.
-        values: nested as the dataclass is.
-        source: name of the file or option, for messages.
+    ``source`` names the file or option in messages.
 
     Raises:
         InputError: an unknown name, or a value of the wrong type or out of its range.

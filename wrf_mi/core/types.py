@@ -21,17 +21,15 @@ class Prediction:
         mean: [m, *shape of an observation], as in `wrf_mi.core.Record`: grey in 0..1, dBm, or complex coefficients.
         std: standard deviation of observation minus mean, real, of the mean's shape and unit; for a complex coefficient
             sqrt(E |h - mean|^2). None: the model states none.
+
+    Raises:
+        ValueError: shapes that differ.
     """
 
     mean: NDArray[Any]
     std: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        """Refuse shapes that differ.
-
-        Raises:
-            ValueError: naming both shapes.
-        """
         if self.std is not None and np.shape(self.mean) != np.shape(self.std):
             raise ValueError(f"Prediction: mean {np.shape(self.mean)} and std {np.shape(self.std)} differ in shape")
 

@@ -256,6 +256,9 @@ class Factorised:
         layers: hidden layers of the network.
         width: neurons of a hidden layer.
         components: complex signals of a Gaussian, with K coefficients each.
+
+    Raises:
+        InputError: an encoding without features of the transmitter.
     """
 
     encoding: Encoding = field(default_factory=Encoding)
@@ -270,11 +273,6 @@ class Factorised:
     signal_parameters = ("signal", "terms.")
 
     def __post_init__(self) -> None:
-        """Refuse an encoding without features of the transmitter.
-
-        Raises:
-            InputError: no octaves.
-        """
         if not self.encoding.sizes["transmitter"]:
             raise InputError("setting encoding.tx_octaves: 0 leaves factorised nothing to see; choose 1 or more")
 

@@ -236,12 +236,8 @@ class _Operator(ABC):
 class Images(_Operator):
     """Complex images that add up to a spectrum: R = sum_k c_k image_k.
 
-    Real and imaginary parts are products of one real matrix, a fifth faster than a complex product.
-
-    Args:
-        images: complex images [K, height * width].
-        height: rows.
-        width: columns.
+    ``images`` are complex, [K, height * width]. Real and imaginary parts are products of one real matrix, a fifth
+    faster than a complex product.
     """
 
     def __init__(self, images: ArrayLike, height: int, width: int) -> None:
@@ -261,13 +257,7 @@ class Images(_Operator):
 
 
 class PixelOperator(_Operator):
-    """Map from signals [batch, n] to the perception plane by sparse weights.
-
-    Args:
-        weights: matrix [pixels, n], see `pixel_weights`.
-        height: rows of the plane.
-        width: columns.
-    """
+    """Map from signals [batch, n] to the perception plane by sparse weights [pixels, n] (`pixel_weights`)."""
 
     def __init__(self, weights: csr_array, height: int, width: int) -> None:
         self.weights, self.height, self.width = weights, height, width

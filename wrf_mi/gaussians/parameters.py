@@ -45,7 +45,6 @@ class Gaussians:
     batch: int
 
     def __post_init__(self) -> None:
-        """Refuse Gaussians without a blending rule."""
         if (self.opacity is None) == (self.attenuation is None):
             raise ValueError("Gaussians need either an opacity (alpha blending) or an attenuation (product blending)")
 

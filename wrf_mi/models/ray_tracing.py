@@ -81,7 +81,6 @@ class TracingSettings(LoopOptions, TraceOptions):
     target_kinds: str = ",".join(CHOSEN_KINDS)
 
     def __post_init__(self) -> None:
-        """Refuse settings out of range."""
         super().__post_init__()
         if self.calibration is None and (chosen := self.chosen()):
             raise InputError(f"setting {chosen[0]}: of a training, and nothing is calibrated; set calibration, too")

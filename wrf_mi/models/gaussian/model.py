@@ -105,8 +105,6 @@ class FittedField(Fitted):
         store: folder in which operators are kept (`wrf_mi.training.static_operator`).
 
     Attributes:
-        params: parameters by name.
-        form: form of the observations.
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
         held_out: reports of training rows on which its stages were chosen; None after loading, or where none were.
     """

@@ -79,13 +79,7 @@ class DcganSettings(NetworkSettings):
 
 @dataclass(frozen=True)
 class Grid:
-    """Sizes of an image batch.
-
-    Attributes:
-        batch: number of images.
-        height: rows of an image.
-        width: columns of an image.
-    """
+    """Number, height and width of the images of a batch."""
 
     batch: int
     height: int

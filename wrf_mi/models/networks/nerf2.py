@@ -110,7 +110,6 @@ class Nerf2Settings(NetworkSettings):
     shared: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse settings out of range."""
         super().__post_init__()
         if self.far_m and self.far_m <= self.near_m:
             raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
@@ -154,9 +153,6 @@ class Field(Fitted):
         scales: unit of each receiver's channels [n_rx].
 
     Attributes:
-        outputs: complex numbers that a ray brings.
-        task: task of the record.
-        n_rays: rays of a receiver.
         groups: indices of the receivers that share networks.
         data: constants of every evaluation on the device: rays of all receivers, and `constant_parts`.
         network: networks whose weights are to be replaced.

@@ -139,14 +139,7 @@ def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
 
 @dataclass(frozen=True)
 class FittedFire(Fitted):
-    """A fitted network.
-
-    Attributes:
-        sample: ``antenna`` or ``row``.
-        network: encoder and decoder.
-        bands: bands of the training data.
-        settings: settings of the fit.
-    """
+    """A fitted network for samples of an ``antenna`` or a ``row``."""
 
     sample: str
     network: Fire
