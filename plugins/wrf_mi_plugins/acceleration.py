@@ -33,7 +33,7 @@ from wrf_mi.gaussians.footprint import Pose, depth_order
 from wrf_mi.gaussians.parameters import Gaussians
 
 from .bundles import Bundles, RayLists
-from .ray_response import Hulls, RayFootprints, hulls
+from .ray_response import Hulls, RayFootprints, hulls, to_world
 
 IN_PART = 64
 """Approximate ellipsoids per part: with fewer, most rays meet none of it; with more, each trace tests many."""
@@ -142,7 +142,7 @@ def _hits(ellipsoids: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any
     behind = dr.max(dr.select(radius + STEP > distance, distance + radius + STEP, 0))
     ray = dr.arange(mi.UInt32, 2 * parts * lists)
     axis = [dr.gather(mi.Float, c, ray % lists) for c in bundles.axis]
-    turned = dr.detach(mi.Vector3f(*pose.from_local(axis)))
+    turned = dr.detach(mi.Vector3f(*to_world(pose, axis)))
     back = ray >= parts * lists
     end = SIZE + STEP
     origin = _place((ray // lists) % parts, across) + turned * dr.select(back, end, -behind)

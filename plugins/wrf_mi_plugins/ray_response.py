@@ -57,6 +57,11 @@ class RayFootprints:
         return [*self.direction, *self.whitened[0], *self.whitened[1], *self.lean, self.depth_extent]
 
 
+def to_world(pose: Pose, v: list[Any]) -> list[Any]:
+    """A vector of the receiver's frame in the world frame (R v)."""
+    return [sum((row[k] * v[k] for k in (1, 2)), row[0] * v[0]) for row in pose.to_world]
+
+
 @dataclass
 class Hulls:
     """Ellipsoids around the part of a Gaussian that a ray may meet, arrays [n], metres; detached.

@@ -32,10 +32,6 @@ class Pose:
         """A world vector in the receiver's frame (R^T v)."""
         return [sum((self.to_world[k][i] * v[k] for k in (1, 2)), self.to_world[0][i] * v[0]) for i in range(3)]
 
-    def from_local(self, v: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
-        """A vector of the receiver's frame in the world frame (R v)."""
-        return [sum((row[k] * v[k] for k in (1, 2)), row[0] * v[0]) for row in self.to_world]
-
 
 @dataclass
 class Footprints:

@@ -263,17 +263,6 @@ class PixelOperator(_Operator):
         self.weights, self.height, self.width = weights, height, width
         self.kind = np.result_type(weights.dtype, np.complex64)
 
-    @classmethod
-    def of(cls, gaussians: Gaussians, pose: Pose, plane: Plane) -> PixelOperator:
-        """The operator of Gaussians of static geometry and one receiver; see `pixel_weights`."""
-        return cls(pixel_weights(gaussians, pose, plane), plane.height, plane.width)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the weights."""
-        w = self.weights
-        return w.data.nbytes + w.indices.nbytes + w.indptr.nbytes
-
     def field(self, signals: ArrayLike) -> ComplexArray:
         """R [batch, height * width] of complex signals [batch, n]."""
         columns = np.asarray(signals, self.kind).T
