@@ -103,12 +103,7 @@ def text_lines(path: Path) -> list[str]:
 
 @contextmanager
 def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[None]:
-    """Turn any error of a block that reads a file into one line.
-
-    Args:
-        path: the file.
-        missing: error for a missing file, or its message.
-        remedy: end of the message for a damaged file.
+    """Turn any error of a block that reads a file into one line: ``missing``, or for a damaged file the ``remedy``.
 
     Raises:
         InputError: naming the file.
@@ -212,8 +207,8 @@ def append_line(path: Path, line: str) -> None:
             raise
 
 
-def write_figure(path: Path, figure: Any, dpi: int = 110) -> Path:
+def write_figure(path: Path, figure: Any) -> Path:
     """Write a Matplotlib figure as PNG atomically."""
     with atomic_file(path) as part:
-        figure.savefig(part, format="png", dpi=dpi, metadata={"Software": None})
+        figure.savefig(part, format="png", dpi=110, metadata={"Software": None})
     return path

@@ -64,9 +64,7 @@ NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of the BLE data (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received; the rows of

@@ -42,11 +42,7 @@ def write_record_file(path: str | Path, record: Record) -> Path:
 
 
 def read_record_file(path: str | Path, name: str | None = None) -> Record:
-    """Read a file of `write_record_file`.
-
-    Args:
-        path: path of the file, or of a folder that holds it alone.
-        name: name of the record; by default the one that is stored.
+    """Read a file of `write_record_file`, or a folder that holds it alone, with another name if one is given.
 
     Raises:
         InputError: a file that is missing or damaged, or of another format version.

@@ -63,9 +63,7 @@ GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the NeRF2 spectrum layout (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="spectrum"``, positions [n, 3] in metres and ``observation`` [n_rx, n, height, width]

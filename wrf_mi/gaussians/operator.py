@@ -153,13 +153,7 @@ def _weights(
 
 
 def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: float = np.inf) -> csr_array:
-    """The weights of the perception plane, computed one row of tiles after the other.
-
-    Args:
-        gaussians: Gaussians for one transmitter (batch 1); signals are not read.
-        pose: pose of the receiver.
-        plane: perception plane of the receiver, of the Gaussians' float type.
-        most_bytes: largest size of the weights.
+    """The weights of Gaussians for one transmitter on the perception plane, one row of tiles after the other.
 
     Returns:
         Matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a row
@@ -287,11 +281,6 @@ def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> NDArray[np.float6
     In the terms of `wrf_mi.gaussians.recurrence`: removal of Gaussian i takes away w_i T_i S_i, and scales the sum Q_i
     behind it, which it hides, by 1 / b_i. With the weights B_i = w_i T_i of `pixel_weights`, the transmittance is
     T_i = 1 - sum_{k < i} B_k (alpha blending) or 1 - sum_{k < i} B_k (1 - delta_k) (product blending).
-
-    Args:
-        gaussians: Gaussians for one transmitter (batch 1).
-        pose: pose of the receiver.
-        plane: the receiver's perception plane.
     """
     weights = pixel_weights(gaussians, pose, plane)
     seen, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)

@@ -98,11 +98,7 @@ REACH = "reach_m"
 class FittedField(Fitted):
     """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
 
-    Args:
-        arrays: arrays of a run file.
-        config: settings of the training.
-        problem: data and scene.
-        store: folder in which operators are kept (`wrf_mi.training.static_operator`).
+    Operators are kept in the folder ``store`` (`wrf_mi.training.static_operator`).
 
     Attributes:
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.

@@ -145,12 +145,7 @@ class Field(Fitted):
 
     Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
 
-    Args:
-        record: data with the receivers.
-        settings: settings of NeRF2.
-        coordinates: frame of positions.
-        far_m: distance at which rays end, metres.
-        scales: unit of each receiver's channels [n_rx].
+    Rays end at ``far_m`` metres; ``scales`` are the units of the receivers' channels, [n_rx].
 
     Attributes:
         groups: indices of the receivers that share networks.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import field_arrays, from_field_arrays, received_rows
+from ..model import received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -47,15 +46,6 @@ class Bands:
     def spacing_hz(self) -> float:
         """Smallest distance of two uplink subcarriers; infinite with a single subcarrier."""
         return float(np.diff(np.sort(self.uplink_hz)).min(initial=np.inf))
-
-    def arrays(self, wavefront: str) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file, with the name of a wave model."""
-        return {"wavefront": np.array(wavefront), **field_arrays(self)}
-
-    @classmethod
-    def load(cls, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, Bands]:
-        """Wave model and bands that `arrays` described."""
-        return str(arrays["wavefront"]), from_field_arrays(cls, arrays)
 
 
 def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:

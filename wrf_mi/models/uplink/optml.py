@@ -34,7 +34,18 @@ from ...core.settings import Count
 from ...core.types import IntArray
 from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
-from ..model import Arrays, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
+from ..model import (
+    Arrays,
+    Inputs,
+    Model,
+    Problem,
+    field_arrays,
+    from_field_arrays,
+    keyed,
+    settings_array,
+    stored_settings,
+    under,
+)
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .csi_bands import Bands
@@ -247,8 +258,8 @@ class OptML(R2F2):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, wave model, bands and weights."""
-        settings = {"settings": settings_array(self.settings)}
-        return settings | self.bands.arrays(self.kind) | keyed("network/", self.network.arrays())
+        settings = {"settings": settings_array(self.settings), "wavefront": np.array(self.kind)}
+        return settings | field_arrays(self.bands) | keyed("network/", self.network.arrays())
 
 
 def prune(
@@ -315,7 +326,8 @@ def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> OptML:
     """The model that `OptML.arrays` described."""
-    settings, (kind, bands) = stored_settings(OptMLSettings, arrays, "optml"), Bands.load(arrays)
+    settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
+    bands = from_field_arrays(Bands, arrays)
     waves = waves_of(kind, bands, settings.max_distance_m)
     network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
     return OptML(kind, bands, settings, network)

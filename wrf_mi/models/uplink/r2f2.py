@@ -37,7 +37,7 @@ from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
 from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, under
+from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays, keyed, under
 from .csi_bands import Bands, bands_of, known_rows, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
@@ -62,12 +62,6 @@ class ScenePaths:
     Over a band of some megahertz an uplink tells directions well, but lengths only to metres, and the phase between the
     bands turns with the length. A mesh that is centimetres off knows lengths far better. Gains are those of the uplink
     alone: materials are not needed.
-
-    Args:
-        scene: scene from `wrf_mi.tracing.open_scene`.
-        receiver: receiver with an array.
-        tx_antenna: antenna of the transmitters.
-        options: options of the search.
     """
 
     def __init__(self, scene: Any, receiver: Receiver, tx_antenna: Antenna, options: TraceOptions) -> None:
@@ -242,7 +236,7 @@ class R2F2(Fitted):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Wave model, bands and settings."""
         settings = {name: np.array(value) for name, value in asdict(self.settings).items()}
-        return self.bands.arrays(self.kind) | keyed("settings/", settings)
+        return {"wavefront": np.array(self.kind)} | field_arrays(self.bands) | keyed("settings/", settings)
 
 
 def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
@@ -264,7 +258,7 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
     """The model that `R2F2.arrays` described."""
     settings = {name: value.item() for name, value in under("settings/", arrays).items()}
     found = PathSettings(**settings)
-    return R2F2(*Bands.load(arrays), found, _scene_paths(problem, found))
+    return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
 
 
 SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
