@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core import Record
+from ..core.array_files import stored_names
 from ..core.registry import Registry
 from .argos import SUFFIXES, read_argos
 from .ble_folder import ANCHORS, TEST, TRAINING, read_ble_folder
@@ -110,8 +111,7 @@ def _by_files(folder: Path) -> list[Layout]:
 def array_names(file: Path) -> set[str]:
     """Names of the arrays in an ``.npz`` file; empty where it is none, whose reader says so."""
     try:
-        with zipfile.ZipFile(file) as stored:
-            return {name.removesuffix(".npy") for name in stored.namelist()}
+        return stored_names(file)
     except (OSError, zipfile.BadZipFile):
         return set()
 
