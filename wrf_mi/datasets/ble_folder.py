@@ -287,9 +287,7 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
-    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None if not
-    stated.
-    """
+    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
     found = [_by_anchor(prefix, table) for table in tables]
     if not any(anchor in columns for columns in found for anchor in ids):
         return None
