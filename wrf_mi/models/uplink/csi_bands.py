@@ -69,21 +69,15 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
         downlink_hz = spacing_hz * (np.arange(down) + (gap - 1) / 2 + 0.5)
     array_m = record.receivers[0].array_m
     elements = None if array_m is None or not known else np.asarray(array_m, float)
-    if elements is not None and elements.shape != (antennas, 3):
-        raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
-    return Bands(uplink_hz, downlink_hz, antennas, known, None if elements is None else principal(elements))
-
-
-def principal(elements_m: FloatArray) -> FloatArray:
-    """Positions of an array's elements about their mean, along its principal axes, [antennas, q], metres.
-
-    Axes along which it is flat (`FLAT`) are left out: a plane array has two, a line one, a single antenna none.
-    """
-    return np.asarray((elements_m - elements_m.mean(axis=0)) @ principal_axes(elements_m).T)
+    if elements is not None:
+        if elements.shape != (antennas, 3):
+            raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
+        elements = (elements - elements.mean(axis=0)) @ principal_axes(elements).T
+    return Bands(uplink_hz, downlink_hz, antennas, known, elements)
 
 
 def principal_axes(elements_m: FloatArray) -> FloatArray:
-    """Unit vectors [q, 3] of the principal axes along which an array is not flat, see `principal`."""
+    """Unit vectors [q, 3] of the principal axes along which an array is not flat (`FLAT`): a plane array has two."""
     _, extent, axes = np.linalg.svd(elements_m - elements_m.mean(axis=0), full_matrices=False)
     return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
 
