@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core import Receiver, rotation_matrix, unit_vectors
-from wrf_mi.gaussians import oracle
 from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 RECEIVER = Receiver(

@@ -15,7 +15,7 @@ from wrf_mi.backend.device import to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
-from wrf_mi.gaussians.operator import PixelOperator
+from wrf_mi.gaussians.operator import PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.static_signals import static_signals
 from wrf_mi.gaussians.tiles import perception_plane
@@ -67,6 +67,11 @@ class Direct:
         alpha, delta = (None, last) if self._product else (last[0], None)
         return Gaussians(position, scale, rotation, signal, alpha, delta, 1)
 
+    def operator(self, gaussians: Gaussians) -> PixelOperator:
+        """Operator of Gaussians from `gaussians`."""
+        weights = pixel_weights(gaussians, self.pose, self.plane)
+        return PixelOperator(weights, self.plane.height, self.plane.width)
+
     def splat(self, parts: Any) -> Any:
         """Complex field on the directions."""
         return self._splatted(parts, self.pose, self.plane)
@@ -82,7 +87,7 @@ def difference(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m: 
     direct = Direct(field, params)
     gaussians = direct.gaussians(direct.parts(tx_pos_m))
     signal = (gaussians.signal[0].numpy() + 1j * gaussians.signal[1].numpy())[None]
-    found = PixelOperator.of(gaussians, direct.pose, direct.plane).magnitude(signal, SQUARED_MAGNITUDE_EPS)
+    found = direct.operator(gaussians).magnitude(signal, SQUARED_MAGNITUDE_EPS)
     pixels = direct.pixels(tx_pos_m)
     return relative(found.ravel() - pixels, pixels)
 
@@ -123,12 +128,13 @@ def main() -> dict[str, Any]:
     gaussians = direct.gaussians(direct.parts(tx[0]))
 
     def build() -> PixelOperator:
-        return PixelOperator.of(gaussians, direct.pose, direct.plane)
+        return direct.operator(gaussians)
 
     built, built_mb, pixels = bootstrap(interleaved({"": build}, 5)[""]), memory_mb(build), build()
     factors, coefficients = static_signals(field, params)
     assert factors is not None
-    images = pixels.composed(factors)
+    images, weights = pixels.composed(factors), pixels.weights
+    weights_parts = weights.data, weights.indices, weights.indptr
     given = (coefficients(tx) @ factors.T).astype(np.complex64)
 
     def spectra(tx_pos_m: NDArray[Any]) -> NDArray[Any]:
@@ -151,7 +157,10 @@ def main() -> dict[str, Any]:
         rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [
         line("building: pixels", f"{built} ms, {built_mb:.0f} MB beside its result"),
-        line("size: pixels", f"{pixels.nbytes / 1e6:.2g} MB"),
+        line(
+            "size: pixels",
+            f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB",
+        ),
         line("size: pixels, composed", f"{images.table.nbytes / 1e6:.2g} MB"),
     ]
     for name, kind, values in (

@@ -18,7 +18,7 @@ from wrf_mi_scenes.divided import cluttered_room, divided_room
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS
-from wrf_mi.gaussians.chunks import gaussians_in_parts
+from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.receivers import antenna_csi, bartlett_spectrum
 from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from wrf_mi.backend.device import on_device as to_device
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians import Gaussians, oracle
+from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.footprint_constants import CUTOFF, MIN_COSINE
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
+from . import field_oracle
 from .stress_rows import DOUBLE, IMAGE, GradientWorst, Row, Worst, relative
 
 ComplexArray = NDArray[np.complex128]
@@ -150,7 +151,7 @@ def image(field: Field, blending: str, size: Size) -> ComplexArray:
 
 
 def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> tuple[ComplexArray, NDArray[np.bool_]]:
-    """Image [height, width] by `wrf_mi.gaussians.oracle` in float64, and a mask of pixels off all footprints' edges.
+    """Image [height, width] by `field_oracle` in float64, and a mask of pixels off all footprints' edges.
 
     With ``sphere`` the lower hemisphere is appended: [2 * height, width].
     """
@@ -159,7 +160,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
         directions = np.concatenate([directions, directions * [1, -1, -1]])
     parts = (field.position_m, field.scale_m, field.rotation)
     last = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
-    seen = oracle.project(*parts, RECEIVER)
+    seen = field_oracle.project(*parts, RECEIVER)
     clear = np.ones(directions.shape[:2], bool)
     for i in seen.order:
         cosine = directions @ seen.direction[i]
@@ -167,7 +168,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
         reach = np.sqrt(np.einsum("...i,ij,...j->...", point, np.linalg.inv(seen.covariance[i]), point))
         clear &= (np.abs(reach - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
         clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
-    return oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
+    return field_oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 
 Report = Callable[[Gaussians, Pose], Sequence[Any]]

@@ -1,7 +1,7 @@
 """Plugin integrator: ``mi.render`` compared with its definition in float64, values and derivatives.
 
 The footprint here is the largest response on a ray; splatting takes the response in the tangent plane
-(`wrf_mi.gaussians.ray_response`). Both agree in the limit of small angles only, so each has a definition in NumPy.
+(`wrf_mi_plugins.ray_response`). Both agree in the limit of small angles only, so each has a definition in NumPy.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from wrf_mi_plugins.blend_rays import blend_rays
+from wrf_mi_plugins.bundles import all_lists, ray_bundles
+from wrf_mi_plugins.ray_response import ray_footprints
 
 from wrf_mi.backend.device import on_device as to_device
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians import oracle
-from wrf_mi.gaussians.blend_rays import blend_rays
-from wrf_mi.gaussians.bundles import all_lists, ray_bundles
 from wrf_mi.gaussians.footprint import Pose, depth_order
 from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.ray_response import ray_footprints
 
+from . import field_oracle
 from .stress_fields import (
     HARD,
     ON_THE_EDGE,
@@ -95,8 +95,8 @@ def defined(field: Field, blending: str, size: Size) -> tuple[ComplexArray, NDAr
         clear &= (np.abs(np.sqrt(square) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
         clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
     if blending == "alpha":
-        return oracle.blend_alpha(responses, field.signal[order], field.opacity[order]), clear
-    return oracle.blend_product(responses, field.signal[order], field.attenuation[order]), clear
+        return field_oracle.blend_alpha(responses, field.signal[order], field.opacity[order]), clear
+    return field_oracle.blend_product(responses, field.signal[order], field.attenuation[order]), clear
 
 
 def plugin_gradients(of_each: int, names: Iterable[str] = tuple(HARD)) -> list[Row]:

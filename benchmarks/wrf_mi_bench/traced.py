@@ -141,7 +141,7 @@ def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int
     """Mean `difference` by angular size, for round Gaussians and for axes of 2 : 1.
 
     Projection neglects the tilt against the line of sight, of first order in the size and zero for round Gaussians, and
-    the extent in depth, of second order (`wrf_mi.gaussians.ray_response`).
+    the extent in depth, of second order (`wrf_mi_plugins.ray_response`).
     """
     rows = []
     for size in sizes_deg:

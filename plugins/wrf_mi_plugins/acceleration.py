@@ -4,7 +4,7 @@ A ray through many overlapping ellipsoids costs one trace per hit, and each trac
 Three measures keep that small:
 
 * one ray is traced for each bundle, through ellipsoids grown by the bundle's width
-  (`wrf_mi.gaussians.ray_response.hulls`);
+  (`wrf_mi_plugins.ray_response.hulls`);
 * the ellipsoids are distributed over many parts far from each other and traced in each, so that few overlap;
 * the caller keeps the lists until the Gaussians' geometry or the receiver changes.
 
@@ -29,10 +29,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from wrf_mi.gaussians.bundles import Bundles, RayLists
 from wrf_mi.gaussians.footprint import Pose, depth_order
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.ray_response import Hulls, RayFootprints, hulls
+
+from .bundles import Bundles, RayLists
+from .ray_response import Hulls, RayFootprints, hulls, to_world
 
 IN_PART = 64
 """Approximate ellipsoids per part: with fewer, most rays meet none of it; with more, each trace tests many."""
@@ -141,7 +142,7 @@ def _hits(ellipsoids: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any
     behind = dr.max(dr.select(radius + STEP > distance, distance + radius + STEP, 0))
     ray = dr.arange(mi.UInt32, 2 * parts * lists)
     axis = [dr.gather(mi.Float, c, ray % lists) for c in bundles.axis]
-    turned = dr.detach(mi.Vector3f(*pose.from_local(axis)))
+    turned = dr.detach(mi.Vector3f(*to_world(pose, axis)))
     back = ray >= parts * lists
     end = SIZE + STEP
     origin = _place((ray // lists) % parts, across) + turned * dr.select(back, end, -behind)

@@ -21,11 +21,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from wrf_mi.gaussians.blend_rays import Walls
-from wrf_mi.gaussians.bundles import Bundles, RayLists
 from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.ray_response import RayFootprints
+
+from .blend_rays import Walls
+from .bundles import Bundles, RayLists
+from .ray_response import RayFootprints
 
 ROUNDING = 1e-5
 """Share of a distance by which a Gaussian must be farther than a wall: some roundings of float32."""

@@ -13,13 +13,13 @@ import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.blend_rays import Walls, blend_rays
-from wrf_mi.gaussians.bundles import RayLists, ray_bundles
 from wrf_mi.gaussians.footprint import Pose
-from wrf_mi.gaussians.ray_response import ray_footprints
 
 from .acceleration import traced_lists
+from .blend_rays import Walls, blend_rays
+from .bundles import RayLists, ray_bundles
 from .hidden import without_hidden
+from .ray_response import ray_footprints
 from .sensor import RIGID_TOLERANCE, PerceptionPlane, pose_of
 from .shape import gaussian_shape_of, interleave, read_gaussians
 from .walls import find_crossings, wall_scene, wall_shapes, walls_of
@@ -65,7 +65,7 @@ class TracedField(ADIntegrator):
     signal times its largest response on the ray, times the transmission of nearer Gaussians and walls. Gaussians with
     an ``opacity`` are blended as in WRF-GS+ (alpha), those with an ``attenuation`` as in WRF-GS (product). Order,
     cut-off and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.render.splat`); the footprint is
-    exact where splatting projects (`wrf_mi.gaussians.ray_response`).
+    exact where splatting projects (`wrf_mi_plugins.ray_response`).
 
     The field is the scene's ``ellipsoids`` shape with the attribute ``signal``, see
     `wrf_mi_plugins.shape.gaussian_shape`; its parameters in ``mi.traverse(scene)`` have derivatives, forward and

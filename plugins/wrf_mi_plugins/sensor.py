@@ -11,8 +11,18 @@ from numpy.typing import ArrayLike
 
 from wrf_mi.backend.device import to_vectors
 from wrf_mi.core import InputError, pixel_directions, rotation_matrix
-from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, equirectangular_sphere
+from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, azimuth_rad, unit_vectors
 from wrf_mi.gaussians.footprint import Pose
+
+
+def equirectangular_sphere(height: int, width: int) -> FloatArray:
+    """Unit vector of every pixel of an equirectangular grid over the full sphere, shape [height, width, 3].
+
+    Row r lies at ``-90 + r * 180 / height`` degrees, so no row at the zenith; azimuths rise from 0 (column 0).
+    """
+    elevation = np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
+    return unit_vectors(azimuth_rad(width)[None, :], elevation[:, None])
+
 
 DIRECTIONS = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}
 """Functions of (height, width) for the unit vectors of all pixels."""

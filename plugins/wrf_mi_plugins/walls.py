@@ -10,11 +10,12 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.blend_rays import Walls
 from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.tracing.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
 from wrf_mi.tracing.slab import slab
 
+from .blend_rays import Walls
+from .ray_response import to_world
 from .shape import interleave
 
 ITU_PREFIX = "mat-itu_"
@@ -70,10 +71,10 @@ def find_crossings(
     Raises:
         InputError: a ray crosses more than `MOST_CROSSINGS` walls.
     """
-    d = dr.detach(mi.Vector3f(*pose.from_local(direction)))
+    d = dr.detach(mi.Vector3f(*to_world(pose, direction)))
     field = mi.Vector3f(0, 0, 1)
     if polarization is not None:
-        field = dr.detach(mi.Vector3f(*pose.from_local([mi.Float(c) for c in polarization])))
+        field = dr.detach(mi.Vector3f(*to_world(pose, [mi.Float(c) for c in polarization])))
     field -= dr.dot(field, d) * d
     number = dr.zeros(mi.UInt32, max(_registry(s) for s in shapes) + 1)
     for i, shape in enumerate(shapes):

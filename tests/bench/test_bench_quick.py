@@ -20,7 +20,7 @@ from wrf_mi.core import InputError
 CHECKOUT = Path(__file__).resolve().parents[2]
 STORED = CHECKOUT / "benchmarks" / "results" / FILE
 SAME_SSIM, SAME_L2 = 0.99, 0.06
-"""Bounds for Gaussians of 2 degrees: projection differs from rays by 1.4 % (`wrf_mi.gaussians.ray_response`), and
+"""Bounds for Gaussians of 2 degrees: projection differs from rays by 1.4 % (`wrf_mi_plugins.ray_response`), and
 Mitsuba's integrator makes those of low opacity smaller and stops early."""
 
 Ratios = dict[str, dict[str, float]]

@@ -19,8 +19,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import Antenna
 from wrf_mi.datasets import load, make_splits, read_deepmimo
-from wrf_mi.datasets.deepmimo import PARAMS
-from wrf_mi.datasets.deepmimo_params import CHANNEL_PARAMS
+from wrf_mi.datasets.deepmimo import CHANNEL_PARAMS, PARAMS
 from wrf_mi.receivers.array import array_response
 
 STORED = Path(__file__).parent / "data" / "deepmimo_channels.npz"
@@ -107,6 +106,7 @@ def test_parameters_in_the_folder_are_those_of_the_call(tmp_path: Path) -> None:
     (folder / CHANNEL_PARAMS).write_text(json.dumps(chosen))
     record = load(folder)
     assert [receiver.name for receiver in record.receivers] == ["bs2", "bs0"]
+    chosen["ofdm"] = chosen["ofdm"] | {"selected_subcarriers": np.array([0, 21, 42, 63])}  # as DeepMIMO's own users do
     np.testing.assert_array_equal(record.observation, read_deepmimo(folder, params=chosen).observation)
     assert record.receivers[0].antenna == Antenna("hw_dipole", frame="array")
     assert record.tx_antenna == Antenna("hw_dipole")
@@ -225,21 +225,23 @@ def test_wrong_scenario_is_refused_in_one_line(tmp_path: Path, case: str) -> Non
 
 
 WRONG_PARAMS: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown key": ({"antenna": {}}, "'antenna' is not known; give some of base_stations"),
-    "unknown part": ({"bs_antenna": {"fov": 90}}, "bs_antenna: 'fov' is not known; give some of shape"),
-    "part of words": ({"ofdm": "wide"}, "ofdm is 'wide'; give some of bandwidth"),
+    "unknown key": ({"antenna": {}}, "setting antenna: unknown; known here: .*base_stations"),
+    "unknown part": ({"bs_antenna": {"fov": 90}}, r"bs_antenna\.fov: unknown; known here: bs_antenna\.shape"),
+    "part of words": ({"ofdm": "wide"}, "ofdm: expected a mapping, got 'wide'"),
     "out of range": ({"base_stations": [1]}, "base station 1 is out of range; the scenario has 0 to 0"),
-    "names": ({"base_stations": ["roof"]}, r"base_stations is \['roof'\]; give all or a list"),
-    "twice": ({"base_stations": [0, 0]}, "with a number twice"),
-    "subcarrier out of range": ({"ofdm": {"selected_subcarriers": [512]}}, "give a list of different whole numbers"),
-    "no subcarrier": ({"ofdm": {"selected_subcarriers": []}}, "selected_subcarriers is"),
-    "half a subcarrier": ({"ofdm": {"subcarriers": 1.5}}, "subcarriers is 1.5; give a whole number from 1"),
-    "no bandwidth": ({"ofdm": {"bandwidth": 0}}, "bandwidth is 0; give a positive number of Hz"),
-    "flat array": ({"bs_antenna": {"shape": 8}}, "shape is 8; give two whole numbers"),
-    "no spacing": ({"bs_antenna": {"spacing": True}}, "spacing is True; give a positive number of wavelengths"),
-    "one angle": ({"bs_antenna": {"rotation": 90}}, "rotation is 90; give the angles about x, y and z in degrees"),
-    "pattern": ({"ue_antenna": {"radiation_pattern": "horn"}}, "radiation_pattern is 'horn'; choose from isotropic"),
-    "carrier phase": ({"add_carrier_phase": "yes"}, "add_carrier_phase is 'yes'; give true or false"),
+    "names": ({"base_stations": ["roof"]}, "base_stations: expected int, got 'roof'"),
+    "twice": ({"base_stations": [0, 0]}, r"base_stations: \[0, 0\]; give a list of different whole numbers"),
+    "subcarrier out of range": ({"ofdm": {"selected_subcarriers": [512]}}, "different whole numbers from 0 to 511"),
+    "no subcarrier": ({"ofdm": {"selected_subcarriers": []}}, r"selected_subcarriers: \[\]; give a list"),
+    "half a subcarrier": ({"ofdm": {"subcarriers": 1.5}}, r"ofdm\.subcarriers: expected int, got 1\.5"),
+    "no bandwidth": ({"ofdm": {"bandwidth": 0}}, r"ofdm\.bandwidth: 0\.0 is out of range, choose more than 0"),
+    "flat array": ({"bs_antenna": {"shape": 8}}, r"bs_antenna\.shape: expected a list of 2 values, got 8"),
+    "no elements": ({"bs_antenna": {"shape": [4, 0]}}, r"bs_antenna\.shape: \[4, 0\]; give two whole numbers from 1"),
+    "no spacing": ({"bs_antenna": {"spacing": True}}, r"bs_antenna\.spacing: expected float, got True"),
+    "one angle": ({"bs_antenna": {"rotation": 90}}, r"bs_antenna\.rotation: expected a list of 3 values, got 90"),
+    "infinite angle": ({"bs_antenna": {"rotation": [0, 0, "1e99"]}}, "rotation, .* is too large; lower it"),
+    "pattern": ({"ue_antenna": {"radiation_pattern": "horn"}}, "radiation_pattern: 'horn'; choose from isotropic"),
+    "carrier phase": ({"add_carrier_phase": "yes"}, "add_carrier_phase: expected bool, got 'yes'"),
 }
 
 

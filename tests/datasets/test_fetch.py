@@ -18,7 +18,7 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
 from wrf_mi.datasets.fetch import download
 from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
-from wrf_mi.datasets.registry import DataSet, RemoteFile, known, remote_files
+from wrf_mi.datasets.registry import DATA_VARIABLE, DataSet, RemoteFile, known, remote_files
 
 ROWS = 6
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room")
@@ -31,6 +31,12 @@ DATASET = DataSet("small", "spectrum", "MIT", "made up", base_url="http://unused
 class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         pass
+
+
+@pytest.fixture(autouse=True)
+def _without_retries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retries wait."""
+    monkeypatch.setattr(sys.modules[download.__module__], "RETRIES", 0)
 
 
 @pytest.fixture
@@ -100,7 +106,7 @@ def test_a_corrupted_file_is_refused_and_nothing_is_left(server: tuple[str, Path
     image = root / "abc123" / "spectrum" / "00004.png"
     image.write_bytes(image.read_bytes()[:-1] + b"\0")
     with pytest.raises(InputError, match=r"00004\.png has not the published SHA-256") as error:
-        download(DATASET, entries, tmp_path / "home" / "small", url, retries=0, progress=progress)
+        download(DATASET, entries, tmp_path / "home" / "small", url, progress=progress)
     assert "\n" not in str(error.value)
     assert list((tmp_path / "home").iterdir()) == []
 
@@ -112,7 +118,7 @@ def test_a_file_without_end_is_refused_and_nothing_is_left(
     entries = manifest(small_folder(root / "abc123"))
     monkeypatch.setattr(sys.modules[download.__module__], "MOST_BYTES", 100)
     with pytest.raises(InputError, match="is larger than any published file, nothing was kept"):
-        download(DATASET, entries, tmp_path / "home" / "small", url, retries=0)
+        download(DATASET, entries, tmp_path / "home" / "small", url)
     assert list((tmp_path / "home").iterdir()) == []
 
 
@@ -121,7 +127,7 @@ def test_missing_remote_file_is_reported_in_one_line(server: tuple[str, Path], t
     entries = manifest(small_folder(root / "abc123"))
     (root / "abc123" / "spectrum" / "00002.png").unlink()
     with pytest.raises(InputError, match=r"404 .*00002\.png"):
-        download(DATASET, entries, tmp_path / "home" / "small", url, retries=0)
+        download(DATASET, entries, tmp_path / "home" / "small", url)
     assert list((tmp_path / "home").iterdir()) == []
 
 
@@ -131,15 +137,16 @@ def test_missing_network_is_reported_in_one_line(home: Path, monkeypatch: pytest
         unused.bind(("127.0.0.1", 0))  # bound and not listening: connections are refused
         url = f"http://127.0.0.1:{unused.getsockname()[1]}"
         with pytest.raises(InputError, match=r"127\.0\.0\.1:\d+ cannot be reached; .*WRF_MI_DATA") as error:
-            fetch("rfid-lab", base_url=url, retries=0, progress=False)
+            fetch("rfid-lab", base_url=url, progress=False)
     assert "\n" not in str(error.value)
     assert list((home / "cache").iterdir()) == []
 
 
-def test_unwritable_folder_is_reported(tmp_path: Path):
+def test_unwritable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path / "file"))
     with pytest.raises(InputError, match="cannot be written"):
-        fetch("rfid-lab", home=tmp_path / "file", base_url="http://127.0.0.1:9", progress=False)
+        fetch("rfid-lab", base_url="http://127.0.0.1:9", progress=False)
 
 
 def test_names_that_cannot_be_fetched(home: Path):
@@ -283,7 +290,7 @@ def test_a_pickle_with_other_content_is_refused_and_nothing_is_left(
         served.read_bytes().replace(b"\x33\x33\x33\x33", b"\x34\x33\x33\x33") if content is None else content
     )
     with pytest.raises(InputError, match=message) as error:
-        download(DATASET, entries, tmp_path / "home" / "hall", url, retries=0)
+        download(DATASET, entries, tmp_path / "home" / "hall", url)
     assert "\n" not in str(error.value)
     assert str(tmp_path) not in str(error.value), "names a file that is gone"
     assert list((tmp_path / "home").iterdir()) == []
@@ -307,7 +314,7 @@ def test_fetch_flat_ble_from_a_copy(server: tuple[str, Path], home: Path, capsys
 @needs("rfid-lab")
 @pytest.mark.parametrize("name", ["rfid-lab", "flat-ble", "newrf-conference", "newrf-office"])
 def test_existing_copy_is_checked_without_network(name: str):
-    folder = fetch(name, home=DATA, base_url="http://127.0.0.1:9", retries=0, progress=False)
+    folder = fetch(name, base_url="http://127.0.0.1:9", progress=False)
     assert folder.parent == DATA
 
 

@@ -18,9 +18,9 @@ from wrf_mi.gaussians import (
     random_gaussians,
     tiles,
 )
-from wrf_mi.gaussians.chunks import gaussians_in_parts
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.operator import pixel_weights
+from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
 from wrf_mi.training import predictor
 from wrf_mi.training.predictor import Predictor

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import (
     Gaussians,
-    oracle,
 )
+from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat
-from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.gaussians.tiles import Plane, perception_plane
 from wrf_mi.training.step import device_pose
 
 SINGLE = 1e-5
@@ -60,6 +61,10 @@ def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Ga
     ), signal
 
 
+def operator_of(gaussians: Gaussians, pose: Pose, plane: Plane) -> PixelOperator:
+    return PixelOperator(pixel_weights(gaussians, pose, plane), plane.height, plane.width)
+
+
 def complex_of(pair: tuple[Any, Any]) -> np.ndarray:
     return pair[0].numpy() + 1j * pair[1].numpy()
 
@@ -75,7 +80,7 @@ def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, in
     floats = mi.Float if single else Float64
     gaussians, signal = hard(product, floats)
     plane = perception_plane(*size, floats)
-    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, floats), plane)
+    operator = operator_of(gaussians, device_pose(RECEIVER, floats), plane)
     assert (
         operator.weights.dtype
         == {
@@ -122,7 +127,7 @@ def test_operator_without_visible_gaussians_is_zero() -> None:
     gaussians, signal = hard(False, mi.Float)
     below = RECEIVER.position_m - 90 * RECEIVER.to_world[:, 2]
     gaussians.position = [mi.Float([float(c)] * 40) for c in below]
-    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
+    operator = operator_of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     assert operator.weights.nnz == 0
     assert not operator.magnitude(signal[None]).any()
 
@@ -139,7 +144,7 @@ def test_no_gaussians(product: bool) -> None:
     )
     parts = ([none() for _ in range(k)] for k in (3, 3, 4, 2))
     empty = Gaussians(*parts, **blending, batch=1)
-    operator = PixelOperator.of(empty, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
+    operator = operator_of(empty, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     assert operator.weights.shape == (23 * 61, 0)
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()
 
@@ -147,7 +152,7 @@ def test_no_gaussians(product: bool) -> None:
 def test_batches_and_factors() -> None:
     """More transmitters than a block, one by one and together, through factors and without; all linear."""
     gaussians, _ = hard(True, mi.Float)
-    operator = PixelOperator.of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
+    operator = operator_of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
     rng = np.random.default_rng(1)
     factors, c = (
         (rng.standard_normal(s) + 1j * rng.standard_normal(s)).astype(np.complex64)

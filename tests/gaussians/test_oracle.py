@@ -7,11 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
-
-from wrf_mi.core import Receiver, azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
-from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
-from wrf_mi.gaussians.oracle import (
+from wrf_mi_bench.field_oracle import (
     blend_alpha,
     blend_product,
     covariance_matrix,
@@ -20,6 +16,10 @@ from wrf_mi.gaussians.oracle import (
     render,
     tangent_basis,
 )
+
+from wrf_mi.core import Receiver, azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 EXACT = 1e-12
 """A few roundings of float64 on values near one."""

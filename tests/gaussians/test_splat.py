@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
@@ -15,7 +16,6 @@ from wrf_mi.gaussians import (
     FIELDS,
     Encoding,
     Gaussians,
-    oracle,
     random_gaussians,
 )
 from wrf_mi.gaussians.render import splat

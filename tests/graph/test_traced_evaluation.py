@@ -14,15 +14,15 @@ import yaml
 from made_spectra import RECEIVERS, small_field
 from small_fits import QUICK, official, settings
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, room, write_xml
+from wrf_mi_plugins.blend_rays import blend_rays
+from wrf_mi_plugins.bundles import all_lists, ray_bundles
+from wrf_mi_plugins.ray_response import ray_footprints
 
 from wrf_mi.backend.device import on_device, to_tensor
 from wrf_mi.core import InputError, Receiver, Record, pixel_directions
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.blend_rays import blend_rays
-from wrf_mi.gaussians.bundles import all_lists, ray_bundles
 from wrf_mi.gaussians.footprint import depth_order
-from wrf_mi.gaussians.ray_response import ray_footprints
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import evaluation_of
 from wrf_mi.graph.graph import Batch, Graph

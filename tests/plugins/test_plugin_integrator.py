@@ -13,12 +13,11 @@ import wrf_mi_plugins
 from test_plugin_integrator_rays import brute, bundles_of, gaussians_of, pose_of
 from traced_fields import RECEIVER, any_field, blended
 from wrf_mi_plugins import integrator as integrator_module
-from wrf_mi_plugins.sensor import receiver_to_world
+from wrf_mi_plugins.sensor import equirectangular_sphere, receiver_to_world
 from wrf_mi_plugins.shape import gaussian_shape, shape_parameters
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError, pixel_directions
-from wrf_mi.core.angles import equirectangular_sphere
 from wrf_mi.gaussians import Gaussians
 
 pytestmark = pytest.mark.all_threads

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from traced_fields import RECEIVER, any_field, blended, seen
 from wrf_mi_plugins.acceleration import traced_lists
+from wrf_mi_plugins.blend_rays import Walls, blend_rays
+from wrf_mi_plugins.bundles import all_lists, ray_bundles
+from wrf_mi_plugins.ray_response import hulls, ray_footprints
+from wrf_mi_plugins.sensor import equirectangular_sphere
 
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import pixel_directions, rotation_matrix
-from wrf_mi.core.angles import equirectangular_sphere
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.blend_rays import Walls, blend_rays
-from wrf_mi.gaussians.bundles import all_lists, ray_bundles
 from wrf_mi.gaussians.footprint import Pose, depth_order
 from wrf_mi.gaussians.footprint_constants import NEAR_M
-from wrf_mi.gaussians.ray_response import hulls, ray_footprints
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 

@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import wrf_mi_plugins
-from wrf_mi_plugins.sensor import receiver_to_world
+from wrf_mi_plugins.sensor import equirectangular_sphere, receiver_to_world
 
 from wrf_mi.core import InputError, azimuth_elevation, pixel_directions, rotation_matrix
-from wrf_mi.core.angles import equirectangular_sphere
 
 FLOAT32 = 2e-6
 """Unit vectors and metres in float32 after a rotation."""

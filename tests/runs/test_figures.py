@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_fields import Float64
 from matplotlib.figure import Figure
+from wrf_mi_bench import field_oracle
 
 from wrf_mi.core import Receiver, unit_vectors
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.gaussians import Gaussians
+from wrf_mi.gaussians.footprint import Footprints, project
 from wrf_mi.gaussians.footprint_constants import LOW_PASS_RAD, NEAR_M
-from wrf_mi.gaussians.oracle import Projection, footprint, project
 from wrf_mi.runs import figures
+from wrf_mi.training.step import device_pose
 
 RECEIVER = Receiver("gateway1", np.array([1.0, 2.0, 3.0]), np.array([0.36, 0.48, 0.0, 0.8]))
 ROUND = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -18,10 +22,18 @@ OUTLINE_TOLERANCE = 1e-9
 """Rounding of a few float64 operations on numbers of order one."""
 
 
-def seen_from(azimuth_deg: float, elevation_deg: float, distance_m: float, scale_m: list[float]) -> Projection:
+def placed(azimuth_deg: float, elevation_deg: float, distance_m: float) -> FloatArray:
     direction = unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg))
-    position = RECEIVER.position_m + RECEIVER.to_world @ (distance_m * direction)
-    return project(position[None], np.array([scale_m]), ROUND, RECEIVER)
+    return RECEIVER.position_m + RECEIVER.to_world @ (distance_m * direction)
+
+
+def footprints(position_m: FloatArray, scale_m: FloatArray) -> Footprints:
+    nothing = [Float64(np.zeros(len(position_m)))]
+    parts = [[Float64(column.copy()) for column in part.T] for part in (position_m, scale_m)]
+    return project(
+        Gaussians(*parts, [*nothing * 3, nothing[0] + 1], nothing * 2, opacity=nothing[0], attenuation=None, batch=1),
+        device_pose(RECEIVER, Float64),
+    )
 
 
 def outlines_of(figure: Figure) -> list[FloatArray]:
@@ -33,23 +45,24 @@ def outlines_of(figure: Figure) -> list[FloatArray]:
 @pytest.mark.parametrize(("azimuth", "elevation"), [(90, 60), (0, 10), (200, 89), (359.5, 0)])
 def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elevation: float) -> None:
     """The angular radius is the scale seen from the receiver with the low-pass added, also at seam and zenith."""
-    seen = seen_from(azimuth, elevation, 4.0, [0.4, 0.4, 0.4])
+    seen = footprints(placed(azimuth, elevation, 4.0)[None], np.full((1, 3), 0.4))
     (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
     angle = np.arccos(outline @ unit_vectors(np.radians(azimuth), np.radians(elevation)))
     assert angle == pytest.approx(np.arctan(np.hypot(0.4 / 4.0, LOW_PASS_RAD)), abs=OUTLINE_TOLERANCE)
 
 
 def test_outline_is_where_the_footprint_is_one_deviation() -> None:
-    seen = seen_from(40, 70, 2.0, [0.1, 0.3, 0.5])
-    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
-    assert footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
+    position, scale = placed(40, 70, 2.0)[None], np.array([[0.1, 0.3, 0.5]])
+    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), footprints(position, scale), [1.0]))
+    seen = field_oracle.project(position, scale, ROUND, RECEIVER)
+    assert field_oracle.footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
 
 
 def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> None:
     directions = unit_vectors(np.radians([0, 90, 180, 270]), np.radians(45))
     distance = np.array([3.0, 3.0, 3.0, NEAR_M / 2])
     position = RECEIVER.position_m + (distance[:, None] * directions) @ RECEIVER.to_world.T
-    seen = project(position, np.full((4, 3), 0.1), np.repeat(ROUND, 4, axis=0), RECEIVER)
+    seen = footprints(position, np.full((4, 3), 0.1))
     figure = figures.footprint_sky(np.zeros((9, 36)), seen, [0.5, 0.9, 0.1, 2.0])
     centres = [outline[:-1].mean(axis=0) for outline in outlines_of(figure)]
     azimuth = [round(np.degrees(np.arctan2(y, x))) % 360 for x, y, _ in centres]

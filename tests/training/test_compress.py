@@ -20,7 +20,7 @@ from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.removal import removal
+from wrf_mi.gaussians.operator import removal
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compressed import COMPRESSION

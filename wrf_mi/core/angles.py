@@ -45,15 +45,6 @@ def pixel_directions(height: int, width: int) -> FloatArray:
     return unit_vectors(azimuth_rad(width)[None, :], elevation_rad(height)[:, None])
 
 
-def equirectangular_sphere(height: int, width: int) -> FloatArray:
-    """Unit vector of every pixel of an equirectangular grid over the full sphere, shape [height, width, 3].
-
-    Row r lies at ``-90 + r * 180 / height`` degrees, so no row at the zenith; azimuths rise from 0 (column 0).
-    """
-    elevation = np.arange(height, dtype=float) * (np.pi / height) - np.pi / 2
-    return unit_vectors(azimuth_rad(width)[None, :], elevation[:, None])
-
-
 def solid_angles(height: int, width: int) -> FloatArray:
     """Weight of each pixel in an integral over the upper hemisphere, [height * width], steradian.
 

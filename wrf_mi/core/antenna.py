@@ -46,6 +46,9 @@ class Antenna:
         polarization: ``"V"``: along the unit vector of the zenith angle; ``"H"``: along the unit vector of the azimuth.
         frame: ``"world"``: the antenna's z axis is the world's, for any orientation of the array. ``"array"``: its z
             axis is the array's y axis, its boresight the array's normal.
+
+    Raises:
+        InputError: an unknown name, or a directional pattern without orientation.
     """
 
     pattern: str = "iso"
@@ -53,11 +56,6 @@ class Antenna:
     frame: str = "world"
 
     def __post_init__(self) -> None:
-        """Refuse unknown names, and a directional pattern without orientation.
-
-        Raises:
-            InputError: naming the attribute and its values.
-        """
         for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
             if getattr(self, name) not in known:
                 text = f"antenna: {name} is {str(getattr(self, name))[:40]!r}; choose from {', '.join(known)}"
@@ -74,11 +72,7 @@ class Antenna:
         return replace(self, polarization="H" if self.polarization == "V" else "V")
 
     def to_world(self, orientation_xyzw: ArrayLike) -> FloatArray:
-        """Rotation [3, 3] from the antenna's frame to the world's.
-
-        Args:
-            orientation_xyzw: unit quaternion of the array, its frame to world.
-        """
+        """Rotation [3, 3] from the antenna's frame to the world's, for an array's orientation (quaternion to world)."""
         return np.eye(3) if self.frame == "world" else rotation_matrix(orientation_xyzw) @ DEVICE_TO_ARRAY
 
     def mounted(self, orientation_xyzw: ArrayLike = UPRIGHT) -> MountedAntenna:
@@ -117,12 +111,7 @@ class Antenna:
 
 @dataclass(frozen=True)
 class MountedAntenna:
-    """An antenna in the world.
-
-    Attributes:
-        antenna: pattern and polarisation.
-        to_world: rotation [3, 3] from the antenna's frame to the world's.
-    """
+    """An antenna in the world, and the rotation [3, 3] from its frame to the world's."""
 
     antenna: Antenna
     to_world: FloatArray
@@ -134,15 +123,7 @@ ANTENNA = Antenna()
 
 @dataclass(frozen=True)
 class AntennaOptions:
-    """Antennas that replace those in the data; None: no replacement.
-
-    Attributes:
-        rx_pattern: pattern of every receiver's antennas.
-        rx_polarization: polarisation of every receiver's antennas.
-        rx_frame: frame of every receiver's antennas.
-        tx_pattern: pattern of the transmitter's antenna.
-        tx_polarization: polarisation of the transmitter's antenna.
-    """
+    """Antennas of every receiver and of the transmitter that replace those in the data; None: no replacement."""
 
     rx_pattern: str | None = None
     rx_polarization: str | None = None

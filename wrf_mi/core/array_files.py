@@ -41,11 +41,7 @@ class ArrayStream:
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
     """Write an ``.npz`` file of plain arrays, or of `ArrayStream`, atomically.
 
-    Args:
-        path: file to write.
-        arrays: arrays by their names.
-        compressed: compress them.
-        checksum: add a checksum, which `stored_arrays` compares; not for `ArrayStream`.
+    `stored_arrays` compares the checksum, which `ArrayStream` cannot have.
     """
     stored = dict(arrays)
     if checksum:
@@ -113,19 +109,13 @@ def _read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     version = np.lib.format.read_magic(stream)
     if version not in HEADERS:
         raise ValueError(f"format {version} of NumPy")
-    shape, fortran, dtype = HEADERS[version](stream)
+    shape, _, dtype = HEADERS[version](stream)
     count = math.prod(shape) * dtype.itemsize
     if dtype.hasobject:
         raise ValueError("objects, which would be unpickled")
     if any(side < 0 for side in shape) or count > size - stream.tell():
         raise ValueError(f"states {list(shape)} numbers of {dtype}, and has {size} bytes")
-    content = bytearray(count)
-    view, filled = memoryview(content), 0
-    while filled < count:
-        piece = stream.read(min(count - filled, 1 << 24))
-        if not piece:
-            raise ValueError("ends too early")
-        view[filled : filled + len(piece)] = piece
-        filled += len(piece)
+    stream.seek(0)
+    values: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     stream.read(1)  # the archive compares its own checksum at the end
-    return np.ndarray(shape, dtype, content, order="F" if fortran else "C")
+    return values

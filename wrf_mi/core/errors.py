@@ -18,9 +18,10 @@ class DataFault(InputError):
     Attributes:
         file: path of the file or folder.
         text: what is wrong, and after the last semicolon the remedy.
-        place: place in the file, such as "row 3" or "line 1"; empty for the file as a whole.
+        place: place in the file, by default "row 3" or "line 1"; empty for the file as a whole.
         row: number of the row as the file counts rows, or None.
-        kind: the file and the remedy, which repeated faults of one kind have in common.
+        kind: the file and the remedy, which repeated faults of one kind have in common; the folder where
+            ``file_per_row``, as the other rows are in files beside it.
     """
 
     def __init__(
@@ -33,16 +34,6 @@ class DataFault(InputError):
         place: str = "",
         file_per_row: bool = False,
     ) -> None:
-        """Make the fault.
-
-        Args:
-            file: path of the file or folder.
-            text: what is wrong; the remedy.
-            row: number of the row of data.
-            line: number of the line of a text file, from 1.
-            place: place in the file, by default the row or the line.
-            file_per_row: the file holds one row, and the other rows are in files beside it.
-        """
         super().__init__(file, text)
         self.file, self.text, self.row = Path(file), text, row
         self.place = place or (f"row {row}" if row is not None else f"line {line}" if line is not None else "")

@@ -11,11 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from .errors import DataFault, InputError
-
-LONGEST = 300
-"""Most characters of another library's message: some hold the damaged content."""
-
 
 MOST_MESSAGE = 400
 """Characters that are shown of another library's message: some repeat the content of a file."""
@@ -55,12 +53,9 @@ _REMEDIES = {
 
 
 def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
-    """An error of the operating system and its remedy, on one line.
+    """An error of the operating system and its remedy, on one line, beside a ``path`` or the one that it names.
 
-    Args:
-        error: error of the system.
-        path: file or folder; None: the one that the error names.
-        what: verb phrase, such as "cannot be written".
+    ``what`` is a verb phrase, such as "cannot be written".
     """
     file = path or (error.filename2 if error.filename2 is not None else error.filename)
     text = one_line(error.strerror or error)
@@ -76,12 +71,7 @@ MOST_NAME = 1024
 
 
 def inside(folder: Path, name: object, source: str | Path) -> Path:
-    """The path of a file that another file names, below its folder.
-
-    Args:
-        folder: folder that the file has to be in.
-        name: stated name.
-        source: file that states it, for the message.
+    """The path in a folder of the file that another file, the ``source``, names.
 
     Raises:
         InputError: no name, or one that leaves the folder.
@@ -113,12 +103,7 @@ def text_lines(path: Path) -> list[str]:
 
 @contextmanager
 def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[None]:
-    """Turn any error of a block that reads a file into one line.
-
-    Args:
-        path: the file.
-        missing: error for a missing file, or its message.
-        remedy: end of the message for a damaged file.
+    """Turn any error of a block that reads a file into one line: ``missing``, or for a damaged file the ``remedy``.
 
     Raises:
         InputError: naming the file.
@@ -130,36 +115,25 @@ def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[Non
     except InputError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
-        raise DataFault(path, f"not readable ({one_line(error)[:LONGEST]}); {remedy}") from None
+        raise DataFault(path, f"not readable ({one_line(error)}); {remedy}") from None
 
 
-LEFTOVER = re.compile(r"\.(.+)\.(\d+)\.(part|old)")
+LEFTOVER = re.compile(r"\.(.+)\.(\d{1,9})\.(part|old)")
 """Name of a temporary file or folder: the name that it is to take or had, and the number of its process."""
-
-
-def _is_running(process: int) -> bool:
-    """Whether a process of that number runs; this one does not count, as it makes each temporary file once."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return process != os.getpid()
 
 
 def remove_leftovers(folder: Path, name: str | None = None) -> None:
     """Remove temporary files and folders that killed processes left in a folder, at any depth.
 
-    A folder that was to be replaced, and had lost its name, takes it again.
-
-    Args:
-        folder: the folder.
-        name: only leftovers beside the file or folder of this name in ``folder``, not below it.
+    A folder that was to be replaced, and had lost its name, takes it again. With a ``name`` only leftovers beside the
+    file or folder of this name are removed.
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
         found = LEFTOVER.fullmatch(path.name)
-        if found is None or _is_running(int(found[2])):
+        if found is None:
+            continue
+        # Files of this process count: it makes each temporary file once.
+        if (process := int(found[2])) != os.getpid() and psutil.pid_exists(process):
             continue
         last = found[1]
         while inner := LEFTOVER.fullmatch(last):  # a temporary folder that is written atomically itself
@@ -190,10 +164,6 @@ def atomic_file(path: Path) -> Iterator[Path]:
 @contextmanager
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its name if the block succeeds and is removed otherwise.
-
-    Args:
-        path: the folder to make.
-        replace: replace an existing folder.
 
     Raises:
         InputError: ``path`` exists and may not be replaced, or cannot be written.
@@ -237,8 +207,8 @@ def append_line(path: Path, line: str) -> None:
             raise
 
 
-def write_figure(path: Path, figure: Any, dpi: int = 110) -> Path:
+def write_figure(path: Path, figure: Any) -> Path:
     """Write a Matplotlib figure as PNG atomically."""
     with atomic_file(path) as part:
-        figure.savefig(part, format="png", dpi=dpi, metadata={"Software": None})
+        figure.savefig(part, format="png", dpi=110, metadata={"Software": None})
     return path

@@ -50,12 +50,7 @@ def _cgroup_bytes() -> Iterator[int]:
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Refuse an allocation that does not fit.
-
-    Args:
-        needed: estimated bytes.
-        what: subject of the sentence, with the file or setting.
-        remedy: what to lower, or to do in its place.
+    """Refuse an allocation of ``needed`` bytes for ``what`` (the file or setting) that does not fit.
 
     Raises:
         InputError: more than is free.

@@ -41,6 +41,9 @@ class Paths:
         object_names: names of the scene's surfaces.
         n_tx: transmitters traced, with or without a path.
         n_rx: receivers traced, with or without a path.
+
+    Raises:
+        ValueError: arrays of inconsistent shapes.
     """
 
     tx: IntArray
@@ -61,11 +64,6 @@ class Paths:
         return len(self.tx)
 
     def __post_init__(self) -> None:
-        """Reject arrays of inconsistent shapes.
-
-        Raises:
-            ValueError: naming the array.
-        """
         depth = self.interactions.shape[1] if self.interactions.ndim == 2 else -1
         more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
         more |= {"objects": (depth,), "vertices_m": (depth, 3)}
@@ -89,13 +87,7 @@ _ARRAYS = tuple(f.name for f in fields(Paths) if f.name not in ("object_names", 
 
 
 def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write paths to a compressed ``.npz`` of plain arrays, atomically.
-
-    Args:
-        file: file to write.
-        paths: paths, whose fields become keys of the same name.
-        extra: further arrays by other names.
-    """
+    """Write paths, whose fields become keys, and extra arrays by other keys to a compressed ``.npz``, atomically."""
     arrays: dict[str, Any] = {name: getattr(paths, name) for name in _ARRAYS}
     arrays |= {"object_names": np.asarray(paths.object_names, dtype=str), "n_tx": paths.n_tx, "n_rx": paths.n_rx}
     return write_arrays(Path(file), {"format": FORMAT, **arrays, **(extra or {})}, compressed=True)

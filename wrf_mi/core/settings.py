@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from functools import cache
 from typing import Annotated, Any, TypeVar, cast
 
+import numpy as np
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -83,21 +84,13 @@ class CheckedSettings:
     """Base of settings whose numbers are checked (`check`) when they are made."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range.
-
-        Raises:
-            InputError: naming the setting.
-        """
         check(self)
 
 
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
-    """Settings from a nested dictionary; what it does not name keeps its default.
+    """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
-    Args:
-        kind: dataclass of the settings.
-        values: nested as the dataclass is.
-        source: name of the file or option, for messages.
+    ``source`` names the file or option in messages.
 
     Raises:
         InputError: an unknown name, or a value of the wrong type or out of its range.
@@ -127,20 +120,25 @@ def _number(value: Any) -> Any:
     return value
 
 
+def _plain(value: Any) -> Any:
+    """Values that JSON lacks: arrays as lists, others as text."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
 def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
     """A value of the type ``hint``."""
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
-        # JSON has lists in place of tuples; else nothing is converted.
-        return _adapter(hint).validate_json(json.dumps(value, default=str), strict=True)
+        # JSON has lists in place of tuples and arrays; else nothing is converted.
+        return _adapter(hint).validate_json(json.dumps(value, default=_plain), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
     text = f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
     if first["type"] == "literal_error":
         text = f"{value!r}; choose from " + first["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
     elif first["type"] in ("tuple_type", "missing", "too_long", "too_short"):
-        parts = typing.get_args(hint)
+        parts = typing.get_args(hint) if typing.get_origin(hint) is tuple else (Ellipsis,)
         count = "" if Ellipsis in parts else f"{len(parts)} "
         text = f"expected a list of {count}values, got {value!r}"
     raise InputError(f"{source}, setting {name}: {text}")

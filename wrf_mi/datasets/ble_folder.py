@@ -64,9 +64,7 @@ NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of the BLE data (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received; the rows of
@@ -81,8 +79,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     anchors_m = attempt(_positions, anchors, "xyz")
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
-    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY)}
-    runs = attempt(_runs, tables)
+    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, RUN)}
     strengths = [attempt(_signal_strength, table, ids) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
     stop_at_faults()
@@ -107,7 +104,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         tx_antenna=tx_antenna.value,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=noise[STD].value,
-        runs=runs.value,
+        runs=stated[RUN].value,
         source=str(folder),
     )
     carriers_hz = stated[FREQUENCY].value
@@ -261,32 +258,18 @@ def _wrong_id(anchor: str, before: list[str]) -> str | None:
     return None
 
 
-def _having(column: str, tables: list[CsvTable]) -> list[CsvTable]:
-    """Tables with an optional column, which all or none must have."""
+def _in_both(column: str, tables: list[CsvTable]) -> Any:
+    """An optional column of all tables, which all or none must have, concatenated; None where no table has it."""
     having = [table for table in tables if column in table.header]
     for table in tables:
         if having and table not in having:
             text = f"no column {column}, but {having[0].path.name} has one; give it in both files or in neither"
             refuse(DataFault(table.path, text, line=1))
-    return having
-
-
-def _runs(tables: list[CsvTable]) -> NDArray[np.str_] | None:
-    """The run of each row of all tables; None where no table states it."""
-    having = _having(RUN, tables)
-    return np.concatenate([runs_of(table) for table in having]) if having else None
-
-
-def _in_both(column: str, tables: list[CsvTable]) -> FloatArray | None:
-    """An optional column of numbers of all tables, concatenated; None where no table has it."""
-    having = _having(column, tables)
-    if not having:
-        return None
-    columns = [table.numbers(column) for table in having]
+    columns: list[Any] = [runs_of(table) if column == RUN else table.numbers(column) for table in having]
     if column == FREQUENCY:
         for table, values in zip(having, columns, strict=True):
             carriers_of(table.path, values)
-    return np.concatenate(columns)
+    return np.concatenate(columns) if columns else None
 
 
 def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
@@ -304,9 +287,7 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
-    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None if not
-    stated.
-    """
+    """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
     found = [_by_anchor(prefix, table) for table in tables]
     if not any(anchor in columns for columns in found for anchor in ids):
         return None

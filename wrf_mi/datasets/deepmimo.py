@@ -18,26 +18,32 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, InputError, Receiver, Record
 from ..core.angles import FloatArray, unit_vectors
-from ..core.antenna import DEVICE_TO_ARRAY
+from ..core.antenna import ANTENNA, DEVICE_TO_ARRAY
 from ..core.array_files import stored_array, stored_arrays
 from ..core.files import readable, text_lines
+from ..core.settings import CheckedSettings, Positive, settings_from
 from ..core.types import IntArray
 from ..core.yaml_files import read_yaml
 from ..parallel import run_module
-from .deepmimo_params import ALL, BASE_STATIONS, CHANNEL_PARAMS, ChannelParams, channel_params
-from .folder_files import data_folder, numbers_of, read_official, shown
+from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
 from .read_mat import FAULT
 
+CHANNEL_PARAMS = "channel_params.yml"
+"""File of a scenario's folder that selects what is computed; optional."""
+MAX_NUMBER, MAX_ELEMENTS = 1 << 20, 1 << 10
+"""Most subcarriers, and most elements of an array along one axis."""
 PARAMS = "params.json"
 OLD_PARAMS = "params.mat"
 """File of scenarios before version 4."""
@@ -56,6 +62,93 @@ VALUES_PER_CHUNK = 1 << 20
 """Complex values of the largest array in a chunk of users."""
 
 
+Pattern = Literal["isotropic", "halfwave-dipole"]
+"""DeepMIMO's names of antenna patterns."""
+
+
+@dataclass(frozen=True)
+class _Ofdm:
+    bandwidth: Positive = 10e6  # Hz, of all subcarriers
+    subcarriers: Annotated[int, Field(ge=1, le=MAX_NUMBER, description=f"1 to {MAX_NUMBER}")] = 512
+    selected_subcarriers: tuple[int, ...] = (0,)
+
+
+@dataclass(frozen=True)
+class _StationAntenna:
+    shape: tuple[int, int] = (1, 1)  # elements along y and z of the base station's own frame
+    spacing: Positive = 0.5  # wavelengths of the carrier
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about the world's x axis, then y, then z
+    radiation_pattern: Pattern = "isotropic"
+
+
+@dataclass(frozen=True)
+class _UserAntenna:
+    radiation_pattern: Pattern = "isotropic"
+
+
+@dataclass(frozen=True)
+class _ChannelParams(CheckedSettings):
+    """Content of `CHANNEL_PARAMS`: what is computed from the paths of a scenario.
+
+    Names, units and defaults are those of ``deepmimo.ChannelParameters`` (DeepMIMO 4), except for the base station's
+    array, a single antenna by default. ``add_carrier_phase`` multiplies each path by exp(-j 2 pi carrier delay), which
+    some converters leave out.
+    """
+
+    ofdm: _Ofdm = field(default_factory=_Ofdm)
+    bs_antenna: _StationAntenna = field(default_factory=_StationAntenna)
+    ue_antenna: _UserAntenna = field(default_factory=_UserAntenna)
+    base_stations: tuple[int, ...] | Literal["all"] | None = None
+    add_carrier_phase: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        lists = {"ofdm.selected_subcarriers": (self.ofdm.selected_subcarriers, self.ofdm.subcarriers - 1)}
+        if isinstance(self.base_stations, tuple):
+            lists["base_stations"] = self.base_stations, MAX_NUMBER
+        for name, (numbers, high) in lists.items():
+            if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0 or max(numbers) > high:
+                text = f"setting {name}: {shown(list(numbers))}"
+                raise InputError(f"{text}; give a list of different whole numbers from 0 to {high}")
+        if min(self.bs_antenna.shape) < 1 or max(self.bs_antenna.shape) > MAX_ELEMENTS:
+            text = f"setting bs_antenna.shape: {shown(list(self.bs_antenna.shape))}"
+            raise InputError(f"{text}; give two whole numbers from 1 to {MAX_ELEMENTS}, elements along y and z")
+        if not fits_single(np.array([*self.bs_antenna.rotation, self.bs_antenna.spacing, self.ofdm.bandwidth])):
+            raise InputError("setting bs_antenna.rotation, bs_antenna.spacing or ofdm.bandwidth is too large; lower it")
+
+    @property
+    def offsets_hz(self) -> FloatArray:
+        """Frequency of each selected subcarrier [K] relative to the carrier."""
+        return np.array(self.ofdm.selected_subcarriers, float) * (self.ofdm.bandwidth / self.ofdm.subcarriers)
+
+    @property
+    def elements(self) -> FloatArray:
+        """Elements [m, 3] in the base station's own frame, wavelengths: the first at the origin, y fastest."""
+        across, up = self.bs_antenna.shape
+        z, y = np.divmod(np.arange(across * up), across)
+        return np.stack([np.zeros(len(y)), y, z], axis=1) * self.bs_antenna.spacing
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotation [3, 3] from the base station's own frame to the world's (3GPP TR 38.901, equation 7.1-2)."""
+        return np.asarray(Rotation.from_euler("xyz", self.bs_antenna.rotation, degrees=True).as_matrix())
+
+
+def _antennas(chosen: _ChannelParams) -> tuple[Antenna, ...]:
+    """Antenna of the base stations and of the users."""
+    patterns = (chosen.bs_antenna.radiation_pattern, "array"), (chosen.ue_antenna.radiation_pattern, "world")
+    # An isotropic antenna is vertical in the world, as everywhere; powers do not state another polarisation.
+    return tuple(ANTENNA if one == "isotropic" else Antenna("hw_dipole", frame=frame) for one, frame in patterns)
+
+
+def _channel_params(file: Path, stated: Mapping[str, Any]) -> _ChannelParams:
+    try:
+        return settings_from(_ChannelParams, stated, str(file))
+    except InputError as error:
+        text = str(error).removeprefix(f"{file}, ")
+        raise InputError(f"{file}: {text}{'' if ';' in text else '; correct it (docs/data.md)'}") from None
+
+
 @dataclass(frozen=True)
 class _Scenario:
     """Folder, carrier in Hz, base stations as (set, number in the set), and sets of users."""
@@ -72,8 +165,7 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     Args:
         path: folder of the scenario.
         name: name of the record; by default that of the folder.
-        params: content of `CHANNEL_PARAMS`, in place of that file: ``base_stations``, ``ofdm``, ``bs_antenna``,
-            ``ue_antenna`` and ``add_carrier_phase``, see ``docs/data.md``.
+        params: content of `CHANNEL_PARAMS`, in place of that file, see ``docs/data.md``.
 
     Returns:
         A record with ``task="csi"``: users as transmitters, a receiver for each chosen base station, ``observation``
@@ -86,7 +178,9 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     scenario, file = _read_scenario(folder), folder / CHANNEL_PARAMS
     if params is None:
         params = read_yaml(file) if file.exists() else {}
-    chosen = channel_params(file, params)
+    chosen = _channel_params(file, params)
+    bs_antenna, ue_antenna = _antennas(chosen)
+    orientation = Rotation.from_matrix(chosen.rotation @ DEVICE_TO_ARRAY.T).as_quat()
     numbers = _choose(scenario, chosen)
     found = [_of_station(scenario, scenario.stations[number], chosen) for number in numbers]
     users = found[0][1]
@@ -102,9 +196,7 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     array_m = (chosen.elements @ DEVICE_TO_ARRAY.T) * (speed_of_light / scenario.carrier_hz)
     several = len(array_m) > 1
     receivers = (
-        Receiver(
-            f"bs{number}", position, chosen.orientation_xyzw, chosen.bs_antenna, array_m=array_m if several else None
-        )
+        Receiver(f"bs{number}", position, orientation, bs_antenna, array_m if several else None)
         for number, (position, _, _) in zip(numbers, found, strict=True)
     )
     return Record(
@@ -115,7 +207,7 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
         observation=observation if several else observation[:, :, 0],
         official=read_official(folder, len(users), first=0, source=folder.name) or _draw_split(received),
         frequencies_hz=scenario.carrier_hz + chosen.offsets_hz,
-        tx_antenna=chosen.ue_antenna,
+        tx_antenna=ue_antenna,
         source=str(folder),
     )
 
@@ -176,14 +268,14 @@ def _number(file: Path, entry: Mapping[Any, Any], key: str) -> int:
     return value
 
 
-def _choose(scenario: _Scenario, chosen: ChannelParams) -> list[int]:
+def _choose(scenario: _Scenario, chosen: _ChannelParams) -> list[int]:
     """Numbers of the chosen base stations."""
     count, file = len(scenario.stations), scenario.folder / CHANNEL_PARAMS
     every = list(range(count))
     if chosen.base_stations is None:
         if count > 1:
             text = f"{scenario.folder}: {count} base stations, 0 to {count - 1}"
-            raise InputError(f"{text}; choose in {CHANNEL_PARAMS}, {BASE_STATIONS}: [0] or {BASE_STATIONS}: {ALL}")
+            raise InputError(f"{text}; choose in {CHANNEL_PARAMS}, base_stations: [0] or base_stations: all")
         return every
     if isinstance(chosen.base_stations, str):
         return every
@@ -193,7 +285,7 @@ def _choose(scenario: _Scenario, chosen: ChannelParams) -> list[int]:
 
 
 def _of_station(
-    scenario: _Scenario, station: tuple[int, int], chosen: ChannelParams
+    scenario: _Scenario, station: tuple[int, int], chosen: _ChannelParams
 ) -> tuple[FloatArray, FloatArray, NDArray[np.complex64]]:
     """Position [3], users [n, 3] and channels [n, m, k] of a base station, over all sets of users."""
     positions, users, channels = [], [], []
@@ -263,7 +355,7 @@ def _mat_arrays(files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
 
 
 def _channels(
-    scenario: _Scenario, pair: str, paths: Mapping[str, NDArray[Any]], chosen: ChannelParams
+    scenario: _Scenario, pair: str, paths: Mapping[str, NDArray[Any]], chosen: _ChannelParams
 ) -> NDArray[np.complex64]:
     """Channels [n, m, k], NaN for users without a path."""
     elements, offsets_hz = chosen.elements, chosen.offsets_hz
@@ -284,7 +376,7 @@ def _channels(
         departure = departure @ chosen.rotation
         with np.errstate(over="ignore", invalid="ignore"):
             gain = exist * 10 ** (power / 20) * np.exp(1j * np.radians(phase))
-            for antenna, directions in ((chosen.bs_antenna, departure), (chosen.ue_antenna, arrival)):
+            for antenna, directions in zip(_antennas(chosen), (departure, arrival), strict=True):
                 gain = gain * np.linalg.norm(antenna.field(directions), axis=-1)
             at_elements = gain[..., None] * np.exp(2j * np.pi * (departure @ elements.T))
             waves = np.exp(-2j * np.pi * delay[..., None] * offsets_hz)
@@ -297,8 +389,8 @@ def _channels(
     return channel
 
 
-def _check_delays(scenario: _Scenario, pair: str, delay: FloatArray, chosen: ChannelParams) -> None:
-    symbol = chosen.subcarriers / chosen.bandwidth_hz
+def _check_delays(scenario: _Scenario, pair: str, delay: FloatArray, chosen: _ChannelParams) -> None:
+    symbol = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
     if delay.size and delay.max() >= symbol:
         # The package would leave such a path out.
         text = (

@@ -37,27 +37,18 @@ MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
 """Largest download of a file that is kept (those known have less than 1 MB), and of one that is converted."""
 
 
-def fetch(
-    name: str,
-    *,
-    home: str | Path | None = None,
-    base_url: str | None = None,
-    retries: int = RETRIES,
-    progress: bool = True,
-) -> Path:
+def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> Path:
     """Download a known data set atomically, or check an existing copy.
 
     Every file, or the arrays of a converted file, must have the published SHA-256.
 
     Args:
         name: name of a known data set.
-        home: folder for ``<name>/``; by default that of ``WRF_MI_DATA``, or else the user's cache.
         base_url: URL of a mirror of the public original.
-        retries: number of further attempts after a failure.
         progress: show a progress bar, and the note of the data set, on standard error.
 
     Returns:
-        The folder of the data set.
+        The folder of the data set, ``<name>/`` below ``WRF_MI_DATA`` or else in the user's cache.
 
     Raises:
         InputError: unknown name, no network, a file that is not the published one, or a folder that cannot be written.
@@ -65,22 +56,14 @@ def fetch(
     dataset = known(name)
     if dataset.base_url is None:
         raise InputError(f"data set {name}: is not downloaded but {dataset.origin}")
-    parent = Path(home) if home else data_home()
-    target = locate(name, parent) or parent / name
-    folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, retries, progress)
+    target = locate(name, data_home()) or data_home() / name
+    folder = download(dataset, remote_files(dataset), target, base_url or dataset.base_url, progress)
     if progress and dataset.note:
         print(f"{name}: {dataset.note}", file=sys.stderr)
     return folder
 
 
-def download(
-    dataset: DataSet,
-    entries: list[RemoteFile],
-    target: Path,
-    base_url: str,
-    retries: int = RETRIES,
-    progress: bool = False,
-) -> Path:
+def download(dataset: DataSet, entries: list[RemoteFile], target: Path, base_url: str, progress: bool = False) -> Path:
     """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds, as `fetch` does."""
     if target.exists():
         damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry)]
@@ -93,7 +76,7 @@ def download(
         hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
         for entry in entries:  # pooch makes folders too, but not if two threads do at once
             (part / entry.path).parent.mkdir(parents=True, exist_ok=True)
-        store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=retries)
+        store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=RETRIES)
         _fetch_all(store, dataset.name, progress, {entry.path for entry in entries if entry.converted})
         for entry in entries:
             if entry.converted:

@@ -25,6 +25,7 @@ AXES = "x,y,z"
 RUN = "run"
 """Column with the run of the measurement in which each row was taken: a text without line ends."""
 INDEX_FILES = ("train_index.txt", "test_index.txt")
+TX_ANTENNA = "tx_antenna"
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
 """Keys of a transmitter's antenna, whose frame is always the world, turned with the heading."""
@@ -103,6 +104,11 @@ def read_antenna(
     except InputError as error:
         text = str(error).removeprefix("antenna: ")
         raise DataFault(path, f"{one_line(name)}: {text}", row=row) from None
+
+
+def read_tx_antenna(path: Path, info: Mapping[Any, Any]) -> Antenna:
+    """The transmitter's antenna, the entry ``tx_antenna`` of a YAML file."""
+    return read_antenna(path, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS)
 
 
 def antenna_entry(antenna: Antenna) -> dict[str, str]:

@@ -11,16 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core import Record
-from ..core.registry import Registry, resolve
-from .argos import SUFFIXES
-from .ble_folder import ANCHORS, TEST, TRAINING
-from .deepmimo import OLD_PARAMS, PARAMS
+from ..core.array_files import stored_names
+from ..core.registry import Registry
+from .argos import SUFFIXES, read_argos
+from .ble_folder import ANCHORS, TEST, TRAINING, read_ble_folder
+from .deepmimo import OLD_PARAMS, PARAMS, read_deepmimo
 from .folder_files import POSITIONS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
-from .nerf2_ble import POWERS
-from .nerf2_csi import CHANNELS, STATION
-from .record_file import VERSION
-from .spectrum_folder import FOLDS, GATEWAYS, IMAGES
+from .nerf2_ble import POWERS, read_nerf2_ble
+from .nerf2_csi import CHANNELS, STATION, read_nerf2_csi
+from .newrf import read_newrf
+from .record_file import VERSION, read_record_file
+from .spectrum_folder import FOLDS, GATEWAYS, IMAGES, read_spectrum_folder
 from .unknown import unknown_data
 
 ENTRY_POINTS = "wrf_mi.layouts"
@@ -35,7 +37,7 @@ class Layout:
     Attributes:
         name: name of the layout.
         task: task of its records (`wrf_mi.core.Record`); "": that of each file.
-        reader: ``module:function`` of type `Read`, or the function.
+        read: function that reads it.
         files: names of files; a folder with any of them has this layout.
         suffixes: endings of files that are data sets, alone or in a folder without any layout's ``files``.
         array: name of an array that an ``.npz`` file of this layout holds, or "".
@@ -45,7 +47,7 @@ class Layout:
 
     name: str
     task: str
-    reader: str | Read
+    read: Read
     files: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()
     array: str = ""
@@ -55,28 +57,22 @@ class Layout:
         """Whether a file has the ending and the array of this layout."""
         return file.suffix in self.suffixes and (not self.array or self.array in array_names(file))
 
-    @property
-    def read(self) -> Read:
-        """Function that reads the layout."""
-        read: Read = resolve(self.reader) if isinstance(self.reader, str) else self.reader
-        return read
-
 
 BUILT_IN = (
     Layout(
         "spectra",
         "spectrum",
-        "wrf_mi.datasets.spectrum_folder:read_spectrum_folder",
+        read_spectrum_folder,
         (GATEWAYS,),
         parts=(IMAGES, POSITIONS, FOLDS),
     ),
-    Layout("nerf2-ble", "rssi", "wrf_mi.datasets.nerf2_ble:read_nerf2_ble", (POWERS, BLE_GATEWAYS)),
-    Layout("nerf2-csi", "csi", "wrf_mi.datasets.nerf2_csi:read_nerf2_csi", (CHANNELS, STATION)),
-    Layout("ble", "rssi", "wrf_mi.datasets.ble_folder:read_ble_folder", (ANCHORS,), parts=(TRAINING, TEST)),
-    Layout("deepmimo", "csi", "wrf_mi.datasets.deepmimo:read_deepmimo", (PARAMS, OLD_PARAMS)),
-    Layout("npz", "", "wrf_mi.datasets.record_file:read_record_file", suffixes=(".npz",), array=VERSION),
-    Layout("newrf", "csi", "wrf_mi.datasets.newrf:read_newrf", suffixes=(".npz",)),
-    Layout("argos", "csi", "wrf_mi.datasets.argos:read_argos", suffixes=SUFFIXES),
+    Layout("nerf2-ble", "rssi", read_nerf2_ble, (POWERS, BLE_GATEWAYS)),
+    Layout("nerf2-csi", "csi", read_nerf2_csi, (CHANNELS, STATION)),
+    Layout("ble", "rssi", read_ble_folder, (ANCHORS,), parts=(TRAINING, TEST)),
+    Layout("deepmimo", "csi", read_deepmimo, (PARAMS, OLD_PARAMS)),
+    Layout("npz", "", read_record_file, suffixes=(".npz",), array=VERSION),
+    Layout("newrf", "csi", read_newrf, suffixes=(".npz",)),
+    Layout("argos", "csi", read_argos, suffixes=SUFFIXES),
 )
 
 
@@ -115,8 +111,7 @@ def _by_files(folder: Path) -> list[Layout]:
 def array_names(file: Path) -> set[str]:
     """Names of the arrays in an ``.npz`` file; empty where it is none, whose reader says so."""
     try:
-        with zipfile.ZipFile(file) as stored:
-            return {name.removesuffix(".npy") for name in stored.namelist()}
+        return stored_names(file)
     except (OSError, zipfile.BadZipFile):
         return set()
 

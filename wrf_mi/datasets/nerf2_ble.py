@@ -40,9 +40,7 @@ FEWEST = 2
 def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's signal strengths (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received.

@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core import Antenna, DataFault, InputError, Receiver, Record
+from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_array
@@ -26,7 +26,6 @@ from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
     AXES,
     POSITIONS,
-    TX_ANTENNA_WORDS,
     Positions,
     antenna_entry,
     data_folder,
@@ -35,6 +34,7 @@ from .folder_files import (
     read_antenna,
     read_columns,
     read_official,
+    read_tx_antenna,
     refuse_unstated,
     shown,
     unit_quaternion,
@@ -77,7 +77,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     positions = attempt(_positions, folder / POSITIONS, stated, n)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(read_official, folder, n, 0, CHANNELS)
-    tx_antenna = attempt(_tx_antenna, station, info)
+    tx_antenna = attempt(read_tx_antenna, station, info)
     stop_at_faults()
     half, hz = channel.value.shape[2] // 2, frequencies.value
     return Record(
@@ -210,10 +210,6 @@ def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.comple
         text = f"shape {list(truth.shape)}, expected {shape}, as the downlink of {CHANNELS}; correct it"
         raise DataFault(path, text)
     return truth[None]
-
-
-def _tx_antenna(path: Path, info: dict[Any, Any]) -> Antenna:
-    return read_antenna(path, "tx_antenna", info.get("tx_antenna"), TX_ANTENNA_WORDS)
 
 
 def _read_station(path: Path, info: dict[Any, Any]) -> Receiver:

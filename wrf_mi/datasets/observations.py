@@ -15,8 +15,6 @@ logger = logging.getLogger(__name__)
 
 ROWS_PER_CHUNK = 256
 """Rows that are checked at a time, so that large records are not copied."""
-
-
 LEAST_ROWS = 2
 """Training rows below which a receiver is left out: a level and its slope need two, as do a row that trains and another
 that chooses settings."""

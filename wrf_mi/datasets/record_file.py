@@ -7,7 +7,7 @@ names; ``train`` and ``test`` are the official rows, ``tx_antenna`` the attribut
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,7 @@ from ..core.files import readable
 from .folder_files import single_file
 
 VERSION, FORMAT = "record_format", 1
-OPTIONAL = (
-    "folds",
-    "frequencies_hz",
-    "tx_heading_rad",
-    "uplink",
-    "uplink_hz",
-    "truth",
-    "n_readings",
-    "std",
-    "carriers_hz",
-    "runs",
-)
+OPTIONAL = tuple(one.name for one in fields(Record) if one.default is None and one.name != "official")
 """Attributes of a record that may be None."""
 
 
@@ -53,11 +42,7 @@ def write_record_file(path: str | Path, record: Record) -> Path:
 
 
 def read_record_file(path: str | Path, name: str | None = None) -> Record:
-    """Read a file of `write_record_file`.
-
-    Args:
-        path: path of the file, or of a folder that holds it alone.
-        name: name of the record; by default the one that is stored.
+    """Read a file of `write_record_file`, or a folder that holds it alone, with another name if one is given.
 
     Raises:
         InputError: a file that is missing or damaged, or of another format version.

@@ -16,7 +16,7 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..core import Antenna, DataFault, InputError, Receiver, Record
+from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..core.files import atomic_folder, one_line, text_lines
@@ -27,7 +27,7 @@ from ..core.yaml_files import read_yaml
 from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     POSITIONS,
-    TX_ANTENNA_WORDS,
+    TX_ANTENNA,
     Positions,
     antenna_entry,
     data_folder,
@@ -35,6 +35,7 @@ from .folder_files import (
     read_antenna,
     read_official,
     read_positions,
+    read_tx_antenna,
     refuse_runs,
     refuse_unstated,
     shown,
@@ -48,7 +49,7 @@ from .folder_files import (
 
 CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 """Keys under which a file may state carriers."""
-GATEWAYS, FOLDS, IMAGES, TX_ANTENNA = "gateway_info.yml", "blocked_folds.txt", "spectrum", "tx_antenna"
+GATEWAYS, FOLDS, IMAGES = "gateway_info.yml", "blocked_folds.txt", "spectrum"
 RESERVED = ("array", TX_ANTENNA)
 """Mappings of the file that are no receivers; receivers cannot have these names."""
 MOST_PIXELS = 1 << 22
@@ -62,9 +63,7 @@ GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the NeRF2 spectrum layout (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="spectrum"``, positions [n, 3] in metres and ``observation`` [n_rx, n, height, width]
@@ -85,8 +84,8 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     rows = attempt(lambda read: len(read.positions_m), table)
     observation = attempt(_read_images, folder / IMAGES, poses, rows)
     official = attempt(read_official, folder, rows, 1)
-    folds = attempt(_folds, folder / FOLDS, rows)
-    tx_antenna = attempt(_tx_antenna, gateways, info)
+    folds = attempt(parse_folds, folder / FOLDS, rows) if (folder / FOLDS).exists() else None
+    tx_antenna = attempt(read_tx_antenna, gateways, info)
     stop_at_faults()
     stated_rows = table.value
     record = Record(
@@ -96,7 +95,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         receivers=receivers.value,
         observation=observation.value,
         official=official.value,
-        folds=folds.value,
+        folds=None if folds is None else folds.value,
         frequencies_hz=stated.value,
         tx_antenna=tx_antenna.value,
         runs=stated_rows.runs,
@@ -190,15 +189,6 @@ def parse_folds(path: Path, rows: int) -> IntArray:
         what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
         raise DataFault(path, f"{what}; number the folds 0, 1, ... without gaps, two at least")
     return folds
-
-
-def _folds(path: Path, rows: int) -> IntArray | None:
-    """Folds of the file, None where there is none."""
-    return parse_folds(path, rows) if path.exists() else None
-
-
-def _tx_antenna(path: Path, info: dict[Any, Any]) -> Antenna:
-    return read_antenna(path, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS)
 
 
 def _one_carrier(path: Path, table: Positions, stated: FloatArray | None) -> None:

@@ -49,12 +49,7 @@ class Table:
 
 
 def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
-    """The error about a folder or file that no layout describes.
-
-    Args:
-        path: the folder or file.
-        inner: folders in it that are data sets.
-    """
+    """The error about a folder or file that no layout describes; ``inner`` are folders in it that are data sets."""
     if path.is_file():
         table = _read_header(path)
         what = "a file of no known layout" if table is None else "a table, where a folder is wanted"

@@ -5,8 +5,7 @@ from ..backend import init
 # Dr.Jit loads an LLVM when it is imported, so the choice must be made before.
 init()
 
-from .factorised import Factorised
-from .fields import Encoding, WrfGs, WrfGsPlus
+from .fields import Encoding, Factorised, WrfGs, WrfGsPlus
 from .initial import InitialGaussians, gaussians_from_points, random_gaussians
 from .parameters import Gaussians, rows
 

@@ -197,10 +197,7 @@ def _forward(
 def _derivatives(
     record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ReverseState, slopes: list[list[Pair]]
 ) -> tuple[list[Any], list[Any], Any, ReverseState]:
-    """One Gaussian's derivatives by its record and by its signals, summed over a lane's pixels.
-
-    Also returned: whether any pixel sees the Gaussian, and the state behind it.
-    """
+    """Derivatives by one Gaussian's record and signals, summed over a lane's pixels; whether any sees it; the state."""
     along = along_azimuth(record, lanes.azimuth)
     sums: list[list[Any]] = [[0, 0] for _ in range(3)]
     by_blending: list[Any] = [0] * (fields - 9)

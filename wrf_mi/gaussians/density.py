@@ -30,17 +30,11 @@ class DensityChange:
         parameters: per-Gaussian parameters of the new set, [k, m].
         source: old Gaussian of each new one, [m].
         fresh: new Gaussians whose optimiser moments start at zero, [m].
-        cloned: number of cloned Gaussians.
-        split: number of split Gaussians.
-        pruned: number of removed Gaussians.
     """
 
     parameters: Arrays
     source: NDArray[np.int64]
     fresh: NDArray[np.bool_]
-    cloned: int
-    split: int
-    pruned: int
 
 
 def adapt(
@@ -94,8 +88,7 @@ def adapt(
         alpha = expit(parameters["opacity"][0, source[doubled]].astype(float))
         each = np.clip(1 - np.sqrt(1 - alpha), 1e-6, 1 - 1e-6)
         new["opacity"][0, doubled] = logit(each)
-    pruned = len(keep) - len(alive)
-    return DensityChange(new, source, fresh, len(growing) - len(split), len(split), pruned)
+    return DensityChange(new, source, fresh)
 
 
 def reset_opacity(opacity_logits: NDArray[np.float32], at_most: float) -> NDArray[np.float32]:

@@ -32,10 +32,6 @@ class Pose:
         """A world vector in the receiver's frame (R^T v)."""
         return [sum((self.to_world[k][i] * v[k] for k in (1, 2)), self.to_world[0][i] * v[0]) for i in range(3)]
 
-    def from_local(self, v: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
-        """A vector of the receiver's frame in the world frame (R v)."""
-        return [sum((row[k] * v[k] for k in (1, 2)), row[0] * v[0]) for row in self.to_world]
-
 
 @dataclass
 class Footprints:
@@ -146,12 +142,7 @@ def centre_distance(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBas
 
 
 def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBase:
-    """Indices of Gaussians from near to far; equal depths are ordered by x, then y, then z.
-
-    Args:
-        depth: array [n], metres.
-        position: three arrays [n]; they decide ties, so storage order does not.
-    """
+    """Indices of Gaussians from near to far; equal depths are ordered by x, then y, then z, not by storage order."""
     keys = [dr.detach(key) for key in (depth, *position)]
     if dr.backend_v(depth) is dr.JitBackend.CUDA and dr.flag(dr.JitFlag.FreezingScope):
         # Dr.Jit 1.5 records its sort on CUDA, but the replay ends the process (`block_mkperm`).
@@ -168,9 +159,6 @@ def ranked_order(keys: list[dr.ArrayBase]) -> dr.ArrayBase:
     """Indices in ascending order of the first key, ties by those that follow, then by index.
 
     Every lane counts the entries before its own: one kernel of n^2 comparisons.
-
-    Args:
-        keys: arrays [n].
     """
     index_type: Any = dr.uint32_array_t(type(keys[0]))
     n = dr.width(keys[0])

@@ -28,7 +28,7 @@ from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
 from .footprint import Footprints, Pose, depth_order, project
 from .parameters import Gaussians
-from .recurrence import Pair, forward_step
+from .recurrence import SMALLEST_FACTOR, Pair, forward_step
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -153,13 +153,7 @@ def _weights(
 
 
 def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: float = np.inf) -> csr_array:
-    """The weights of the perception plane, computed one row of tiles after the other.
-
-    Args:
-        gaussians: Gaussians for one transmitter (batch 1); signals are not read.
-        pose: pose of the receiver.
-        plane: perception plane of the receiver, of the Gaussians' float type.
-        most_bytes: largest size of the weights.
+    """The weights of Gaussians for one transmitter on the perception plane, one row of tiles after the other.
 
     Returns:
         Matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a row
@@ -236,12 +230,8 @@ class _Operator(ABC):
 class Images(_Operator):
     """Complex images that add up to a spectrum: R = sum_k c_k image_k.
 
-    Real and imaginary parts are products of one real matrix, a fifth faster than a complex product.
-
-    Args:
-        images: complex images [K, height * width].
-        height: rows.
-        width: columns.
+    ``images`` are complex, [K, height * width]. Real and imaginary parts are products of one real matrix, a fifth
+    faster than a complex product.
     """
 
     def __init__(self, images: ArrayLike, height: int, width: int) -> None:
@@ -261,28 +251,11 @@ class Images(_Operator):
 
 
 class PixelOperator(_Operator):
-    """Map from signals [batch, n] to the perception plane by sparse weights.
-
-    Args:
-        weights: matrix [pixels, n], see `pixel_weights`.
-        height: rows of the plane.
-        width: columns.
-    """
+    """Map from signals [batch, n] to the perception plane by sparse weights [pixels, n] (`pixel_weights`)."""
 
     def __init__(self, weights: csr_array, height: int, width: int) -> None:
         self.weights, self.height, self.width = weights, height, width
         self.kind = np.result_type(weights.dtype, np.complex64)
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, pose: Pose, plane: Plane) -> PixelOperator:
-        """The operator of Gaussians of static geometry and one receiver; see `pixel_weights`."""
-        return cls(pixel_weights(gaussians, pose, plane), plane.height, plane.width)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the weights."""
-        w = self.weights
-        return w.data.nbytes + w.indices.nbytes + w.indptr.nbytes
 
     def field(self, signals: ArrayLike) -> ComplexArray:
         """R [batch, height * width] of complex signals [batch, n]."""
@@ -300,3 +273,29 @@ class PixelOperator(_Operator):
     def composed(self, factors: ArrayLike) -> Images:
         """The images [K, pixels] of signals S = C c, for factors C [n, K]."""
         return Images((self.weights @ np.asarray(factors, self.kind)).T, self.height, self.width)
+
+
+def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> NDArray[np.float64]:
+    """Sum over the plane's pixels of |change of R| on removal of one Gaussian, [n].
+
+    In the terms of `wrf_mi.gaussians.recurrence`: removal of Gaussian i takes away w_i T_i S_i, and scales the sum Q_i
+    behind it, which it hides, by 1 / b_i. With the weights B_i = w_i T_i of `pixel_weights`, the transmittance is
+    T_i = 1 - sum_{k < i} B_k (alpha blending) or 1 - sum_{k < i} B_k (1 - delta_k) (product blending).
+    """
+    weights = pixel_weights(gaussians, pose, plane)
+    seen, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)
+    delta = [np.array(part, float) for part in gaussians.attenuation or (np.zeros(gaussians.count),) * 2]
+    re, im = (np.array(part, float) for part in gaussians.signal)
+    sent, hidden = (weights.data * values[seen] for values in (re + 1j * im, 1 - delta[0] - 1j * delta[1]))
+
+    def before(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Sum over the entries before each in its pixel."""
+        total = np.concatenate([[0], np.cumsum(values)])
+        return total[:-1] - np.repeat(total[start], length)
+
+    transmittance = 1 - before(hidden)
+    hides = np.divide(hidden, transmittance, out=np.zeros_like(hidden), where=transmittance != 0)
+    factor = 1 - hides
+    behind = np.repeat(weights @ (re + 1j * im), length) - before(sent) - sent
+    quotient = behind * np.conj(factor) / np.maximum(np.abs(factor), SMALLEST_FACTOR) ** 2
+    return np.asarray(np.bincount(seen, np.abs(sent - hides * quotient), gaussians.count), float)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
+import numpy as np
+
+from ..backend.device import on_device
 
 PER_PAIR = ("scale", "rotation", "opacity", "attenuation")
 """Attributes beside the signal that may differ between transmitters."""
@@ -42,7 +45,6 @@ class Gaussians:
     batch: int
 
     def __post_init__(self) -> None:
-        """Refuse Gaussians without a blending rule."""
         if (self.opacity is None) == (self.attenuation is None):
             raise ValueError("Gaussians need either an opacity (alpha blending) or an attenuation (product blending)")
 
@@ -119,3 +121,46 @@ def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     if dr.width(gaussians.scale[0]) == n:  # one geometry serves all of them
         return replace(gaussians, **changes)
     return gaussians.mapped(lambda a: dr.gather(kind, a, pair), **changes)
+
+
+CHUNK_SIZE = 1 << 14
+"""Pairs of Gaussian and transmitter at once: 64 MB of a network of width 256."""
+
+
+def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_once: int = CHUNK_SIZE) -> Gaussians:
+    """The evaluated result of ``field.gaussians(params, tx_pos)`` in chunks, without gradients, which need all layers.
+
+    A network keeps some numbers of every layer for each Gaussian and transmitter, kilobytes in WRF-GS+: in chunks
+    memory grows only with the Gaussians themselves.
+
+    Args:
+        field: any of `wrf_mi.gaussians.FIELDS`: no Gaussian depends on another.
+        params: parameters of the field.
+        tx_pos: transmitter positions [3, batch], metres.
+        at_once: approximate number of pairs of Gaussian and transmitter at once.
+    """
+    count, batch = params["position"].shape[1], tx_pos.shape[1]
+    step = max(at_once // batch, 1)
+    parts: list[Gaussians] = []
+    with dr.suspend_grad():
+        for first in range(0, max(count, 1), step):
+            chunk = slice(first, min(first + step, count))
+            values = {name: value[:, chunk] if name in field.per_gaussian else value for name, value in params.items()}
+            parts.append(field.gaussians(values, tx_pos))
+            dr.eval(vars(parts[-1]))
+        if len(parts) == 1:
+            return parts[0]
+        # Concatenated the parts are [part, transmitter, Gaussian]; the result is [transmitter, Gaussian].
+        sizes = [part.count for part in parts]
+        begin = batch * np.cumsum([0, *sizes[:-1]])
+        slots = [a + np.arange(batch * n).reshape(batch, n) for a, n in zip(begin, sizes, strict=True)]
+        order = on_device(np.concatenate(slots, axis=1), dr.uint32_array_t(type(parts[0].position[0])))
+
+        def joined(*arrays: Any) -> Any:
+            whole = dr.concat(list(arrays))
+            return whole if dr.width(whole) == count else dr.gather(type(whole), whole, order)
+
+        names = [f.name for f in fields(Gaussians) if f.name != "batch"]
+        result = Gaussians(**{n: each(joined, *(getattr(part, n) for part in parts)) for n in names}, batch=batch)
+        dr.eval(vars(result))
+    return result

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from ..backend.device import to_tensor
 from ..backend.recorded import Recorded
-from .factorised import Factorised
-from .fields import WrfGs
+from .fields import Factorised, WrfGs
 from .network import dense, linear
 
 ComplexArray = NDArray[np.complex64]

@@ -158,13 +158,8 @@ def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch
     """List the Gaussians of each tile in depth order.
 
     Where room for every Gaussian in every tile takes more than `RESERVED` entries, entries are counted first and only
-    their room is allocated. A function that Dr.Jit records cannot count: there, room is for all.
-
-    Args:
-        footprints: footprints of ``batch * n`` columns.
-        order: Gaussians from near to far, [n].
-        plane: the perception plane.
-        batch: number of transmitters.
+    their room is allocated. A function that Dr.Jit records cannot count: there, room is for all. Footprints are of
+    ``batch * n`` columns, ``order`` lists the n Gaussians from near to far.
 
     Raises:
         InputError: more entries than 32 bits count.

@@ -30,9 +30,8 @@ from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
-from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
-from ..gaussians.parameters import by_component
+from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
 from ..tracing.field_calculator import Complex
 from ..tracing.options import FACTOR

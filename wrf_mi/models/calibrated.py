@@ -34,14 +34,7 @@ INTERVALS, ROWS = "intervals/", "intervals_rows"
 
 
 class FittedWithIntervals(Fitted):
-    """A fitted model whose standard deviations are those of held-out errors.
-
-    Args:
-        fitted: fitted model.
-        record: data.
-        rows: training rows, from which distances are measured [n].
-        intervals: standard deviations of errors.
-    """
+    """A fitted model whose standard deviations are those of held-out errors, by the distance to training rows [n]."""
 
     def __init__(self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals) -> None:
         self.fitted, self._record, self._rows, self._intervals = fitted, record, rows, intervals

@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
-    """Refuse a record that a model does not serve, or whose parts do not fit together.
-
-    Args:
-        method: model to be fitted.
-        record: data.
-        others: models to be named where it does not serve.
+    """Refuse a record that a model does not serve, naming ``others`` that do, or whose parts do not fit together.
 
     Raises:
         InputError: another task; no uplink for a model that needs it; rows of several carriers for a model that serves

@@ -81,7 +81,6 @@ class TracingSettings(LoopOptions, TraceOptions):
     target_kinds: str = ",".join(CHOSEN_KINDS)
 
     def __post_init__(self) -> None:
-        """Refuse settings out of range."""
         super().__post_init__()
         if self.calibration is None and (chosen := self.chosen()):
             raise InputError(f"setting {chosen[0]}: of a training, and nothing is calibrated; set calibration, too")
@@ -312,11 +311,7 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
 
 
 def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse a phase error that has no effect, and warn of other settings that have none.
-
-    Raises:
-        InputError: naming the setting.
-    """
+    """Refuse a phase error that has no effect, and warn of other settings that have none."""
     settings, record = problem.settings, problem.record
     idle = without_effect(settings.options)
     if settings.phase_error and not task_of(record).image:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,8 +16,11 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
-from ..gaussians.oracle import Projection
+from ..core.types import IntArray
 from ..models.hybrid.scene_side import STAGES
+
+if TYPE_CHECKING:
+    from ..gaussians.footprint import Footprints
 
 PANEL_IN = 2.3
 """Side of a polar plot in inches."""
@@ -144,21 +147,24 @@ def row_table(rows: Rows, columns: Sequence[str], row: ArrayLike, label: str) ->
     return figure
 
 
-def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike, label: str = "weight") -> Figure:
+def footprint_sky(spectrum: ArrayLike, gaussians: Footprints, weight: ArrayLike, label: str = "weight") -> Figure:
     """Spectrum beside the outlines of the Gaussians' footprints, at exp(-1/2) of their maximum.
 
     Args:
         spectrum: grey values [H, W].
-        gaussians: n Gaussians projected by `wrf_mi.gaussians.oracle.project`; those without a footprint are left out.
+        gaussians: footprints of n Gaussians (`wrf_mi.gaussians.footprint.project`); those that are not visible are left
+            out.
         weight: colour of the outlines, the largest on top, shape [n]; for example |opacity x signal|.
         label: name of the weight.
     """
-    drawn = gaussians.order[np.argsort(np.asarray(weight, float)[gaussians.order], kind="stable")]
+    colour = np.asarray(weight, float)
+    order = np.argsort(colour, kind="stable")
+    drawn = order[gaussians.visible.numpy()[order]]
     figure = Figure(figsize=(2 * 1.6 * PANEL_IN, 1.5 * PANEL_IN), layout="constrained")
     left, right = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
     polar_spectrum(left, spectrum, "spectrum")
-    lines = LineCollection(list(_outlines(gaussians)[drawn]), cmap="magma_r", linewidths=0.8)
-    lines.set_array(np.asarray(weight, float)[drawn])
+    lines = LineCollection(list(_outlines(gaussians, drawn)), cmap="magma_r", linewidths=0.8)
+    lines.set_array(colour[drawn])
     lines.set_clim(0, None)
     right.add_collection(lines)
     _sky(right, f"footprints of {len(drawn)} Gaussians", ring_labels="black")
@@ -168,13 +174,15 @@ def footprint_sky(spectrum: ArrayLike, gaussians: Projection, weight: ArrayLike,
     return figure
 
 
-def _outlines(gaussians: Projection) -> FloatArray:
+def _outlines(gaussians: Footprints, chosen: IntArray) -> FloatArray:
     """Azimuth in radians and 90 degrees - elevation in degrees along each footprint's outline, [n, points, 2]."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
     circle = np.stack([np.cos(turn), np.sin(turn)])
-    # A point v of the tangent plane lies in the direction n + v_1 e_1 + v_2 e_2.
-    in_plane = np.swapaxes(np.linalg.cholesky(gaussians.covariance) @ circle, -1, -2)
-    azimuth, elevation = azimuth_elevation(gaussians.direction[:, None] + in_plane @ gaussians.basis)
+    vectors = (gaussians.direction, *gaussians.whitened)
+    direction, *whitened = (np.stack([c.numpy()[chosen] for c in vector], axis=-1) for vector in vectors)
+    # The vectors x of the tangent plane with (a . x, b . x) on the unit circle; the direction is n + x.
+    in_plane = np.swapaxes(np.linalg.pinv(np.stack(whitened, axis=1)) @ circle, -1, -2)
+    azimuth, elevation = azimuth_elevation(direction[:, None] + in_plane)
     return np.stack([azimuth, 90 - np.degrees(elevation)], axis=-1)
 
 

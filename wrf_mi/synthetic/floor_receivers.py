@@ -29,7 +29,7 @@ from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..datasets import read_ble_folder, read_deepmimo, user_cache, write_ble_folder
 from ..datasets.ble_folder import CARRIER_HZ
-from ..datasets.deepmimo_params import CHANNEL_PARAMS
+from ..datasets.deepmimo import CHANNEL_PARAMS
 from ..datasets.folder_files import write_extra, write_official
 from ..receivers.channel import rssi_dbm
 from ..tracing.deepmimo import write_deepmimo

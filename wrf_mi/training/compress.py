@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..backend.device import to_tensor
 from ..core import InputError, Record, Split
 from ..gaussians import InitialGaussians
-from ..gaussians.removal import removal
+from ..gaussians.operator import removal
 from ..gaussians.tiles import perception_plane
 from .config import NetworkConfig, TrainConfig
 from .fields import make_field
@@ -42,7 +42,7 @@ class Compression:
         budget: number of Gaussians to keep; 0: all.
         width: neurons a layer of a smaller network; 0: unchanged.
         layers: hidden layers of a smaller network; 0: unchanged.
-        terms: terms of a factorised field (`wrf_mi.gaussians.factorised`) that replaces the model, with the sizes
+        terms: terms of a factorised field (`wrf_mi.gaussians.fields`) that replaces the model, with the sizes
             above; 0: the model is kept.
         distil: steps in which a smaller network learns the larger network's spectra.
         fine_tune: final steps on the training rows.
@@ -73,7 +73,7 @@ class Compression:
 def importance(config: TrainConfig, params: Mapping[str, Any], record: Record, split: Split) -> NDArray[np.float64]:
     """Mean |change| of a pixel over training views when a Gaussian is removed, [n].
 
-    Each Gaussian is removed alone (`wrf_mi.gaussians.removal`), so a dark Gaussian that hides a strong one counts.
+    Each Gaussian is removed alone (`wrf_mi.gaussians.operator`), so a dark Gaussian that hides a strong one counts.
     """
     field, plane = make_field(config), perception_plane(*map(int, record.observation.shape[-2:]), mi.Float)
     tensors = {name: to_tensor(values) for name, values in params.items()}

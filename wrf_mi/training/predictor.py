@@ -20,8 +20,7 @@ from ..core.angles import FloatArray
 from ..core.carriers import carriers_text, rows_by_carrier
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
-from ..gaussians.chunks import CHUNK_SIZE
-from ..gaussians.parameters import Gaussians
+from ..gaussians.parameters import CHUNK_SIZE, Gaussians
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form

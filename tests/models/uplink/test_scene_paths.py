@@ -13,7 +13,7 @@ import wrf_mi
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.models.uplink.csi_bands import Bands
-from wrf_mi.models.uplink.scene_paths import distinct
+from wrf_mi.models.uplink.r2f2 import distinct
 from wrf_mi.models.uplink.uplink_paths import Start, find_paths
 from wrf_mi.models.uplink.uplink_waves import waves_of
 from wrf_mi.synthetic.furnished_room import trace_channels

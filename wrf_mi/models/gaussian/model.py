@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...core import Antenna, InputError, Prediction, Split, receiver_arrays, stored_receivers
-from ...graph.graph import Graph
+from ...core import Antenna, InputError, Prediction, Receiver, Record, Split, receiver_arrays, stored_receivers
+from ...graph.graph import LEVEL, Graph
 from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
@@ -33,7 +34,57 @@ from ...training.state import FitState
 from ...training.targets import form_of, plan_rows, stage_names, targets_of
 from ...training.trainer import HeldOutReports, Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
-from .new_receivers import Params, of_all_receivers, trained_part, without_rows
+
+Params = dict[str, NDArray[np.float32]]
+OF_RECEIVER = "receiver."
+"""Prefix of the names of a receiver's parameters."""
+MEANS = ("gain", "pattern")
+"""Parameters of a receiver whose mean is taken; a pose is the stated one."""
+
+
+def without_rows(split: Split) -> tuple[int, ...]:
+    """Receivers that a split holds out and leaves no row."""
+    return tuple(number for number in split.held_receivers if number not in split.left[:, 0])
+
+
+def trained_part(record: Record, split: Split) -> tuple[Record, Split]:
+    """A record and its split with the receivers alone that have training rows."""
+    new = without_rows(split)
+    if not new:
+        return record, split
+    kept = np.setdiff1d(np.arange(len(record.receivers)), new)
+    return record.at_receivers(kept), split.at_receivers(kept)
+
+
+def of_all_receivers(
+    params: Params, reach: Reach | None, receivers: tuple[Receiver, ...], new: tuple[int, ...]
+) -> tuple[Params, Reach | None]:
+    """Parameters and reach of a fit without some receivers, for all.
+
+    A new receiver has the mean level, gain (logarithm of an amplitude) and pattern of the others and its stated pose;
+    the Gaussians reach as far from the transmitters that any receiver observed.
+    """
+    if not new:
+        return params, reach
+    trained = [number for number in range(len(receivers)) if number not in new]
+    whole = dict(params)
+    for number in new:
+        for kind in MEANS:
+            names = [f"{OF_RECEIVER}{receivers[other].name}.{kind}" for other in trained]
+            found = [params[name] for name in names if name in params]
+            if found:
+                whole[f"{OF_RECEIVER}{receivers[number].name}.{kind}"] = np.mean(found, axis=0, dtype=np.float32)
+    if LEVEL in params:
+        level = np.full((1, len(receivers)), params[LEVEL].mean(), np.float32)
+        level[:, trained] = params[LEVEL]
+        whole[LEVEL] = level
+    if reach is None:
+        return whole, None
+    known = [np.concatenate(reach.known_m)] * len(receivers)
+    for number, positions_m in zip(trained, reach.known_m, strict=True):
+        known[number] = positions_m
+    return whole, replace(reach, known_m=tuple(known))
+
 
 logger = logging.getLogger(__name__)
 
@@ -47,15 +98,9 @@ REACH = "reach_m"
 class FittedField(Fitted):
     """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
 
-    Args:
-        arrays: arrays of a run file.
-        config: settings of the training.
-        problem: data and scene.
-        store: folder in which operators are kept (`wrf_mi.training.static_operator`).
+    Operators are kept in the folder ``store`` (`wrf_mi.training.static_operator`).
 
     Attributes:
-        params: parameters by name.
-        form: form of the observations.
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
         held_out: reports of training rows on which its stages were chosen; None after loading, or where none were.
     """

@@ -79,13 +79,7 @@ class DcganSettings(NetworkSettings):
 
 @dataclass(frozen=True)
 class Grid:
-    """Sizes of an image batch.
-
-    Attributes:
-        batch: number of images.
-        height: rows of an image.
-        width: columns of an image.
-    """
+    """Number, height and width of the images of a batch."""
 
     batch: int
     height: int
@@ -151,12 +145,10 @@ class _Patches(dr.CustomOp):
 
 
 def patches(x: Any, grid: Grid, side: int) -> Any:
-    """Neighbours of every pixel, [side * side * channels, columns]: taps row by row, the channels of each.
+    """Neighbours of every pixel of images [channels, columns], [side * side * channels, columns].
 
-    Args:
-        x: images [channels, columns].
-        grid: sizes of the images.
-        side: 3: the pixel and its eight neighbours; 2: the pixel, its neighbours above and left.
+    Taps row by row, the channels of each. Side 3: the pixel and its eight neighbours; 2: the pixel and its neighbours
+    above and left.
     """
     channels = x.shape[0]
     flat = dr.custom(_Patches, x.array, channels, grid, side)

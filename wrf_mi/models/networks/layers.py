@@ -112,13 +112,7 @@ class Linear(Module):
 
 
 class Mlp(Module):
-    """Hidden layers with an activation after each, and an output layer without.
-
-    Args:
-        layers: hidden layers; the first may have named inputs.
-        out: output layer; None: the last hidden layer is the output.
-        activation: activation of the hidden layers.
-    """
+    """Hidden layers with an activation after each, and an output layer without; None: the last hidden layer is it."""
 
     def __init__(self, layers: list[Linear], out: Linear | None, activation: Callable[[Any], Any] = relu) -> None:
         self.layers, self.out, self.activation = layers, out, activation

@@ -17,7 +17,9 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,27 +27,272 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
-from ...core import Record, Split
-from ...core.types import IntArray
-from ...tasks.conditions import channel_scales, conditions_of, outputs_of, placed_receivers, truth_of
+from ...backend.recorded import Recorded
+from ...core import InputError, Prediction, Record, Split
+from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
+from ...core.settings import Count
+from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
+from ...tasks import Task, task_of
+from ...tasks.conditions import (
+    channel_scales,
+    channels_from,
+    conditions_of,
+    known_uplink,
+    normalised_uplink,
+    outputs_of,
+    placed_receivers,
+    truth_of,
+)
+from ...training.loop_config import AdamConfig
 from ...training.session import FitSession
 from ..model import (
     Arrays,
+    Fitted,
+    Inputs,
     Model,
     Problem,
+    field_arrays,
     from_field_arrays,
     inputs_of,
+    keyed,
     known_positions,
     received_rows,
+    settings_array,
     stored_settings,
     under,
 )
-from .layers import Coordinates, columns
-from .nerf2_field import Field, Nerf2Settings, step_loss
-from .nerf2_march import Nerf2Network
-from .training import Network, opaque_rows, train_network
+from .layers import Coordinates, columns, feature_count
+from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
+from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
+
+DB_UNIT = 10.0
+"""Unit of the loss of signal strengths, dB."""
+POINTS_PER_CHUNK = 1 << 15
+"""Points whose attenuation is evaluated together in predictions."""
+PAIRS_PER_CHUNK = 1 << 18
+"""Pairs of a point and a condition that are evaluated together in predictions: bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Nerf2Settings(NetworkSettings):
+    """Settings of NeRF2 and of the training loop.
+
+    Attributes:
+        batch: spectra of a step, at most.
+        networks: sizes of the networks.
+        rays: pixels of a spectrum in a step.
+        sphere_rays: rays over the full sphere, for signal strengths and channels.
+        sphere_batch: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of
+            transmitters.
+        samples: points along a ray.
+        near_m: distance from the receiver at which rays start, metres.
+        far_m: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions
+            are not known.
+        tx_octaves: octaves of the encoding of transmitter positions.
+        shared: whether all receivers share a pair of networks.
+    """
+
+    steps: int = 5000
+    batch: int = 16
+    validate_every: int = 500
+    optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
+    networks: Networks = dataclasses.field(default_factory=Networks)
+    rays: Count = 256
+    sphere_rays: Count = 64
+    sphere_batch: Count = 128
+    samples: Count = 4
+    near_m: float = 0.0
+    far_m: float = 0.0
+    tx_octaves: int = 4
+    shared: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.far_m and self.far_m <= self.near_m:
+            raise InputError(f"setting far_m: {self.far_m} is not beyond near_m, {self.near_m}; choose more, or 0")
+
+
+def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> dict[str, Any]:
+    """Rays of a receiver: its index, the rays' indices, and how many rays a receiver has."""
+    direction, origin = columns(data["direction"], picked + receiver * count), columns(data["origin"], receiver)
+    return {**data, "direction": direction, "origin": origin}
+
+
+def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
+    """Report of the instrument, from the rays' flat parts [outputs * batch * rays]; a tensor.
+
+    Greys [batch, rays]; powers in dBm [batch, 1]; channels' real parts, then imaginary ones, [batch, 2 outputs].
+    """
+    outputs, batch, rays = shape
+    re, im = parts
+    tensor = type(offset)
+    if task.image:
+        return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
+    # Rays have equal solid angles; the root makes the size of incoherent sums independent of the number of rays.
+    re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
+    if task.in_decibel:
+        decibels = float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
+        return tensor(dr.gather(type(re), offset.array, rx) + decibels, (batch, 1))
+    both = tensor(dr.concat([re, im]), (2 * outputs, batch))
+    return dr.moveaxis(both, 0, 1)
+
+
+class Field(Fitted):
+    """A fitted field, evaluated in two steps that are recorded once.
+
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
+
+    Rays end at ``far_m`` metres; ``scales`` are the units of the receivers' channels, [n_rx].
+
+    Attributes:
+        groups: indices of the receivers that share networks.
+        data: constants of every evaluation on the device: rays of all receivers, and `constant_parts`.
+        network: networks whose weights are to be replaced.
+        networks: fitted networks of each group.
+
+    Raises:
+        InputError: a receiver without a pose that is needed.
+    """
+
+    def __init__(
+        self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
+    ) -> None:
+        self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
+        self.outputs, self.task, self._shape = outputs_of(record), task_of(record), record.observation.shape[2:]
+        self.networks: list[Nerf2Network] = []
+        self._seen: tuple[int, list[Seen]] | None = None
+        receivers = placed_receivers(record, self.outputs.by_uplink)
+        everyone = tuple(range(len(receivers)))
+        self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
+        if self.task.image:
+            rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
+        else:
+            rays = fibonacci_sphere(settings.sphere_rays)
+        self.n_rays = len(rays)
+        self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
+        origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
+        extent_m, frequencies_hz = float(np.abs(origins).max()) + far_m, self.outputs.frequencies_hz
+        parts = {
+            **constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz),
+            "origin": origins.T,
+            "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
+        }
+        self.data = {name: to_tensor(values) for name, values in parts.items()}
+        dr.make_opaque(self.data)
+        self.network = self.initial(np.random.default_rng(0))
+        network, s = self.network, settings
+
+        @Recorded
+        def looked(params: dict[str, Any], rays: dict[str, Any]) -> Any:
+            with dr.suspend_grad():
+                return look(network.with_state(params), rays)
+
+        @Recorded
+        def marched(params: dict[str, Any], seen: Seen, condition: Any, receiver: Any) -> Any:
+            with dr.suspend_grad():
+                batch, rays = condition.shape[1], seen.first.shape[1] // s.samples
+                parts = march(network.with_state(params), seen, condition, s.samples)
+                return report(params["offset"], parts, self.task, (self.outputs.count, batch, rays), receiver)
+
+        self._looked, self._marched = looked, marched
+
+    def initial(self, rng: np.random.Generator) -> Nerf2Network:
+        """Networks with random weights."""
+        receivers = sum(len(members) for members in self.groups)
+        return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
+
+        Raises:
+            InputError: fitted to uplink channels, and there are none.
+        """
+        network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
+        if self._seen is None or self._seen[0] != receiver:
+            # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
+            self._seen = receiver, self.look(network, receiver)
+        condition, divisor = self.condition_of(inputs, receiver)
+        values, shape = self.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
+        return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Settings, frame and weights."""
+        arrays = {
+            "settings": settings_array(self.settings),
+            "far_m": np.asarray(self.far_m),
+            "scales": self.scales,
+            **field_arrays(self.coordinates, "frame/"),
+        }
+        for g, network in enumerate(self.networks):
+            arrays |= keyed(f"group{g}/", network.arrays())
+        return arrays
+
+    def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
+        """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
+        index = dr.opaque(mi.UInt32, receiver)
+        everything = np.arange(self.n_rays) if rays is None else rays
+        most = max(1, POINTS_PER_CHUNK // self.settings.samples)
+        chunks = np.array_split(everything, -(-len(everything) // most) if self.task.image else 1)
+        parts = [rays_of(self.data, index, opaque_rows(chunk), self.n_rays) for chunk in chunks]
+        # Shapes of results are recorded for the shapes of tensors, and not of arrays.
+        dr.eval(parts)
+        return [self._looked(network.state(), part) for part in parts]
+
+    def march(self, network: Nerf2Network, seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
+        """Reports of the instrument for conditions [features, m]: [m, values]."""
+        m, index = condition.shape[1], dr.opaque(mi.UInt32, receiver)
+        blocks = []
+        at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in seen))
+        for start in range(0, m, at_once):
+            chosen = columns(condition, opaque_rows(np.arange(start, min(m, start + at_once))))
+            dr.eval(chosen)
+            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in seen]
+            blocks.append(np.concatenate(reports, axis=1))
+        return np.concatenate(blocks)
+
+    def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
+        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
+
+        Raises:
+            InputError: no uplink, where one is needed.
+        """
+        if self.outputs.by_uplink:
+            features, divisor = normalised_uplink(known_uplink(inputs.uplink))
+            return to_tensor(features.T), divisor
+        s = self.settings
+        where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
+        return where, float(self.scales[receiver])
+
+
+def step_loss(network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], field: Field) -> Any:
+    """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
+
+    Args:
+        network: both networks.
+        data: `Field.data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
+        given: ``rows``, ``rays`` and ``receiver``, indices.
+        field: field to be trained.
+    """
+    tensor, rays = type(data["direction"]), dr.width(given["rays"])
+    seen = look(network, rays_of(data, given["receiver"], given["rays"], field.n_rays))
+    condition = columns(data["condition"], given["rows"])
+    batch = condition.shape[1]
+    parts = march(network, seen, condition, field.settings.samples)
+    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), given["receiver"])
+    values = data["truth"].shape[1]
+    reported = predicted.shape[1]
+    slot = dr.arange(type(given["rows"]), batch * reported)
+    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
+    column = dr.gather(type(slot), given["rays"], slot % reported) if field.task.image else slot % reported
+    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
+    error = predicted - truth
+    if field.task.in_decibel:
+        error = error * (1 / DB_UNIT)
+    return dr.mean(error * error, axis=None).array
+
 
 SCORED_RAYS = 512
 """Pixels of each validation spectrum by which steps are chosen."""

@@ -62,12 +62,7 @@ class Networks:
 class Nerf2Network(Module):
     """Attenuation network, radiance network, and offset of each receiver's power in dB.
 
-    Args:
-        s: sizes.
-        condition: features of a transmitter.
-        outputs: complex numbers that a ray brings.
-        receivers: number of receivers.
-        rng: source of the weights.
+    A transmitter has ``condition`` features, and a ray brings ``outputs`` complex numbers.
     """
 
     def __init__(self, s: Networks, condition: int, outputs: int, receivers: int, rng: np.random.Generator) -> None:

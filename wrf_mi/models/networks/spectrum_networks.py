@@ -100,15 +100,7 @@ class SpectrumNetwork:
 
 @dataclass(frozen=True)
 class FittedNetworks(Fitted):
-    """Fitted networks.
-
-    Attributes:
-        kind: kind of network.
-        settings: settings of the networks.
-        coordinates: frame of the positions.
-        generators: generator of each receiver.
-        shape: height and width of a spectrum.
-    """
+    """Fitted networks: a generator for each receiver, of spectra of ``shape`` (height, width)."""
 
     kind: SpectrumNetwork
     settings: Any

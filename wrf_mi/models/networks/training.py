@@ -49,11 +49,6 @@ class NetworkSettings(LoopConfig):
     optimiser: AdamConfig = field(default_factory=network_adam)
 
     def __post_init__(self) -> None:
-        """Refuse values that no fit can use.
-
-        Raises:
-            InputError: naming the setting.
-        """
         super().__post_init__()
         if not self.optimiser.network:
             raise InputError("setting optimiser.network: 0.0 is out of range, choose more than 0")
@@ -94,13 +89,7 @@ class Network:
 
 
 class NetworkTrainer(TrainingLoop):
-    """Training loop of a network.
-
-    Args:
-        network: network with its initial weights.
-        config: settings of the loop.
-        seed: seed of the order of samples and of all other draws.
-        state: state of an interrupted training to continue from.
+    """Training loop of a network, from its initial weights or from the ``state`` of an interrupted training.
 
     Raises:
         InputError: no sample that trains.
@@ -161,12 +150,6 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     """Train a network, from its checkpoint in the session's folder if it exists.
 
     Networks of one fit differ in their names and share that file, in which finished ones stay.
-
-    Args:
-        network: network with its initial weights.
-        config: settings of the loop.
-        seed: seed of all draws.
-        session: folder, progress and stop.
 
     Returns:
         The module with the running mean of its weights on the device, and the best score on validation rows, the higher

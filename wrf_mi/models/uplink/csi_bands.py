@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import field_arrays, from_field_arrays, received_rows
+from ..model import received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -48,15 +47,6 @@ class Bands:
         """Smallest distance of two uplink subcarriers; infinite with a single subcarrier."""
         return float(np.diff(np.sort(self.uplink_hz)).min(initial=np.inf))
 
-    def arrays(self, wavefront: str) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file, with the name of a wave model."""
-        return {"wavefront": np.array(wavefront), **field_arrays(self)}
-
-    @classmethod
-    def load(cls, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, Bands]:
-        """Wave model and bands that `arrays` described."""
-        return str(arrays["wavefront"]), from_field_arrays(cls, arrays)
-
 
 def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     """The bands of a record.
@@ -79,21 +69,15 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
         downlink_hz = spacing_hz * (np.arange(down) + (gap - 1) / 2 + 0.5)
     array_m = record.receivers[0].array_m
     elements = None if array_m is None or not known else np.asarray(array_m, float)
-    if elements is not None and elements.shape != (antennas, 3):
-        raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
-    return Bands(uplink_hz, downlink_hz, antennas, known, None if elements is None else principal(elements))
-
-
-def principal(elements_m: FloatArray) -> FloatArray:
-    """Positions of an array's elements about their mean, along its principal axes, [antennas, q], metres.
-
-    Axes along which it is flat (`FLAT`) are left out: a plane array has two, a line one, a single antenna none.
-    """
-    return np.asarray((elements_m - elements_m.mean(axis=0)) @ principal_axes(elements_m).T)
+    if elements is not None:
+        if elements.shape != (antennas, 3):
+            raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
+        elements = (elements - elements.mean(axis=0)) @ principal_axes(elements).T
+    return Bands(uplink_hz, downlink_hz, antennas, known, elements)
 
 
 def principal_axes(elements_m: FloatArray) -> FloatArray:
-    """Unit vectors [q, 3] of the principal axes along which an array is not flat, see `principal`."""
+    """Unit vectors [q, 3] of the principal axes along which an array is not flat (`FLAT`): a plane array has two."""
     _, extent, axes = np.linalg.svd(elements_m - elements_m.mean(axis=0), full_matrices=False)
     return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
 

@@ -32,7 +32,19 @@ from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...training.session import FitSession
-from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, settings_array, stored_settings, under
+from ..model import (
+    Arrays,
+    Fitted,
+    Inputs,
+    Model,
+    Problem,
+    field_arrays,
+    from_field_arrays,
+    keyed,
+    settings_array,
+    stored_settings,
+    under,
+)
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
@@ -139,14 +151,7 @@ def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
 
 @dataclass(frozen=True)
 class FittedFire(Fitted):
-    """A fitted network.
-
-    Attributes:
-        sample: ``antenna`` or ``row``.
-        network: encoder and decoder.
-        bands: bands of the training data.
-        settings: settings of the fit.
-    """
+    """A fitted network for samples of an ``antenna`` or a ``row``."""
 
     sample: str
     network: Fire
@@ -163,7 +168,7 @@ class FittedFire(Fitted):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Kind of sample, settings, bands and weights."""
         arrays = {"sample": np.asarray(self.sample), "settings": settings_array(self.settings)}
-        return arrays | self.bands.arrays("") | keyed("network/", self.network.arrays())
+        return arrays | field_arrays(self.bands) | keyed("network/", self.network.arrays())
 
 
 def predict_samples(
@@ -235,7 +240,7 @@ def _fit(
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
     """The network that `FittedFire.arrays` described."""
-    settings, (_, bands) = stored_settings(FireSettings, arrays, "fire"), Bands.load(arrays)
+    settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
     weights = under("network/", arrays)
     sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
     fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)

@@ -51,13 +51,7 @@ class LinearSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class LinearMap(Fitted):
-    """A fitted map.
-
-    Attributes:
-        matrix: from uplink to downlink coefficients, [f, g].
-        antennas: antennas of a row.
-        penalty: penalty of the fit.
-    """
+    """A fitted map from uplink to downlink coefficients, ``matrix`` [f, g], and the penalty of its fit."""
 
     matrix: NDArray[np.complex128]
     antennas: int

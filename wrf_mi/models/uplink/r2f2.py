@@ -13,8 +13,7 @@ by non-linear least squares, are evaluated at the downlink's frequencies. Differ
   have a subcarrier between them, the carrier of 802.11.
 - The Bayesian information criterion chooses the number of paths up to ``max_paths``; the paper sets a threshold of the
   residual.
-- With a scene the paths of its mesh start the search, and their lengths and directions have a prior
-  (`wrf_mi.models.uplink.scene_paths`).
+- With a scene the paths of its mesh start the search, and their lengths and directions have a prior (`ScenePaths`).
 - Gains have priors, too, each of a power of its own (`wrf_mi.models.uplink.uplink_paths.expected_gains`).
 - The solver is Levenberg and Marquardt's with exact derivatives (`wrf_mi.models.uplink.uplink_paths`).
 
@@ -25,6 +24,7 @@ bands.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -32,15 +32,107 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Record, Split
+from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
+from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
 from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, under
-from .csi_bands import Bands, bands_of, known_rows, relative_error
-from .scene_paths import ScenePaths
-from .uplink_paths import Paths, find_paths
-from .uplink_waves import Complex, waves_of
+from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays, keyed, under
+from .csi_bands import Bands, bands_of, known_rows, principal_axes, relative_error
+from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
+from .uplink_waves import Complex, Waves, waves_of
+
+CHUNK_SIZE = 256
+"""Positions that are traced together."""
+LENGTH_SD_M, COSINE_SD = 0.3, 0.03
+"""Standard deviations of a path's length and its direction's cosines, by a mesh that is some centimetres off."""
+ALIKE_M, ALIKE_COSINE = 0.02, 0.01
+"""Paths that differ by less count as one."""
+FAINT = 10 ** (-50 / 20)
+"""Least amplitude of a path, as a share of the root mean square of all."""
+MOST = 70
+"""Most traced paths of a row, the strongest."""
+NEEDED = 1e-4
+"""Least power of a path in the uplink, as a share of the strongest path's."""
+
+
+class ScenePaths:
+    """Paths of a scene from transmitters to a receiver, as the start of the search in an uplink.
+
+    Over a band of some megahertz an uplink tells directions well, but lengths only to metres, and the phase between the
+    bands turns with the length. A mesh that is centimetres off knows lengths far better. Gains are those of the uplink
+    alone: materials are not needed.
+    """
+
+    def __init__(self, scene: Any, receiver: Receiver, tx_antenna: Antenna, options: TraceOptions) -> None:
+        from ...tracing.solve import Prepared
+        from ...tracing.traced_field import TracedOptions
+
+        assert receiver.array_m is not None
+        self._scene, self._receiver, self._prepared = scene, receiver, Prepared(scene)
+        self._options = TracedOptions(options, tx_antenna=tx_antenna)
+        self._centre, self._axes = receiver.array_m.mean(axis=0), principal_axes(receiver.array_m)
+
+    def __call__(self, waves: Waves, h: Complex, tx_pos_m: FloatArray, heading_rad: FloatArray | None) -> Start:
+        """Paths that explain uplinks [n, antennas, f] of transmitters [n, 3], metres, with yaw [n] in rad or None.
+
+        Raises:
+            InputError: positions that are not known, or inside a solid.
+        """
+        if not np.isfinite(tx_pos_m).all():
+            raise InputError("r2f2 with a scene: traces from positions; give finite x, y, z in metres for every row")
+        rows = list(self._rows(tx_pos_m, heading_rad))
+        theta = np.zeros((len(rows), max(1, *map(len, rows)), 1 + len(self._axes)))
+        theta[..., 0] = 1.0  # of absent paths: any length that is not zero
+        present = np.zeros(theta.shape[:2], bool)
+        for number, row in enumerate(rows):
+            theta[number, : len(row)], present[number, : len(row)] = row, True
+
+        def needed(part: slice) -> Any:
+            solved = waves.solve(theta[part], present[part], h[part])
+            return expected_gains(waves, h[part], present[part], solved)[1]
+
+        power = np.concatenate(in_parts(needed, len(h)))
+        present &= power > NEEDED * power.max(axis=1, keepdims=True)
+        order = np.argsort(~present, axis=1, kind="stable")[:, : max(1, int(present.sum(axis=1).max()))]
+        theta = np.take_along_axis(theta, order[..., None], axis=1)
+        precision = np.broadcast_to(np.r_[LENGTH_SD_M, np.full(len(self._axes), COSINE_SD)] ** -2.0, theta.shape)
+        return Start(theta, np.take_along_axis(present, order, axis=1), precision)
+
+    def _rows(self, tx_pos_m: FloatArray, heading_rad: FloatArray | None) -> Iterator[FloatArray]:
+        """Lengths and direction cosines [k, p] of each transmitter's paths, seen from the middle of the array."""
+        from ...tracing.traced_field import TracedField
+
+        for start in range(0, len(tx_pos_m), CHUNK_SIZE):
+            part = slice(start, start + CHUNK_SIZE)
+            turned = None if heading_rad is None else heading_rad[part]
+            given = tx_pos_m[part], self._receiver, self._options, turned
+            self._prepared.check(tx_pos_m[part], (self._receiver,))
+            traced = TracedField(self._scene, *given, prepared=self._prepared)
+            found = traced({})
+            shape = found.batch, found.each
+            amplitude = np.hypot(*(part.numpy() for part in found.gain)).reshape(shape)
+            arrival = np.stack([u.numpy() for u in found.arrival], axis=-1).reshape(*shape, 3)
+            source = arrival * found.length_m.numpy().reshape(*shape, 1) - self._centre
+            length = np.linalg.norm(source, axis=-1, keepdims=True)
+            every = np.concatenate([length, source / length @ self._axes.T], axis=-1)
+            for strength, row in zip(amplitude * traced.exists.reshape(shape), every, strict=True):
+                yield distinct(row, strength)
+
+
+def distinct(theta: FloatArray, strength: FloatArray) -> FloatArray:
+    """The strongest different paths [k, p] among some with strengths [m], 0 for place holders."""
+    order = np.argsort(-strength, kind="stable")
+    least = FAINT * np.sqrt(np.square(strength).sum())
+    kept: list[int] = []
+    for place in order[strength[order] > least]:
+        apart = np.abs(theta[kept] - theta[place])
+        if not ((apart[:, 0] < ALIKE_M) & (apart[:, 1:] < ALIKE_COSINE).all(axis=1)).any():
+            kept.append(int(place))
+        if len(kept) == MOST:
+            break
+    return theta[kept]
+
 
 Kind = Literal["auto", "spherical", "plane", "free"]
 BOTH_GAPS = (1, 2)
@@ -144,7 +236,7 @@ class R2F2(Fitted):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Wave model, bands and settings."""
         settings = {name: np.array(value) for name, value in asdict(self.settings).items()}
-        return self.bands.arrays(self.kind) | keyed("settings/", settings)
+        return {"wavefront": np.array(self.kind)} | field_arrays(self.bands) | keyed("settings/", settings)
 
 
 def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
@@ -166,7 +258,7 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
     """The model that `R2F2.arrays` described."""
     settings = {name: value.item() for name, value in under("settings/", arrays).items()}
     found = PathSettings(**settings)
-    return R2F2(*Bands.load(arrays), found, _scene_paths(problem, found))
+    return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
 
 
 SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"

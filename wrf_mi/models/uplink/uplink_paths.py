@@ -88,17 +88,10 @@ class Start:
 
 
 def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int, start: Start | None = None) -> Paths:
-    """Paths of uplinks [n, antennas, f].
+    """Paths of uplinks [n, antennas, f], ``max_paths`` a row at most beside those of ``start``.
 
-    All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last.
-
-    Args:
-        waves: wave model.
-        h: uplinks.
-        max_paths: most paths of a row that are searched for.
-        between: steps of refinement after an addition.
-        final: steps of refinement in the end, and of known paths in the beginning.
-        start: paths that are known before; None: none.
+    All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last; those of the
+    start by as many before.
     """
     known = start or Start.none(len(h), 1 + waves.cosines.shape[1])
     return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final, known[rows]), len(h)))

@@ -11,8 +11,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend.device import on_device
-from .tiles import LANE_ROWS, TILE_COLUMNS, TILE_ROWS, tiling
+from wrf_mi.backend.device import on_device
+from wrf_mi.gaussians.tiles import LANE_ROWS, TILE_COLUMNS, TILE_ROWS, tiling
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Complex blending along rays: the traced evaluation, with its derivatives.
 
 The sum is that of `wrf_mi.gaussians.recurrence`, with the response of the 3D Gaussian along the ray in place of the
-projected footprint (`wrf_mi.gaussians.ray_response`) and the complex transmission W of walls:
+projected footprint (`wrf_mi_plugins.ray_response`) and the complex transmission W of walls:
 
     R = sum_i w_i S_i W(t_i) T_i,   T_{i+1} = T_i b_i
 
@@ -17,10 +17,8 @@ from typing import Any
 
 import drjit as dr
 
-from .blend import RECORD, pack, read, unpack
-from .bundles import Bundles, RayLists
-from .ray_response import RAY_FIELDS, RayFootprints, peak_distance, response, response_slope
-from .recurrence import (
+from wrf_mi.gaussians.blend import RECORD, pack, read, unpack
+from wrf_mi.gaussians.recurrence import (
     ForwardState,
     ReverseState,
     accumulate,
@@ -30,6 +28,9 @@ from .recurrence import (
     reverse_step,
     times,
 )
+
+from .bundles import Bundles, RayLists
+from .ray_response import RAY_FIELDS, RayFootprints, peak_distance, response, response_slope
 
 
 @dataclass
@@ -212,7 +213,7 @@ def blend_rays(
     """Received complex signal along each ray.
 
     Args:
-        footprints: responses of n Gaussians, see `wrf_mi.gaussians.ray_response.ray_footprints`.
+        footprints: responses of n Gaussians, see `wrf_mi_plugins.ray_response.ray_footprints`.
         signal: complex signal (re, im), two arrays [n].
         lists: Gaussians of each bundle, near to far: at least those that its rays meet.
         bundles: the rays.

@@ -24,9 +24,9 @@ from typing import Any
 
 import drjit as dr
 
-from .footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
-from .footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
-from .parameters import Gaussians
+from wrf_mi.gaussians.footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
+from wrf_mi.gaussians.footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.parameters import Gaussians
 
 RAY_FIELDS = 12
 """Numbers of one Gaussian's response along any ray: n, a, b (3 each), k1, k2 and 1 / L^2."""
@@ -55,6 +55,11 @@ class RayFootprints:
     def columns(self) -> list[Any]:
         """The ``RAY_FIELDS`` numbers of each Gaussian."""
         return [*self.direction, *self.whitened[0], *self.whitened[1], *self.lean, self.depth_extent]
+
+
+def to_world(pose: Pose, v: list[Any]) -> list[Any]:
+    """A vector of the receiver's frame in the world frame (R v)."""
+    return [sum((row[k] * v[k] for k in (1, 2)), row[0] * v[0]) for row in pose.to_world]
 
 
 @dataclass
