@@ -27,7 +27,7 @@ from ..tracing.options import TraceOptions
 from ..tracing.scenes import open_scene
 from ..tracing.tracer import RayTracer
 from .floor_channels import with_noise
-from .furnished_room import free_positions
+from .searches import free_positions
 
 CARRIER_HZ = 2.44e9
 SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
