@@ -14,9 +14,11 @@ from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
 from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
+from ..scene.plan import plan_surfaces
 from ..scene.plan_sources import Mask, read_layout
-from ..scene.points import lidar_package
+from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
 from ..scene.surfaces import Surface, bodies
+from ..tracing.devices import winding_number
 from .placements import placements
 from .repeats import named_rows
 from .units import Found
@@ -69,21 +71,12 @@ def building_file(source: str | Path) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
-def need_packages() -> None:
-    """Refuse to go on without the packages of the extra ``lidar`` that plans and meshes need (`InputError`)."""
-    for name in ("shapely", "mapbox_earcut"):
-        lidar_package(name)
-
-
 def read_building(path: Path) -> Building:
     """Read a plan, a mesh or a scene folder.
 
     Raises:
-        InputError: it is not readable, or a package of the extra ``lidar`` is not installed.
+        InputError: it is not readable.
     """
-    need_packages()
-    from ..scene.plan import plan_surfaces
-
     if path.name == LAYOUT:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
@@ -101,8 +94,6 @@ def read_building(path: Path) -> Building:
 
 def plan_against_walls(record: Record, building: Building) -> Found:
     """Transmitters outside the building or across its walls, and the plan in which they are not."""
-    from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-
     if not record.has_positions or not any(surface.kind == "wall" for surface in building.surfaces):
         return
     count = len(distinct(record.tx_pos_m))
@@ -124,8 +115,6 @@ def plan_against_walls(record: Record, building: Building) -> Found:
 
 def inside_solids(record: Record, building: Building) -> Found:
     """Receivers and transmitters within walls and solid bodies; a few transmitters are errors of their positions."""
-    from ..scene.positions import TOLERATED_SHARE
-
     groups = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
     for what, places in groups.items():
         known = np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -178,18 +167,11 @@ def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
 
 
 def in_solid(places_m: FloatArray, body_m: FloatArray) -> Mask:
-    """Which places [n, 3] lie at least `DEEP_M` inside a closed body of triangles [f, 3, 3], by its solid angle.
-
-    Source: van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30, 1983.
-    """
+    """Which places [n, 3] lie at least `DEEP_M` inside a closed body of triangles [f, 3, 3]."""
     inside = np.zeros(len(places_m), bool)
     low, high = body_m.min(axis=(0, 1)) + DEEP_M, body_m.max(axis=(0, 1)) - DEEP_M
-    for k in np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1)):
-        a, b, c = np.moveaxis(body_m - places_m[k], 1, 0)
-        la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
-        triple = (a * np.cross(b, c)).sum(axis=-1)
-        rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-        if abs(2 * np.arctan2(triple, rest).sum()) > 2 * np.pi:  # 4 pi inside, 0 outside
-            nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
-            inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
+    near = np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1))
+    for k in near[np.abs(winding_number(body_m, places_m[near])) > 0.5]:
+        nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
+        inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
     return inside
