@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -151,18 +152,16 @@ def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
     length = np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=1)
     walls, length = walls_m[length > 0], length[length > 0]
     along = (walls[:, 1] - walls[:, 0]) / length[:, None]
-    for k, place in enumerate(places_m):
-        to = place - walls[:, 0]
-        foot, side = (to * along).sum(axis=1), to[:, 1] * along[:, 0] - to[:, 0] * along[:, 1]
-        near = np.flatnonzero((foot >= 0) & (foot <= length) & (np.abs(side) < THICKEST_WALL_M))
-        for one in near:
-            cosine = along[near] @ along[one]
-            # Sides are measured against each stretch's own direction.
-            other_side = side[near] * np.sign(cosine)
-            facing = (np.abs(cosine) > PARALLEL) & (other_side * side[one] < 0)
-            width = np.abs(side[near]) + abs(side[one])
-            deep = np.minimum(np.abs(side[near]), abs(side[one])) >= DEEP_M
-            inside[k] |= bool((facing & deep & (width <= THICKEST_WALL_M)).any())
+    # Way along each stretch and distance to its left, [n, m].
+    to = places_m[:, None] - walls[:, 0]
+    foot, side = (to * along).sum(axis=-1), to[..., 1] * along[:, 0] - to[..., 0] * along[:, 1]
+    near = (foot >= 0) & (foot <= length) & (np.abs(side) >= DEEP_M)
+    for one, other in combinations(range(len(walls)), 2):
+        cosine = along[one] @ along[other]
+        if abs(cosine) > PARALLEL:
+            between = side[:, one] * side[:, other] * cosine < 0  # the left of one is the right of one that runs back
+            thin = np.abs(side[:, one]) + np.abs(side[:, other]) <= THICKEST_WALL_M
+            inside |= near[:, one] & near[:, other] & between & thin
     return inside
 
 

@@ -12,7 +12,7 @@ import shapely
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .classify import kinds
+from .classify import Face, kinds
 from .layers import layers
 from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
@@ -89,7 +89,7 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
             free &= ~over(plane, area, points, BAND * noise)
     if not kept:
         raise InputError("no plane was found; give a denser scan of a room")
-    roles = kinds(kept, areas, float(np.median(cloud.points_m[:, 2])))
+    roles = kinds([Face(*pair) for pair in zip(kept, areas, strict=True)], float(np.median(cloud.points_m[:, 2])))
     reach = [width if kind == "other" else max(width, REACH_M) for width, kind in zip(reach, roles, strict=True)]
     areas = join(kept, areas, reach)
     things = np.ones(len(cloud.points_m), bool)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
+import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -75,23 +76,16 @@ def _depths(left: FloatArray, right: FloatArray) -> tuple[float, float]:
 def _depth(triangles: FloatArray, cut: FloatArray) -> float:
     """The depth of `crossing_depth` by the edges of triangles [n, 3, 3] that other triangles [m, 3, 3] are cut by."""
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
-    corner, u, v = cut[:, 0], cut[:, 1] - cut[:, 0], cut[:, 2] - cut[:, 0]
-    normal = np.cross(u, v)
-    area = np.linalg.norm(normal, axis=1)
-    corner, u, v, normal, area = (each[area > 0] for each in (corner, u, v, normal, area))
-    depth, step = 0.0, max(1, PAIRS_PER_CHUNK // max(len(corner), 1))
+    normal, proper = trimesh.triangles.normals(cut)  # of triangles with an area alone
+    cut = cut[proper]
+    depth, step = 0.0, max(1, PAIRS_PER_CHUNK // max(len(cut), 1))
     for first in range(0, len(starts), step):
         start, end = starts[first : first + step, None], ends[first : first + step, None]
         # Signed distances [edges, triangles] of both ends from the planes.
-        before, after = (((point - corner) * normal).sum(axis=-1) / area for point in (start, end))
+        before, after = (((point - cut[:, 0]) * normal).sum(axis=-1) for point in (start, end))
         edge, triangle = np.nonzero(before * after < 0)
         d = before[edge, triangle], after[edge, triangle]
-        share = d[0] / (d[0] - d[1])
-        met = start[edge, 0] + share[:, None] * (end - start)[edge, 0] - corner[triangle]
-        # Barycentric coordinates: areas of the parts over that of the triangle.
-        n, square = normal[triangle], area[triangle] ** 2
-        along_v = (np.cross(u[triangle], met) * n).sum(axis=-1) / square
-        along_u = (np.cross(met, v[triangle]) * n).sum(axis=-1) / square
-        within = (along_u >= 0) & (along_v >= 0) & (along_u + along_v <= 1)
+        met = start[edge, 0] + (d[0] / (d[0] - d[1]))[:, None] * (end - start)[edge, 0]
+        within = (trimesh.triangles.points_to_barycentric(cut[triangle], met) >= 0).all(axis=1)
         depth = max(depth, float(np.minimum(np.abs(d[0]), np.abs(d[1]))[within].max(initial=0.0)))
     return depth
