@@ -170,7 +170,7 @@ def in_solid(places_m: FloatArray, body_m: FloatArray) -> Mask:
     inside = np.zeros(len(places_m), bool)
     low, high = body_m.min(axis=(0, 1)) + DEEP_M, body_m.max(axis=(0, 1)) - DEEP_M
     near = np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1))
-    for k in near[np.abs(winding_number(body_m, places_m[near])) > 0.5]:
+    for k in near[winding_number(body_m, places_m[near]) > 0.5]:
         nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
         inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
     return inside

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage, optimize, signal
 from scipy.spatial import cKDTree
@@ -207,20 +208,13 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
     """Points [n, 2] along walls [m, 2, 2]: the middles of equal parts no longer than a step."""
-    parts = []
-    for begin, end in np.asarray(walls_m, float):
-        count = max(1, int(np.ceil(np.linalg.norm(end - begin) / step_m)))
-        parts.append(begin + (np.arange(count)[:, None] + 0.5) / count * (end - begin))
-    return np.concatenate(parts)
+    ends = [shapely.get_coordinates(wall) for wall in shapely.segmentize(shapely.linestrings(walls_m), step_m)]
+    return np.concatenate([(xy[:-1] + xy[1:]) / 2 for xy in ends])
 
 
 def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
-    begin, along = walls_m[:, 0], walls_m[:, 1] - walls_m[:, 0]
-    offset = points_m[:, None] - begin
-    part = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
-    away = offset - part[..., None] * along
-    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))
+    return np.asarray(shapely.distance(shapely.points(points_m), shapely.multilinestrings(list(walls_m))))
 
 
 def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
