@@ -18,7 +18,7 @@ from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
 from ..scene.plan import plan_surfaces
 from ..scene.plan_sources import Mask, read_layout
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-from ..scene.surfaces import Surface, bodies
+from ..scene.surfaces import Surface, bodies, box_of
 from ..tracing.devices import winding_number
 from .placements import placements
 from .repeats import named_rows
@@ -99,8 +99,7 @@ def plan_against_walls(record: Record, building: Building) -> Found:
         return
     count = len(distinct(record.tx_pos_m))
     crossings, outside = conflicts(record.tx_pos_m, building.surfaces)
-    vertices = np.concatenate([surface.vertices_m for surface in building.surfaces])[:, :2]
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    middle = box_of(building.surfaces).mean(axis=0)[:2]
     tolerated = TOLERATED + TOLERATED_SHARE * count
     text = f"{crossings} lines between neighbouring transmitters cross walls of {building.source.name}"
     text += f" and {outside} of {count} transmitters lie outside"

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import yaml
 from defusedxml.common import DefusedXmlException
 from numpy.typing import ArrayLike
@@ -28,7 +27,7 @@ from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
-from .surfaces import Surface
+from .surfaces import Surface, box_of
 from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)
@@ -95,7 +94,7 @@ def write_scene(
     given = materials or Materials()
     if unknown := [name for name in given.surfaces if name not in names]:
         raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
-    require_near(np.concatenate([surface.vertices_m for surface in surfaces]), source)
+    require_near(box_of(surfaces), source)
     full = given.complete({surface.name: surface.kind for surface in surfaces})
     matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
@@ -115,8 +114,7 @@ def write_scene(
     with atomic_folder(folder, replace=replace) as part:
         (part / "meshes").mkdir()
         for surface in surfaces:
-            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-            mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
+            surface.mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
         write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.files import write_figure
 from ..core.paths import Paths
-from .surfaces import Surface
+from .surfaces import Surface, box_of, cut_lines
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
@@ -124,8 +124,7 @@ def draw_scene(
     grid = figure.add_gridspec(1, 2, width_ratios=[1.2, 1])
     slant: Any = figure.add_subplot(grid[0], projection="3d", computed_zorder=False)
     plan = figure.add_subplot(grid[1])
-    vertices = np.concatenate([surface.vertices_m for surface in surfaces])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = box_of(surfaces)
     _draw_slant(slant, surfaces, colours, low, high)
     _draw_plan(plan, surfaces, colours, low, high)
     if points_m is not None and len(scan := np.asarray(points_m, float)):
@@ -220,7 +219,7 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
     edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
     found = edges[trimesh.grouping.group_rows(edges, require_count=1)]
     if creases:
-        mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+        mesh = surface.mesh
         found = np.concatenate([found, mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_RAD]])
     return np.asarray(surface.vertices_m[found], float).reshape(-1, 2, 3)
 
@@ -270,13 +269,6 @@ def _draw_slant(
     axes.tick_params(labelsize=7, pad=0)
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.grid(False)
-
-
-def cut_lines(surface: Surface, height_m: float) -> FloatArray:
-    """Horizontal cut of a surface at a height: lines [n, 2, 2] in plan, metres; none where it is not met."""
-    mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-    cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height_m])
-    return np.asarray(cut, float).reshape(-1, 2, 3)[..., :2]
 
 
 def _draw_plan(
