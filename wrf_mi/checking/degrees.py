@@ -37,7 +37,8 @@ def degrees(record: Record) -> Found:
         return
     both = np.concatenate(list(known.values()))
     in_degrees = ["receivers and transmitters"] if len(known) == 2 and _is_in_degrees(both) else []
-    if not in_degrees and (len(known) == 1 or _apart_m(*known.values()) >= APART_M):
+    middles = [np.median(xy, axis=0) for xy in known.values()]
+    if not in_degrees and (len(known) == 1 or np.linalg.norm(middles[0] - middles[1]) >= APART_M):
         in_degrees = [what for what, xy in known.items() if _is_in_degrees(xy)]
     for what in in_degrees:
         xy = known.get(what, both)
@@ -60,11 +61,6 @@ def _is_in_degrees(xy: FloatArray) -> bool:
     thousandths = xy * MILLIMETRES
     fine = np.mean(np.abs(thousandths - np.round(thousandths)) > ROUNDING)
     return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent and fine >= FINE_SHARE)
-
-
-def _apart_m(one: FloatArray, other: FloatArray) -> float:
-    """Distance of two groups of positions, from middle to middle."""
-    return float(np.linalg.norm(np.median(one, axis=0) - np.median(other, axis=0)))
 
 
 def far_from_origin(record: Record) -> str | None:
