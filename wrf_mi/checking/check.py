@@ -12,13 +12,12 @@ from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
 from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
-from .degrees import degrees, far_from_origin
 from .directions import spectrum_axes
 from .distances import distance_law
 from .reception import few_rows, not_heard
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
 from .report import DataReport, Suspicion
-from .units import Found, channel_phase, heading_unit, position_unit, strength_scale
+from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
 logger = logging.getLogger(__name__)
 
