@@ -122,7 +122,7 @@ def make_scene(
             require_near(trimesh.transform_points(points, shift), file)  # before minutes are spent on its planes
         surfaces = surfaces_from_points(points)
     if known_walls is not None:
-        matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file)).matrix
+        matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
     sample, counts = None, {}

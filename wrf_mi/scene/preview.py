@@ -62,20 +62,17 @@ class GaussianCloud:
         scale_m: standard deviations along the Gaussians' axes [n, 3].
         rotation_xyzw: quaternions, Gaussians' axes to world [n, 4].
         strength_db: value that colours them, [n]; for example 20 log10 of the signal's magnitude.
-        label: name of the strength.
     """
 
     position_m: FloatArray
     scale_m: FloatArray
     rotation_xyzw: FloatArray
     strength_db: FloatArray
-    label: str = "signal of a Gaussian (dB)"
 
     def strongest(self, count: int) -> GaussianCloud:
         """The ``count`` strongest, weakest first, so that the strong are drawn last."""
         order = np.argsort(self.strength_db, kind="stable")[-count:]
-        values = {key: np.asarray(value)[order] for key, value in vars(self).items() if key != "label"}
-        return GaussianCloud(**values, label=self.label)
+        return GaussianCloud(**{key: np.asarray(value)[order] for key, value in vars(self).items()})
 
     def silhouettes(self, across: FloatArray) -> FloatArray:
         """Outlines [n, points, 2] at one standard deviation in the plane of two unit vectors [2, 3]."""
@@ -151,7 +148,7 @@ def draw_scene(
 
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
     """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
-    rgba = _coloured(figure, cloud.strength_db, "viridis", cloud.label, 0.4)
+    rgba = _coloured(figure, cloud.strength_db, "viridis", "signal of a Gaussian (dB)", 0.4)
     right = np.cross([0, 0, 1], EYE) / np.linalg.norm(np.cross([0, 0, 1], EYE))
     screen = np.stack([right, np.cross(EYE, right)])
     outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen

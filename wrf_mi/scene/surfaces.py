@@ -49,11 +49,6 @@ class Surface:
     faces: IntArray
 
     @property
-    def area_m2(self) -> float:
-        """Sum of the areas of its faces."""
-        return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
-
-    @property
     def mesh(self) -> trimesh.Trimesh:
         """Its vertices and faces as they are."""
         return trimesh.Trimesh(self.vertices_m, self.faces, process=False)
