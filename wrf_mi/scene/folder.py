@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, inside, one_line, write_atomically
+from ..core.files import atomic_folder, inside, one_line, write_atomically, write_figure
 from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
@@ -83,7 +83,7 @@ def write_scene(
         InputError: the folder exists or cannot be written, there is no surface, one is too far from the origin, or
             ``materials`` names an unknown surface.
     """
-    from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
+    from .preview import draw_scene  # matplotlib takes a second, and reading a scene does without
 
     folder = Path(folder)
     if not surfaces:
@@ -118,7 +118,7 @@ def write_scene(
         write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
-        draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
+        write_figure(part / PREVIEW_FILE, draw_scene(surfaces, points_m=points_m))
     return folder
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
-from ..core.files import write_figure
 from ..core.paths import Paths
 from .surfaces import Surface, box_of, cut_lines
 
@@ -80,11 +78,6 @@ class GaussianCloud:
         half = np.linalg.cholesky(axes @ np.swapaxes(axes, -1, -2) + 1e-12 * np.eye(2))
         turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
         return np.swapaxes(half @ np.stack([np.cos(turn), np.sin(turn)]), -1, -2)
-
-
-def draw_preview(surfaces: Sequence[Surface], path: str | Path, points: ArrayLike | None = None) -> Path:
-    """Write a picture of a scene and a scan [n, 3] or [n, 2] of it as PNG, atomically."""
-    return write_figure(Path(path), draw_scene(surfaces, points_m=points))
 
 
 def draw_scene(

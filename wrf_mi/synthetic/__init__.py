@@ -50,7 +50,7 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     """
     makers: dict[str, Callable[..., Record]] = {
         LABORATORY: laboratory_record,
-        ROOM: lambda progress: traced_room(progress=progress)[0],
+        ROOM: traced_room,
         BANDS: traced_room_bands,
         FLOOR_STRENGTHS: traced_floor_strengths,
         FLOOR_CHANNELS: traced_floor_channels,

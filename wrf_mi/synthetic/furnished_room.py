@@ -21,7 +21,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from ..core import Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..datasets import read_spectrum_folder, user_cache, write_spectrum_folder
+from ..datasets import read_spectrum_folder, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum, minmax_scale
 from ..tracing.scenes import open_scene
 from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, SCANNER_M, SPACING_M
@@ -61,26 +61,20 @@ OPAQUE = "itu_metal"
 diffraction of thin boards, through which most of the wave passes."""
 
 
-def traced_room(
-    folder: str | Path | None = None, room: TracedRoom = DEFAULT, progress: bool = False
-) -> tuple[Record, Path]:
+def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, progress: bool = False) -> Record:
     """The traced room's spectra: read from an earlier call, or traced now (some minutes by default) and stored.
 
-    The official split is the first ``train`` rows and the rest; positions are drawn independently. A simulated LiDAR
-    scan of the furnished room is included as ``lidar/points.npz``.
+    The official split is the first ``train`` rows and the rest; positions are drawn independently. The folder holds the
+    scene of the measured room, `MEASURED`, and a simulated LiDAR scan of the furnished room.
 
     Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room/`` in the user's cache.
+        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room/`` below ``WRF_MI_DATA`` if it
+            exists, else in the user's cache.
         room: parameters.
         progress: show progress bars on standard error.
-
-    Returns:
-        The record and the folder of the measured room's scene, the input of models.
     """
-    folder = user_cache() / NAME if folder is None else Path(folder)
     facts = {"frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
-    record = made_in_room(folder, NAME, facts, room, lambda scene_folder: _trace(scene_folder, room, progress))
-    return record, folder / MEASURED
+    return made_in_room(folder, NAME, facts, room, lambda scene_folder: _trace(scene_folder, room, progress))
 
 
 def made_in_room(
