@@ -107,8 +107,7 @@ def plan_against_walls(record: Record, building: Building) -> Found:
     (crossed, beyond), best = min(others, key=lambda pair: sum(pair[0]))
     allowed = tolerated + LARGEST_SHARE * count
     if crossed + beyond <= allowed and crossings + outside > 2 * (crossed + beyond) + tolerated:
-        plan, _, remedy = best.text.partition("; ")
-        yield "walls", f"{text}, and {crossed} and {beyond} if {plan}; {remedy}"
+        yield "walls", f"{text}, and {crossed} and {beyond} if {best.motion}; {best.remedy}"
     elif crossings + outside > allowed:
         yield "walls", f"{text}; give positions and building in one frame"
 

@@ -53,8 +53,8 @@ OTHERS = 6
 """Transmitters of other groups that a row's own is compared with."""
 
 
-_Reading = tuple[str, str, Record]
-"""Another reading: name of the suspicion, its text, and the record so read."""
+_Reading = tuple[str, str, str, Record]
+"""Another reading: name of the suspicion, what is wrong, the remedy, and the record so read."""
 REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at azimuth 0, counter-clockwise"
 
 
@@ -103,18 +103,17 @@ def _line_of_sight(record: Record) -> Found:
     if stated.mean() > BRIGHTEST:
         return
     better = []
-    for name, text, reading in _readings(part):
+    for name, what, remedy, reading in _readings(part):
         found = brightness(reading)
         if found.mean() >= BRIGHT and _is_brighter(found, stated, groups) and _moves(reading, found, groups):
-            better.append((name, text, found))
+            better.append((name, what, remedy, found))
     if not better:
         return
     # Several readings may put transmitters where they are in the best one: the first of these is named.
     best = max((found for *_, found in better), key=np.mean)
-    (name, text, found), *others = [one for one in better if not _is_brighter(best, one[2], groups)]
-    what, _, remedy = text.partition("; ")
+    (name, what, remedy, found), *others = [one for one in better if not _is_brighter(best, one[-1], groups)]
     evidence = f"{found.mean():.0%} of the hemisphere is then darker than the direction of the transmitter"
-    also = [text.partition("; ")[0] for other, text, _ in others if other != name]
+    also = [text for other, text, *_ in others if other != name]
     hint = f" (or: {also[0]})" if also else ""
     yield name, f"{what}: {evidence}, as stated {stated.mean():.0%}; {remedy}{hint}"
 
@@ -206,13 +205,14 @@ def _groups(positions_m: FloatArray) -> IntArray:
 
 def _readings(record: Record) -> Iterator[_Reading]:
     for text, image in COLUMNS.items():
-        yield "spectrum-axes", f"{text}; {REMEDY}", replace(record, observation=image(record.observation))
+        yield "spectrum-axes", text, REMEDY, replace(record, observation=image(record.observation))
     for text, turn in ORIENTATIONS.items():
         receivers = tuple(replace(r, orientation_xyzw=turn(r.orientation_xyzw)) for r in record.receivers)
-        yield "orientation", text, replace(record, receivers=receivers)
+        what, _, remedy = text.partition("; ")
+        yield "orientation", what, remedy, replace(record, receivers=receivers)
     for placement in other_plans(record):
-        text = f"transmitters are in another plan than receivers, {placement.text}"
-        yield "plan", text, replace(record, tx_pos_m=placement.positions_m)
+        what = f"transmitters are in another plan than receivers, {placement.motion}"
+        yield "plan", what, placement.remedy, replace(record, tx_pos_m=placement.positions_m)
 
 
 def _half_turn(images: Images) -> Images:

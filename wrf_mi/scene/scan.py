@@ -19,13 +19,7 @@ OUTLIERS = 0.01
 """Share of stray returns: edges, glass, people walking by."""
 
 
-def simulate_scan(
-    scene: Any,
-    poses_m: ArrayLike,
-    *,
-    rays_per_pose: int = RAYS_PER_POSE,
-    seed: int = 1,
-) -> FloatArray:
+def simulate_scan(scene: Any, poses_m: ArrayLike, *, rays_per_pose: int = RAYS_PER_POSE, seed: int = 1) -> FloatArray:
     """Points of a simulated LiDAR at some positions.
 
     The rays of a position are spread evenly over the sphere (a Fibonacci lattice, turned at random); each return is
