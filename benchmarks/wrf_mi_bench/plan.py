@@ -14,7 +14,7 @@ from wrf_mi.scene.plan import layout_walls
 from wrf_mi.scene.plan_align import grid_from_scans
 from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
 from wrf_mi.scene.plan_walls import find_walls
-from wrf_mi.scene.register import register_walls, sample_walls
+from wrf_mi.scene.register import best_scale, register_walls, sample_walls
 
 from .comparison import data_folder, line
 
@@ -80,8 +80,9 @@ def _measured(grid: PlanGrid, true: FloatArray, register: bool = True) -> dict[s
     seconds = time.perf_counter() - begin
     scale = None
     if register:
-        registration = register_walls(sample_walls(walls), true)
-        walls, cells, scale = registration.apply(walls), registration.apply(cells), registration.scale
+        motion = register_walls(sample_walls(walls), true)
+        walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
+        scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
     found, right = wall_agreement(walls, true)
     line = shapely.unary_union(shapely.linestrings(true))
     seen = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length

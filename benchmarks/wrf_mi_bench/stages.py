@@ -25,8 +25,8 @@ from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.timing import bootstrap
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
-from wrf_mi.synthetic.random_room import random_room_record
 from wrf_mi.tasks import TASKS
+from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part

@@ -33,7 +33,7 @@ from wrf_mi.scene.correction_data import FILE as CORRECTION
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_channels import MEASURED
-from wrf_mi.synthetic.laboratory import SCAN
+from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command

@@ -98,32 +98,23 @@ def scene_xml(
     lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
     for material in dict.fromkeys(materials.values()):
         colour = COLOURS.get(material, OTHER_COLOUR)
+        look = f'<rgb name="color" value="{colour}"/>'
         if material in known:
-            lines.append(f'    <bsdf type="radio-material" id="mat-{material}">')
+            kind = "radio-material"
             stated = [(name, value) for name, value in known[material].items() if name in PERFECT_CONSTANTS]
-            lines += [f'        <float name="{name}" value="{value:.9g}"/>' for name, value in stated]
-            lines.append("    </bsdf>")
-            continue
-        if material == ABSORBER and not looks:
-            lines += [
-                f'    <bsdf type="absorber-radio-material" id="mat-{material}">',
-                f'        <rgb name="color" value="{colour}"/>',
-                "    </bsdf>",
-            ]
-            continue
-        if material in slabs and not looks:
+            content = [f'<float name="{name}" value="{value:.9g}"/>' for name, value in stated]
+        elif material == ABSORBER and not looks:
+            kind, content = "absorber-radio-material", [look]
+        elif material in slabs and not looks:
             itu, thickness_m = slabs[material]
-            lines += [
-                f'    <bsdf type="itu-radio-material" id="mat-{material}">',
-                f'        <string name="type" value="{itu}"/>',
-                f'        <float name="thickness" value="{thickness_m:.9g}"/>',
-                f'        <rgb name="color" value="{colour}"/>',
-                "    </bsdf>",
-            ]
-            continue
+            thickness = f'<float name="thickness" value="{thickness_m:.9g}"/>'
+            kind, content = "itu-radio-material", [f'<string name="type" value="{itu}"/>', thickness, look]
+        else:
+            kind = "twosided"
+            content = [f'<bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/></bsdf>']
         lines += [
-            f'    <bsdf type="twosided" id="mat-{material}">',
-            f'        <bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/></bsdf>',
+            f'    <bsdf type="{kind}" id="mat-{material}">',
+            *(f"        {line}" for line in content),
             "    </bsdf>",
         ]
     for name, material in materials.items():

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from wrf_mi_bench.random_room import OPTIONS, Survey, random_room_record
 from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement, table
 
 from wrf_mi.core import Record
 from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
-from wrf_mi.synthetic.random_room import OPTIONS, Survey, random_room_record
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing.tracer import RayTracer
 

@@ -15,7 +15,7 @@ from made_flat import write_flat
 from wrf_mi.checking import building as module
 from wrf_mi.checking import check_data
 from wrf_mi.checking.building import building_file, in_solid, in_wall, inside_solids, read_building
-from wrf_mi.core import InputError, Record
+from wrf_mi.core import Record
 from wrf_mi.datasets import load, write_ble_folder
 
 HALL_M = [[0, 0], [12, 0], [12, 8], [7, 8], [7, 4.2], [6.8, 4.2], [6.8, 8], [0, 8], [0, 0]]
@@ -54,8 +54,7 @@ def names(record: Record) -> list[str]:
 def test_positions_within_the_hall_are_not_suspected(hall: Record) -> None:
     assert building_file(hall.source) == Path(hall.source, "layout.csv")
     assert names(hall) == []
-    report = check_data(Path(hall.source))
-    assert report.skipped == ()
+    assert check_data(Path(hall.source)).suspicions == ()
 
 
 @pytest.mark.parametrize(
@@ -186,18 +185,6 @@ def test_a_plan_that_cannot_be_read_is_suspected(tmp_path: Path) -> None:
         (one,) = report.suspicions
         assert one.name == "building"
         assert message in one.text
-
-
-def test_checks_without_the_packages_for_plans_are_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise InputError(f"scenes from scans need {name}: pip install 'wrf-mi[lidar]'")
-
-    monkeypatch.setattr(module, "lidar_package", missing)
-    report = check_data(write_flat(tmp_path / "flat"))
-    assert report.skipped == (
-        "positions against layout.csv: scenes from scans need shapely: pip install 'wrf-mi[lidar]'",
-    )
-    assert any(line.startswith("not checked: positions against layout.csv") for line in report.lines())
 
 
 def test_a_receiver_at_a_vertex_of_the_plan_is_suspected(hall: Record) -> None:

@@ -9,7 +9,7 @@ import pytest
 from made_building import building
 
 from wrf_mi.checking import check_data
-from wrf_mi.checking.degrees import degrees
+from wrf_mi.checking.units import degrees
 from wrf_mi.core import Record
 
 SALT_LAKE, SINGAPORE, LONDON, SYDNEY = (-111.8442, 40.7672), (103.8198, 1.3521), (-0.1276, 51.5072), (151.21, -33.87)

@@ -72,7 +72,7 @@ def test_placements_state_what_they_do() -> None:
     xy = np.array([[1.0, 2.0, 0.5], [3.0, 5.0, 0.5]])
     names = {"x": 0, "y": 1}
     for placement in placements(xy, np.array([2.0, 3.0])):
-        formulas = placement.text.partition("; use ")[2].split(", ")
+        formulas = placement.remedy.removeprefix("use ").split(", ")
         for formula, column in zip(formulas, placement.positions_m[:, :2].T, strict=True):
             source = formula.partition("= ")[2]
             values = eval(source, {name: xy[:, k] for name, k in names.items()})

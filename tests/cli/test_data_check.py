@@ -39,7 +39,6 @@ def test_correct_data(flat: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "rows": 30,
         "faults": [],
         "suspicions": [],
-        "skipped": [],
         "notes": [],
     }
 

@@ -56,8 +56,8 @@ def test_an_l_shape_keeps_its_missing_quarter() -> None:
     surfaces = by_kind(surfaces_from_points(sampled(l_shape(), COUNT)))
     assert [len(group) for group in surfaces.values()] == [1, 1, 6, 0]
     for flat in (*surfaces["floor"], *surfaces["ceiling"]):
-        assert flat.area_m2 == pytest.approx(22.5, rel=AREA_SHARE)
-    areas = sorted(wall.area_m2 for wall in surfaces["wall"])
+        assert flat.mesh.area == pytest.approx(22.5, rel=AREA_SHARE)
+    areas = sorted(wall.mesh.area for wall in surfaces["wall"])
     np.testing.assert_allclose(areas, 2.7 * np.array([2.5, 2.5, 3, 3, 5, 6]), rtol=AREA_SHARE)
 
 
@@ -68,18 +68,18 @@ def test_a_sloping_ceiling_keeps_its_slope() -> None:
     np.testing.assert_allclose(bounds(ceiling), [0, 0, 2.2, 5, 4, 3.4], atol=2 * PLANE_M)
     gables = [wall for wall in surfaces["wall"] if np.ptp(wall.vertices_m[:, 1]) > 3]
     for gable in gables:
-        assert gable.area_m2 == pytest.approx(4 * 2.8, rel=AREA_SHARE)
+        assert gable.mesh.area == pytest.approx(4 * 2.8, rel=AREA_SHARE)
 
 
 def test_both_sides_of_a_partition_and_the_doorway_through_it() -> None:
     surfaces = by_kind(surfaces_from_points(sampled(two_rooms(), 2 * COUNT)))
     assert [len(group) for group in surfaces.values()] == [1, 1, 6, 0]
-    sides = sorted((wall for wall in surfaces["wall"] if wall.area_m2 < 9), key=lambda wall: wall.vertices_m[0, 0])
+    sides = sorted((wall for wall in surfaces["wall"] if wall.mesh.area < 9), key=lambda wall: wall.vertices_m[0, 0])
     assert len(sides) == 2
     for wall, x in zip(sides, (4.0, 4.12), strict=True):
         assert np.abs(wall.vertices_m[:, 0] - x).max() < PLANE_M
         # The doorway's free edges: 5.1 m long.
-        assert abs(wall.area_m2 - (4 * 2.6 - 0.9 * 2.1)) < 5.1 * EDGE_M
+        assert abs(wall.mesh.area - (4 * 2.6 - 0.9 * 2.1)) < 5.1 * EDGE_M
         flat = trimesh.Trimesh(wall.vertices_m, wall.faces, process=False)
         inside = flat.triangles[..., 1:].mean(axis=1)
         assert not ((inside[:, 0] > 1.6) & (inside[:, 0] < 2.3) & (inside[:, 1] < 2.0)).any()
@@ -114,7 +114,7 @@ def test_the_shadow_of_a_cupboard_is_filled_and_a_window_is_not() -> None:
     surfaces = surfaces_from_points(points[~behind & ~window])
     wall = min(by_kind(surfaces)["wall"], key=lambda one: np.abs(one.vertices_m[:, 1]).max())
     # The window's free edges: 4.4 m long.
-    assert abs(wall.area_m2 - (5 * 2.8 - 1.2 * 1.0)) < 4.4 * EDGE_M
+    assert abs(wall.mesh.area - (5 * 2.8 - 1.2 * 1.0)) < 4.4 * EDGE_M
 
 
 @settings(max_examples=3, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])

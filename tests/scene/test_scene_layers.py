@@ -46,7 +46,7 @@ def test_layers_of_a_wall_are_surfaces_of_their_own() -> None:
     at = min(found, key=abs)
     assert at == pytest.approx(0, abs=LAYER_M)
     niche = np.prod(np.diff(NICHE, axis=1))
-    assert found[at].area_m2 == pytest.approx(7 * 2.8 - niche, rel=0.03)
+    assert found[at].mesh.area == pytest.approx(7 * 2.8 - niche, rel=0.03)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

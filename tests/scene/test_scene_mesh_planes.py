@@ -67,7 +67,7 @@ def test_a_closed_solid_in_a_room_is_furniture(
 ) -> None:
     counts, surfaces = split(solid(*ROOM, inward[0]), solid(low, high, inward[1]))
     assert counts == FURNISHED
-    assert surfaces[-1].area_m2 == pytest.approx(solid(low, high).area)
+    assert surfaces[-1].mesh.area == pytest.approx(solid(low, high).area)
 
 
 def test_walls_that_are_solid_slabs_are_walls_and_what_stands_between_them_is_not() -> None:

@@ -167,9 +167,9 @@ def test_layout_is_extruded_as_it_is(tmp_path):
     surfaces = plan_surfaces(read_layout(file), height_m=2.5, floor_m=0.2)
     kinds = [s.kind for s in surfaces]
     assert kinds[:2] == ["floor", "ceiling"]
-    assert sum(s.area_m2 for s in surfaces if s.kind == "wall") == pytest.approx(2.5 * (4 + 3 + 4 + 3 + 2))
-    assert surfaces[0].area_m2 == pytest.approx(12)
-    assert surfaces[1].area_m2 == pytest.approx(12)
+    assert sum(s.mesh.area for s in surfaces if s.kind == "wall") == pytest.approx(2.5 * (4 + 3 + 4 + 3 + 2))
+    assert surfaces[0].mesh.area == pytest.approx(12)
+    assert surfaces[1].mesh.area == pytest.approx(12)
     assert set(np.unique(surfaces[0].vertices_m[:, 2])) == {0.2}
     assert set(np.unique(surfaces[1].vertices_m[:, 2])) == {2.7}
     assert len({s.name for s in surfaces}) == len(surfaces)

@@ -126,7 +126,7 @@ def test_degenerate_and_doubled_faces_are_dropped(tmp_path: Path, caplog: pytest
     with caplog.at_level(logging.WARNING):
         (surface,) = read_mesh(tmp_path / "room.stl")
     assert len(surface.faces) == 12
-    assert surface.area_m2 == pytest.approx(box.area, rel=1e-6)
+    assert surface.mesh.area == pytest.approx(box.area, rel=1e-6)
     assert [record.getMessage().split(": ")[1] for record in caplog.records] == [
         "1 degenerate faces of mesh left out",
         "2 doubled faces of mesh left out",
@@ -138,7 +138,7 @@ def test_unusable_meshes_are_refused(tmp_path: Path) -> None:
     box.export(tmp_path / "mm.stl")
     with pytest.raises(InputError, match=r"mm.stl: .* looks like millimetres; give --units mm"):
         read_mesh(tmp_path / "mm.stl")
-    assert read_mesh(tmp_path / "mm.stl", "mm")[0].area_m2 == pytest.approx(box.area * 1e-6, rel=1e-6)
+    assert read_mesh(tmp_path / "mm.stl", "mm")[0].mesh.area == pytest.approx(box.area * 1e-6, rel=1e-6)
     trimesh.PointCloud(POINTS).export(tmp_path / "points.ply")
     with pytest.raises(InputError, match=r"points.ply: has no faces, so no surface; make a scene of points"):
         read_mesh(tmp_path / "points.ply")

@@ -7,9 +7,10 @@ from matplotlib.collections import LineCollection, PolyCollection
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from PIL import Image
 
+from wrf_mi.core.files import write_figure
 from wrf_mi.core.paths import Paths
 from wrf_mi.scene.plan import plan_surfaces
-from wrf_mi.scene.preview import GaussianCloud, draw_preview, draw_scene
+from wrf_mi.scene.preview import GaussianCloud, draw_scene
 from wrf_mi.scene.surfaces import Surface
 
 
@@ -42,7 +43,8 @@ def one_path():
 
 
 def test_preview_is_written_whole(tmp_path):
-    path = draw_preview(room(), tmp_path / "preview.png", points=np.random.default_rng(0).uniform(0, 4, (100, 3)))
+    figure = draw_scene(room(), points_m=np.random.default_rng(0).uniform(0, 4, (100, 3)))
+    path = write_figure(tmp_path / "preview.png", figure)
     with Image.open(path) as picture:
         assert picture.size[0] > 1000
         grey = np.asarray(picture.convert("L"))

@@ -22,7 +22,7 @@ from wrf_mi.synthetic.floor_receivers import (
     strengths_of,
     trace_floor,
 )
-from wrf_mi.synthetic.laboratory import SCAN
+from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tracing import TraceOptions, TraceResult, open_scene, trace_paths
 
 SMALL = FloorReceivers(columns=3, rows=2, train=8, test=4, rays=1 << 11, scattered_rays=1 << 6, depth=3, reflections=1)

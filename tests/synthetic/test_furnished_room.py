@@ -14,7 +14,7 @@ from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import antenna_csi
 from wrf_mi.receivers.channel import array_channels
-from wrf_mi.synthetic.furnished_room import TracedRoom, traced_room, transmitters
+from wrf_mi.synthetic.furnished_room import MEASURED, TracedRoom, traced_room, transmitters
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.devices import solid_around
@@ -32,17 +32,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_data_are_stored_and_reproducible(made: Path) -> None:
     before = (made / "tx_pos.csv").stat().st_mtime_ns
-    record, given = traced_room(made, SMALL)
+    record = traced_room(made, SMALL)
     assert (made / "tx_pos.csv").stat().st_mtime_ns == before
     assert record.official is not None
     assert [len(part) for part in record.official] == [6, 2]
     assert record.observation.shape == (1, 8, 90, 360)
     assert record.observation.min() == 0
     assert record.observation.max() == 1
-    assert open_scene(given, FREQUENCY_HZ).objects.keys() == measured_parts(0.02, 1).keys()
-    moved, _ = traced_room(made, replace(SMALL, seed=2))
+    assert open_scene(made / MEASURED, FREQUENCY_HZ).objects.keys() == measured_parts(0.02, 1).keys()
+    moved = traced_room(made, replace(SMALL, seed=2))
     assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
-    back, _ = traced_room(made, SMALL)
+    back = traced_room(made, SMALL)
     assert np.array_equal(record.observation, back.observation)
 
 

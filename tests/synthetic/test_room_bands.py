@@ -18,15 +18,10 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.channel import received_power
 from wrf_mi.synthetic import load_record, traced_room_bands
-from wrf_mi.synthetic.furnished_room import (
-    opaque_parts,
-    room_searches,
-    searched_paths,
-    set_scattering,
-    trace_channels,
-)
-from wrf_mi.synthetic.laboratory import SCAN
+from wrf_mi.synthetic.furnished_room import opaque_parts
 from wrf_mi.synthetic.room_bands import DEFAULT, RECEIVERS, RoomBands, channels_at_carriers
+from wrf_mi.synthetic.searches import searched_paths, set_scattering, trace_channels
+from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.result import recompute
 
@@ -126,7 +121,7 @@ def channels(room: Path, searched_hz: float, carriers_hz: tuple[float, ...], opt
 
 def test_channels_are_those_of_a_search_at_the_carrier(room: Path) -> None:
     """All kinds of path at the carrier of the search; at another one those that are not drawn at random."""
-    exact, rough = room_searches(replace(SMALL, depth=3, reflections=2))
+    exact, rough = replace(SMALL, depth=3, reflections=2).options(diffraction=True)
     receiver, opaque = replace(RECEIVERS[1], array_m=planar_array(2, 2, 0.025)), opaque_parts()
 
     def alone(carrier_hz: float, options: tuple[Any, ...]) -> np.ndarray:

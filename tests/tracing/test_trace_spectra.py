@@ -20,7 +20,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, registry
 from wrf_mi.receivers import antenna_csi
 from wrf_mi.receivers.instruments import SpectrumInstrument
-from wrf_mi.synthetic import laboratory_record, load_record
+from wrf_mi.synthetic import laboratory_record, load_record, stored
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
 from wrf_mi.tracing.fields import sionna_orientation
@@ -244,7 +244,7 @@ def test_laboratory_is_cached_and_reproducible(
 
     monkeypatch.setattr("wrf_mi.synthetic.laboratory.RayTracer", refuse)
     monkeypatch.delenv("WRF_MI_DATA", raising=False)
-    for module in (registry, __import__("wrf_mi.synthetic.laboratory", fromlist=["user_cache"])):
+    for module in (registry, stored):
         monkeypatch.setattr(module, "user_cache", lambda: folder.parent)
     np.testing.assert_array_equal(load_record("laboratory").observation, record.observation)
     assert load_record(folder).name == "laboratory"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
 from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
+from ..scene.plan import plan_surfaces
 from ..scene.plan_sources import Mask, read_layout
-from ..scene.points import lidar_package
-from ..scene.surfaces import Surface, bodies
+from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
+from ..scene.surfaces import Surface, bodies, box_of
+from ..tracing.devices import winding_number
 from .placements import placements
 from .repeats import named_rows
 from .units import Found
@@ -69,21 +72,12 @@ def building_file(source: str | Path) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
-def need_packages() -> None:
-    """Refuse to go on without the packages of the extra ``lidar`` that plans and meshes need (`InputError`)."""
-    for name in ("shapely", "mapbox_earcut"):
-        lidar_package(name)
-
-
 def read_building(path: Path) -> Building:
     """Read a plan, a mesh or a scene folder.
 
     Raises:
-        InputError: it is not readable, or a package of the extra ``lidar`` is not installed.
+        InputError: it is not readable.
     """
-    need_packages()
-    from ..scene.plan import plan_surfaces
-
     if path.name == LAYOUT:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
@@ -101,14 +95,11 @@ def read_building(path: Path) -> Building:
 
 def plan_against_walls(record: Record, building: Building) -> Found:
     """Transmitters outside the building or across its walls, and the plan in which they are not."""
-    from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-
     if not record.has_positions or not any(surface.kind == "wall" for surface in building.surfaces):
         return
     count = len(distinct(record.tx_pos_m))
     crossings, outside = conflicts(record.tx_pos_m, building.surfaces)
-    vertices = np.concatenate([surface.vertices_m for surface in building.surfaces])[:, :2]
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    middle = box_of(building.surfaces).mean(axis=0)[:2]
     tolerated = TOLERATED + TOLERATED_SHARE * count
     text = f"{crossings} lines between neighbouring transmitters cross walls of {building.source.name}"
     text += f" and {outside} of {count} transmitters lie outside"
@@ -116,16 +107,13 @@ def plan_against_walls(record: Record, building: Building) -> Found:
     (crossed, beyond), best = min(others, key=lambda pair: sum(pair[0]))
     allowed = tolerated + LARGEST_SHARE * count
     if crossed + beyond <= allowed and crossings + outside > 2 * (crossed + beyond) + tolerated:
-        plan, _, remedy = best.text.partition("; ")
-        yield "walls", f"{text}, and {crossed} and {beyond} if {plan}; {remedy}"
+        yield "walls", f"{text}, and {crossed} and {beyond} if {best.motion}; {best.remedy}"
     elif crossings + outside > allowed:
         yield "walls", f"{text}; give positions and building in one frame"
 
 
 def inside_solids(record: Record, building: Building) -> Found:
     """Receivers and transmitters within walls and solid bodies; a few transmitters are errors of their positions."""
-    from ..scene.positions import TOLERATED_SHARE
-
     groups = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
     for what, places in groups.items():
         known = np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -162,34 +150,25 @@ def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
     length = np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=1)
     walls, length = walls_m[length > 0], length[length > 0]
     along = (walls[:, 1] - walls[:, 0]) / length[:, None]
-    for k, place in enumerate(places_m):
-        to = place - walls[:, 0]
-        foot, side = (to * along).sum(axis=1), to[:, 1] * along[:, 0] - to[:, 0] * along[:, 1]
-        near = np.flatnonzero((foot >= 0) & (foot <= length) & (np.abs(side) < THICKEST_WALL_M))
-        for one in near:
-            cosine = along[near] @ along[one]
-            # Sides are measured against each stretch's own direction.
-            other_side = side[near] * np.sign(cosine)
-            facing = (np.abs(cosine) > PARALLEL) & (other_side * side[one] < 0)
-            width = np.abs(side[near]) + abs(side[one])
-            deep = np.minimum(np.abs(side[near]), abs(side[one])) >= DEEP_M
-            inside[k] |= bool((facing & deep & (width <= THICKEST_WALL_M)).any())
+    # Way along each stretch and distance to its left, [n, m].
+    to = places_m[:, None] - walls[:, 0]
+    foot, side = (to * along).sum(axis=-1), to[..., 1] * along[:, 0] - to[..., 0] * along[:, 1]
+    near = (foot >= 0) & (foot <= length) & (np.abs(side) >= DEEP_M)
+    for one, other in combinations(range(len(walls)), 2):
+        cosine = along[one] @ along[other]
+        if abs(cosine) > PARALLEL:
+            between = side[:, one] * side[:, other] * cosine < 0  # the left of one is the right of one that runs back
+            thin = np.abs(side[:, one]) + np.abs(side[:, other]) <= THICKEST_WALL_M
+            inside |= near[:, one] & near[:, other] & between & thin
     return inside
 
 
 def in_solid(places_m: FloatArray, body_m: FloatArray) -> Mask:
-    """Which places [n, 3] lie at least `DEEP_M` inside a closed body of triangles [f, 3, 3], by its solid angle.
-
-    Source: van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30, 1983.
-    """
+    """Which places [n, 3] lie at least `DEEP_M` inside a closed body of triangles [f, 3, 3]."""
     inside = np.zeros(len(places_m), bool)
     low, high = body_m.min(axis=(0, 1)) + DEEP_M, body_m.max(axis=(0, 1)) - DEEP_M
-    for k in np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1)):
-        a, b, c = np.moveaxis(body_m - places_m[k], 1, 0)
-        la, lb, lc = (np.linalg.norm(corner, axis=-1) for corner in (a, b, c))
-        triple = (a * np.cross(b, c)).sum(axis=-1)
-        rest = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-        if abs(2 * np.arctan2(triple, rest).sum()) > 2 * np.pi:  # 4 pi inside, 0 outside
-            nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
-            inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
+    near = np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1))
+    for k in near[winding_number(body_m, places_m[near]) > 0.5]:
+        nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
+        inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
     return inside

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from ..core import InputError, Record
@@ -11,13 +11,13 @@ from ..datasets.faults import collect_faults
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
-from .degrees import degrees, far_from_origin
+from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
 from .distances import distance_law
 from .reception import few_rows, not_heard
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
 from .report import DataReport, Suspicion
-from .units import Found, channel_phase, heading_unit, position_unit, strength_scale
+from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
         progress: show a progress bar on standard error where the data set is made on this machine first.
 
     Returns:
-        Faults, suspicions, and checks that could not be made.
+        Faults and suspicions.
 
     Raises:
         InputError: there is no such data set, or no such suspicion.
@@ -95,16 +95,15 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     record, faults = collect_faults(read)
     if record is None:
         return DataReport(name, source, None, tuple(faults), ())
-    skipped: list[str] = []
     found = [suspicion for check in OF_VALUES for suspicion in check(record)]
     wrong_unit = list(degrees(record)) or list(position_unit(record))
     found += wrong_unit
     if all(name in ignore for name, _ in wrong_unit):
         found += [suspicion for check in OF_PLACES for suspicion in check(record)]
-        found += _of_building(record, skipped)
+        found += _of_building(record)
     suspicions = tuple(Suspicion(name, text) for name, text in found if name not in ignore)
     notes = tuple(note for note in (far_from_origin(record),) if note)
-    return DataReport(name, record.source, record, (), suspicions, tuple(skipped), notes)
+    return DataReport(name, record.source, record, (), suspicions, notes)
 
 
 def warn_of_suspicions(record: Record) -> None:
@@ -126,18 +125,10 @@ def _path(dataset: str | Path) -> Path | None:
     return find(dataset)[0]
 
 
-def _of_building(record: Record, skipped: list[str]) -> Iterator[tuple[str, str]]:
-    """Suspicions about positions in the building of the folder; adds the reason to ``skipped`` if it is not known."""
-    # Reads plans and meshes; other checks, which fits make too, start without these packages.
-    from .building import at_vertices, building_file, inside_solids, need_packages, plan_against_walls, read_building
-
+def _of_building(record: Record) -> Found:
+    """Suspicions about positions in the building of the folder, if it shows one."""
     file = building_file(record.source) if record.source else None
     if file is None:
-        return
-    try:
-        need_packages()
-    except InputError as error:
-        skipped.append(f"positions against {file.name}: {error}")
         return
     try:
         building = read_building(file)

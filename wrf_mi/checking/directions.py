@@ -9,7 +9,7 @@ direction moves with the transmitter; lobes that do not move are those of reflec
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,15 +53,8 @@ OTHERS = 6
 """Transmitters of other groups that a row's own is compared with."""
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """Another reading: name of the suspicion, its text, and the record so read."""
-
-    name: str
-    text: str
-    record: Record
-
-
+_Reading = tuple[str, str, str, Record]
+"""Another reading: name of the suspicion, what is wrong, the remedy, and the record so read."""
 REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at azimuth 0, counter-clockwise"
 
 
@@ -78,7 +71,7 @@ def spectrum_axes(record: Record) -> Found:
     if share > MOST:
         evidence = f"in {share:.0%} of the spectra the first row is nearly constant, as a zenith is, the last is not"
         yield "spectrum-axes", f"image rows count from the zenith: {evidence}; {REMEDY}"
-        record = replace(record, observation=_reversed(record.observation))
+        record = replace(record, observation=record.observation[..., ::-1, :])
     yield from _line_of_sight(record)
 
 
@@ -110,20 +103,19 @@ def _line_of_sight(record: Record) -> Found:
     if stated.mean() > BRIGHTEST:
         return
     better = []
-    for reading in _readings(part):
-        found = brightness(reading.record)
-        if found.mean() >= BRIGHT and _is_brighter(found, stated, groups) and _moves(reading.record, found, groups):
-            better.append((reading, found))
+    for name, what, remedy, reading in _readings(part):
+        found = brightness(reading)
+        if found.mean() >= BRIGHT and _is_brighter(found, stated, groups) and _moves(reading, found, groups):
+            better.append((name, what, remedy, found))
     if not better:
         return
     # Several readings may put transmitters where they are in the best one: the first of these is named.
-    best = max((found for _, found in better), key=np.mean)
-    (reading, found), *others = [pair for pair in better if not _is_brighter(best, pair[1], groups)]
-    text, _, remedy = reading.text.partition("; ")
+    best = max((found for *_, found in better), key=np.mean)
+    (name, what, remedy, found), *others = [one for one in better if not _is_brighter(best, one[-1], groups)]
     evidence = f"{found.mean():.0%} of the hemisphere is then darker than the direction of the transmitter"
-    also = [other.text.partition("; ")[0] for other, _ in others if other.name != reading.name]
+    also = [text for other, text, *_ in others if other != name]
     hint = f" (or: {also[0]})" if also else ""
-    yield reading.name, f"{text}: {evidence}, as stated {stated.mean():.0%}; {remedy}{hint}"
+    yield name, f"{what}: {evidence}, as stated {stated.mean():.0%}; {remedy}{hint}"
 
 
 def _behind(record: Record) -> Found:
@@ -213,17 +205,14 @@ def _groups(positions_m: FloatArray) -> IntArray:
 
 def _readings(record: Record) -> Iterator[_Reading]:
     for text, image in COLUMNS.items():
-        yield _Reading("spectrum-axes", f"{text}; {REMEDY}", replace(record, observation=image(record.observation)))
+        yield "spectrum-axes", text, REMEDY, replace(record, observation=image(record.observation))
     for text, turn in ORIENTATIONS.items():
         receivers = tuple(replace(r, orientation_xyzw=turn(r.orientation_xyzw)) for r in record.receivers)
-        yield _Reading("orientation", text, replace(record, receivers=receivers))
+        what, _, remedy = text.partition("; ")
+        yield "orientation", what, remedy, replace(record, receivers=receivers)
     for placement in other_plans(record):
-        text = f"transmitters are in another plan than receivers, {placement.text}"
-        yield _Reading("plan", text, replace(record, tx_pos_m=placement.positions_m))
-
-
-def _reversed(images: Images) -> Images:
-    return images[..., ::-1, :]
+        what = f"transmitters are in another plan than receivers, {placement.motion}"
+        yield "plan", what, placement.remedy, replace(record, tx_pos_m=placement.positions_m)
 
 
 def _half_turn(images: Images) -> Images:

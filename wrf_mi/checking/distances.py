@@ -32,15 +32,15 @@ def distance_law(record: Record) -> Found:
     levels = levels_db(record)
     stated, _ = explained(levels, distances_m(record))
     # Of each motion the point about which it explains most.
-    best: dict[str, tuple[float, float, str]] = {}
+    best: dict[str, tuple[float, float, str, str]] = {}
     for placement in other_plans(record):
         share, exponent = explained(levels, distances_m(replace(record, tx_pos_m=placement.positions_m)))
-        best[placement.motion] = max(best.get(placement.motion, (0.0, 0.0, "")), (share, exponent, placement.text))
-    (share, exponent, text), (second, *_) = sorted(best.values(), reverse=True)[:2]
+        found = share, exponent, placement.motion, placement.remedy
+        best[placement.motion] = max(best.get(placement.motion, (0.0, 0.0, "", "")), found)
+    (share, exponent, plan, remedy), (second, *_) = sorted(best.values(), reverse=True)[:2]
     gain = share - max(stated, second)
     if gain < SHARE / np.sqrt(len(record.receivers)) or not EXPONENTS[0] <= exponent <= EXPONENTS[1]:
         return
-    plan, _, remedy = text.partition("; ")
     evidence = f"distance then explains {share:.0%} of the variance of the signal strengths, as stated {stated:.0%}"
     yield "plan", f"transmitters are in another plan than receivers, {plan}: {evidence}; {remedy}"
 

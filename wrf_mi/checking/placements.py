@@ -32,12 +32,12 @@ class Placement:
 
     Attributes:
         motion: what is wrong.
-        text: what is wrong and how to correct it.
+        remedy: how to correct it.
         positions_m: the corrected positions [n, 3].
     """
 
     motion: str
-    text: str
+    remedy: str
     positions_m: FloatArray
 
 
@@ -48,13 +48,13 @@ def placements(positions_m: FloatArray, *centres_m: FloatArray) -> Iterator[Plac
     picture that was turned over.
     """
     for about in (*centres_m, np.zeros(2)):
-        for text, rows in _MOTIONS.items():
+        for motion, rows in _MOTIONS.items():
             matrix = np.array(rows, float)
             offset = about - matrix @ about
             moved = positions_m.copy()
             moved[:, :2] = positions_m[:, :2] @ matrix.T + offset
             formula = ", ".join(_formula(axis, matrix[k], offset[k]) for k, axis in enumerate("xy"))
-            yield Placement(text, f"{text}; use {formula}", moved)
+            yield Placement(motion, f"use {formula}", moved)
 
 
 def other_plans(record: Record) -> Iterator[Placement]:

@@ -36,7 +36,6 @@ class DataReport:
         record: the data, None if there is a fault.
         faults: what the reader refuses, in the order in which it was found.
         suspicions: data that are likely wrong; only looked for where there is no fault.
-        skipped: checks that could not be made, each with the reason.
         notes: properties of the data that are no mistake, but count for some models.
     """
 
@@ -45,7 +44,6 @@ class DataReport:
     record: Record | None
     faults: tuple[InputError, ...]
     suspicions: tuple[Suspicion, ...]
-    skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -54,14 +52,13 @@ class DataReport:
         return not self.faults
 
     def lines(self, most: int = MOST_LINES) -> list[str]:
-        """A line for each fault, suspicion, skipped check and note, and a summary.
+        """A line for each fault, suspicion and note, and a summary.
 
         Args:
             most: largest number of lines for faults of one kind in one file.
         """
         found = list(self._fault_lines(most))
         found += [f"suspicion {one.name}: {one.text}" for one in self.suspicions]
-        found += [f"not checked: {text}" for text in self.skipped]
         found += [f"note: {text}" for text in self.notes]
         if self.faults:
             summary = f"{_count(len(self.faults), 'fault')}; suspicions are looked for when there is none"
@@ -80,7 +77,6 @@ class DataReport:
             "rows": None if record is None else len(record),
             "faults": [_plain(fault) for fault in self.faults],
             "suspicions": [{"name": one.name, "text": one.text} for one in self.suspicions],
-            "skipped": list(self.skipped),
             "notes": list(self.notes),
         }
 

@@ -1,4 +1,4 @@
-"""Units and scales: headings in degrees, positions in millimetres, powers on a linear scale, channels without phase."""
+"""Units and scales: headings in degrees, positions in millimetres or degrees, linear powers, channels without phase."""
 
 from __future__ import annotations
 
@@ -33,6 +33,24 @@ ALLOWED_DBM = 36.0
 STRONGEST = 90
 """Percentile of the radiated powers: those of the direct path, without a few exceptional rows."""
 
+LONGITUDE, LATITUDE = 180.0, 90.0
+WIDEST_DEG = 1.0
+"""Largest extent of a place in degrees, 111 km of latitude."""
+AWAY = 20.0
+"""Least distance from the origin in extents of the place: 1 km at 0.2 degrees. A room of metres whose origin is twenty
+of its lengths away is not less than a metre wide."""
+MILLIMETRES = 1e3
+"""Degrees of a place have five decimals or more, metres of a survey three at most."""
+FINE_SHARE = 0.5
+"""Least share of coordinates with a fraction of a millimetre."""
+ROUNDING = 1e-6
+"""Of a coordinate in millimetres, which a file states in decimals."""
+APART_M = 20.0
+"""Least distance between receivers and transmitters where the ones are in degrees and the others are not."""
+RESOLUTION_M = 1e-3
+"""Resolution of single precision from which positions are said to be far from the origin."""
+METRES_PER_DEGREE = 111e3
+
 LINEAR_RANGE = 30.0
 """Ratio of the 99th to the 1st percentile above which numbers are powers on a linear scale: in dB or dBm magnitudes
 of, say, 20 to 120 differ by less."""
@@ -44,10 +62,10 @@ def heading_unit(record: Record) -> Found:
     if heading is None or len(record) < 2 or not np.isfinite(heading).all():
         return
     text = f"headings range from {heading.min():.4g} to {heading.max():.4g}"
-    degrees = "they are degrees; multiply them by pi / 180"
+    in_degrees = "they are degrees; multiply them by pi / 180"
     clockwise = "they run clockwise, as of a compass, or the plan is mirrored; use pi / 2 - heading"
     both = "they are degrees and run clockwise, as of a compass; use pi / 2 - heading * pi / 180"
-    readings = {degrees: np.radians(heading), clockwise: -heading, both: -np.radians(heading)}
+    readings = {in_degrees: np.radians(heading), clockwise: -heading, both: -np.radians(heading)}
     stretches, course = _courses(record.tx_pos_m[:, :2])
     if len(course) >= FEWEST_COURSES:
 
@@ -65,7 +83,7 @@ def heading_unit(record: Record) -> Found:
             return
     jumps = np.mean(np.abs(np.diff(heading)) > np.pi)
     if np.ptp(heading) >= WIDEST_RAD and jumps > CONTINUOUS_SHARE:
-        yield "headings", f"{text}, and {jumps:.0%} of the steps between rows are above pi: {degrees}"
+        yield "headings", f"{text}, and {jumps:.0%} of the steps between rows are above pi: {in_degrees}"
 
 
 def _courses(xy_m: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -106,6 +124,54 @@ def position_unit(record: Record) -> Found:
     if middle < 1e3:
         units = f"centimetres ({middle / 1e2:.3g} m) or {units}"
     yield "positions", f"{evidence}: positions are in {units}; give metres, of receivers and transmitters"
+
+
+def degrees(record: Record) -> Found:
+    """Positions in longitude and latitude, in either order, of receivers, of transmitters or of both."""
+    receivers = np.stack([receiver.position_m for receiver in record.receivers])[:, :2]
+    groups = {"receivers": receivers, "transmitters": record.tx_pos_m[:, :2]}
+    known = {what: np.unique(xy[np.isfinite(xy).all(axis=1)], axis=0) for what, xy in groups.items()}
+    known = {what: xy for what, xy in known.items() if len(xy)}
+    if not known:
+        return
+    both = np.concatenate(list(known.values()))
+    in_degrees = ["receivers and transmitters"] if len(known) == 2 and _is_in_degrees(both) else []
+    middles = [np.median(xy, axis=0) for xy in known.values()]
+    if not in_degrees and (len(known) == 1 or np.linalg.norm(middles[0] - middles[1]) >= APART_M):
+        in_degrees = [what for what, xy in known.items() if _is_in_degrees(xy)]
+    for what in in_degrees:
+        xy = known.get(what, both)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        order = "longitude, latitude" if np.abs(high[1]) <= LATITUDE else "latitude, longitude"
+        if np.abs(high).max() <= LATITUDE:
+            order = "longitude and latitude"  # either order is possible
+        extent_m = float((high - low).max()) * METRES_PER_DEGREE
+        text = f"{what} have x from {low[0]:.6f} to {high[0]:.6f} and y from {low[1]:.6f} to {high[1]:.6f}"
+        remedy = "project them to metres, of a local origin or UTM (pyproj), receivers and transmitters alike"
+        yield "degrees", f"{text}: {order} in degrees, of a place some {extent_m:.2g} m wide; {remedy}"
+
+
+def _is_in_degrees(xy: FloatArray) -> bool:
+    """Whether distinct coordinates [n, 2] look like degrees of a place: fine, close together, and far from zero."""
+    if len(xy) < 2:
+        return False
+    extent, largest = float(np.ptp(xy, axis=0).max()), np.abs(xy).max(axis=0)
+    in_range = largest.max() <= LONGITUDE and largest.min() <= LATITUDE
+    thousandths = xy * MILLIMETRES
+    fine = np.mean(np.abs(thousandths - np.round(thousandths)) > ROUNDING)
+    return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent and fine >= FINE_SHARE)
+
+
+def far_from_origin(record: Record) -> str | None:
+    """Note about positions that single precision resolves coarsely, as those of a map projection; None without."""
+    places = np.concatenate([record.tx_pos_m, np.stack([receiver.position_m for receiver in record.receivers])])
+    largest = float(np.nanmax(np.abs(places), initial=0.0))
+    resolution_m = float(np.spacing(np.float32(largest)))
+    if resolution_m < RESOLUTION_M:
+        return None
+    text = f"positions are up to {largest:.4g} m from the origin, as of a map projection"
+    what = f"ray tracing and fields of Gaussians, in single precision, resolve {resolution_m:.2g} m there"
+    return f"{text}: {what}; subtract a common origin from receivers, transmitters and scene"
 
 
 def strength_scale(record: Record) -> Found:

@@ -69,7 +69,8 @@ def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) ->
     from ..runs.compare import compare
     from ..scene.make import make_scene
     from ..synthetic import load_record
-    from ..synthetic.laboratory import NAME, SCAN
+    from ..synthetic.laboratory import NAME
+    from ..synthetic.stored import SCAN
     from ..training.config import PRESETS
 
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")

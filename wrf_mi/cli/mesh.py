@@ -49,7 +49,7 @@ def mesh_command(a: Arguments) -> int:
         height_m=a.height,
         floor_m=a.floor,
         resolution_m=a.resolution,
-        registration=None if pairs is None else pairs.matrix,
+        registration=pairs,
         register_walls_of=a.register_walls,
         positions=a.positions,
         row_0=a.row_0,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,70 +28,96 @@ WALL_SHARE, WALL_HEIGHT_M = 0.7, 2.0
 NARROWEST_WALL_M = 0.15
 
 
-def kinds(planes: Sequence[Plane], areas: Sequence[Any], middle_m: float) -> list[Kind]:
-    """The role of each plane.
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A plane where it was seen.
 
-    Level planes that are large are floors and ceilings in turn from the lowest up, at least `STOREY_M` apart; steeper
-    large planes over a floor are sloping ceilings. Upright planes that span most of a room's height are walls.
-    The areas (shapely) are in the coordinates of their planes. The median height of the points, ``middle_m``, separates
-    floors from ceilings where there is only one of them.
+    Attributes:
+        plane: the plane.
+        area: shapely, in the coordinates of the plane.
     """
-    found: list[Kind] = ["other"] * len(planes)
-    shadow = [footprint(plane, area) for plane, area in zip(planes, areas, strict=True)]
-    height = [span(plane, area) for plane, area in zip(planes, areas, strict=True)]
-    size = [area.area for area in areas]
-    slope = [abs(plane.normal[2]) for plane in planes]
-    least = least_level_area(planes, areas)
-    large = sorted((i for i in range(len(planes)) if slope[i] > LEVEL and size[i] >= least), key=lambda i: height[i][0])
-    for i in large:
-        below = [j for j in large if found[j] != "other" and _overlap(shadow[i], shadow[j])]
-        top = max(below, key=lambda j: height[j][0], default=None)
-        if top is None:
-            found[i] = "floor" if height[i][0] < middle_m else "ceiling"
-        elif found[top] == "floor" and height[i][0] - height[top][0] > STOREY_M:
-            found[i] = "ceiling"
-        elif found[top] == "ceiling":
-            found[i] = "floor" if height[i][0] - height[top][0] < SLAB_M else "ceiling"
-    floors = [i for i in large if found[i] == "floor"]
-    for i in range(len(planes)):
-        if UPRIGHT < slope[i] <= LEVEL and size[i] >= least:
-            under = [height[j][1] for j in floors if height[j][1] < height[i][1] and _overlap(shadow[i], shadow[j])]
-            if height[i][1] > max(under, default=middle_m) + STOREY_M:
-                found[i] = "ceiling"
 
-    def is_wall(i: int) -> bool:
-        middle = planes[i].lift(np.array(areas[i].centroid.coords[0]))
-        near = [j for j in range(len(planes)) if found[j] != "other" and shapely.intersects(shadow[i], shadow[j])]
-        # Heights of floors and ceilings where the wall stands: a ceiling may slope.
-        level = {j: (planes[j].offset_m - planes[j].normal[:2] @ middle[:2]) / planes[j].normal[2] for j in near}
-        floors = [level[j] for j in near if found[j] == "floor" and level[j] < middle[2]]
-        ceilings = [level[j] for j in near if found[j] == "ceiling" and level[j] > middle[2]]
-        least = WALL_SHARE * (min(ceilings) - max(floors)) if floors and ceilings else WALL_HEIGHT_M
-        u0, _, u1, _ = areas[i].bounds
-        return bool(height[i][1] - height[i][0] >= least and u1 - u0 >= NARROWEST_WALL_M)
+    plane: Plane
+    area: Any
 
-    for i in [i for i in range(len(planes)) if slope[i] <= UPRIGHT and is_wall(i)]:
-        found[i] = "wall"
-    return found
+    @property
+    def slope(self) -> float:
+        """Cosine of the angle between the normal and the vertical."""
+        return float(abs(self.plane.normal[2]))
+
+    @cached_property
+    def shadow(self) -> Any:
+        """The area seen from above (shapely, world x and y); a thin strip where the plane is upright."""
+        flat = shapely.transform(self.area, lambda uv: self.plane.lift(uv)[:, :2])
+        return shapely.buffer(shapely.convex_hull(flat), 0.1)
+
+    @cached_property
+    def span_m(self) -> tuple[float, float]:
+        """Lowest and highest z."""
+        z = self.plane.lift(shapely.get_coordinates(self.area))[:, 2]
+        return float(z.min()), float(z.max())
+
+    def overlaps(self, other: Face) -> bool:
+        """Whether one of both faces lies above or below the other."""
+        common = shapely.intersection(self.shadow, other.shadow).area
+        return bool(common > 0.3 * min(self.shadow.area, other.shadow.area))
 
 
-def least_level_area(planes: Sequence[Plane], areas: Sequence[Any]) -> float:
+def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
+    """The role of each face.
+
+    Level faces that are large are floors and ceilings in turn from the lowest up, at least `STOREY_M` apart; steeper
+    large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls. The median
+    height of the points, ``middle_m``, separates floors from ceilings where there is only one of them.
+    """
+    least = least_level_area(faces)
+    large = sorted((face for face in faces if face.area.area >= least), key=lambda face: face.span_m[0])
+    roles = dict[Face, Kind]()
+    for face in large:
+        if face.slope > LEVEL and (role := _level_role(face, roles, middle_m)):
+            roles[face] = role
+    floors = [face for face, role in roles.items() if role == "floor"]
+    for face in large:
+        if UPRIGHT < face.slope <= LEVEL and _is_sloping_ceiling(face, floors, middle_m):
+            roles[face] = "ceiling"
+    walls = [face for face in faces if face.slope <= UPRIGHT and _is_wall(face, roles)]
+    for face in walls:
+        roles[face] = "wall"
+    return [roles.get(face, "other") for face in faces]
+
+
+def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> Kind | None:
+    """Role of a level face above those that have one; None: it is a table, or a second layer."""
+    low = face.span_m[0]
+    top = max((other for other in roles if face.overlaps(other)), key=lambda other: other.span_m[0], default=None)
+    if top is None:
+        return "floor" if low < middle_m else "ceiling"
+    if roles[top] == "floor":
+        return "ceiling" if low - top.span_m[0] > STOREY_M else None
+    return "floor" if low - top.span_m[0] < SLAB_M else "ceiling"
+
+
+def _is_sloping_ceiling(face: Face, floors: Sequence[Face], middle_m: float) -> bool:
+    top = face.span_m[1]
+    under = [floor.span_m[1] for floor in floors if floor.span_m[1] < top and face.overlaps(floor)]
+    return top > max(under, default=middle_m) + STOREY_M
+
+
+def _is_wall(face: Face, roles: Mapping[Face, Kind]) -> bool:
+    """Whether an upright face spans most of the height between floor and ceiling where it stands."""
+    x, y, z = face.plane.lift(np.array(face.area.centroid.coords[0]))
+    heights = {"floor": list[float](), "ceiling": list[float]()}
+    for other, role in roles.items():
+        if shapely.intersects(face.shadow, other.shadow):
+            # The height there: a ceiling may slope.
+            heights[role].append((other.plane.offset_m - other.plane.normal[:2] @ (x, y)) / other.plane.normal[2])
+    floor = max((height for height in heights["floor"] if height < z), default=-np.inf)
+    ceiling = min((height for height in heights["ceiling"] if height > z), default=np.inf)
+    least = WALL_SHARE * (ceiling - floor) if np.isfinite(ceiling - floor) else WALL_HEIGHT_M
+    u0, _, u1, _ = face.area.bounds
+    return bool(np.ptp(face.span_m) >= least and u1 - u0 >= NARROWEST_WALL_M)
+
+
+def least_level_area(faces: Sequence[Face]) -> float:
     """Least area of floors and ceilings, square metres."""
-    level = (area.area for plane, area in zip(planes, areas, strict=True) if abs(plane.normal[2]) > LEVEL)
-    return min(LARGE_M2, LARGE_SHARE * max(level, default=0.0))
-
-
-def footprint(plane: Plane, area: Any) -> Any:
-    """The area seen from above (shapely, world x and y); a thin strip where the plane is upright."""
-    flat = shapely.transform(area, lambda uv: plane.lift(uv)[:, :2])
-    return shapely.buffer(shapely.convex_hull(flat), 0.1)
-
-
-def span(plane: Plane, area: Any) -> tuple[float, float]:
-    """Lowest and highest point of an area, metres."""
-    z = plane.lift(shapely.get_coordinates(area))[:, 2]
-    return float(z.min()), float(z.max())
-
-
-def _overlap(a: Any, b: Any) -> bool:
-    return bool(shapely.intersection(a, b).area > 0.3 * min(a.area, b.area))
+    return min(LARGE_M2, LARGE_SHARE * max((face.area.area for face in faces if face.slope > LEVEL), default=0.0))

@@ -12,7 +12,7 @@ import shapely
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .classify import kinds
+from .classify import Face, kinds
 from .layers import layers
 from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
@@ -56,8 +56,8 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     cloud = thin(points)
     planes, noise = find_planes(cloud)
     points = points.astype(np.float32)
-    kept: list[Plane] = []
-    areas, reach, niches = [], [], dict[int, Any]()
+    # Planes, areas, and ways within which corners are closed; recesses by the number of their wall.
+    pieces, niches = list[tuple[Plane, Any, float]](), dict[int, Any]()
     # A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
     free = np.ones(len(points), bool)
     for stated in _refined(planes, points, noise):
@@ -66,9 +66,7 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
         for layer in parallel:
             area, cell = outline(layer.plane, points[layer.rows])
             if area.area >= SMALLEST_M2:
-                kept.append(layer.plane)
-                areas.append(area)
-                reach.append(3 * noise + cell)
+                pieces.append((layer.plane, area, 3 * noise + cell))
                 free[layer.rows] = False
                 behind += [] if layer.before else [area]
         mine = near(plane, points, 2 * noise) & free
@@ -82,14 +80,13 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
         inside, beside = np.count_nonzero(away < 2 * noise) / 2, np.count_nonzero(away > 3 * noise) / 3
         if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
             if behind:
-                niches[len(kept)] = shapely.union_all(behind)
-            kept.append(plane)
-            areas.append(area)
-            reach.append(3 * noise + cell)
+                niches[len(pieces)] = shapely.union_all(behind)
+            pieces.append((plane, area, 3 * noise + cell))
             free &= ~over(plane, area, points, BAND * noise)
-    if not kept:
+    if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
-    roles = kinds(kept, areas, float(np.median(cloud.points_m[:, 2])))
+    kept, areas, reach = (list(column) for column in zip(*pieces, strict=True))
+    roles = kinds([Face(plane, area) for plane, area, _ in pieces], float(np.median(cloud.points_m[:, 2])))
     reach = [width if kind == "other" else max(width, REACH_M) for width, kind in zip(reach, roles, strict=True)]
     areas = join(kept, areas, reach)
     things = np.ones(len(cloud.points_m), bool)

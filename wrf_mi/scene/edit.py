@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -14,10 +15,16 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .edit_checks import check_moves
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
-from .surfaces import KINDS, Kind, Surface, mesh_parts, moved
+from .surfaces import KINDS, Kind, Surface, box_of, mesh_parts, moved
+
+logger = logging.getLogger(__name__)
+
+TOUCH_M = 0.01
+"""Depth up to which parts touch: surfaces of scans stand up to a centimetre in each other."""
+PAIRS_PER_CHUNK = 1 << 18
+"""Pairs of edge and triangle that are tried together: some 50 MB."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +73,6 @@ def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
         kind = next((kind for kind in KINDS if entry == kind or name.startswith(kind)), "other")
         surfaces.append(Surface(name, cast(Kind, kind), np.asarray(mesh.vertices), np.asarray(mesh.faces)))
     return surfaces, scene.materials
-
-
-def box_of(surfaces: Sequence[Surface]) -> FloatArray:
-    """Lower and upper corner [2, 3] of the box around surfaces, metres."""
-    corners = np.concatenate([surface.vertices_m for surface in surfaces])
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
 def parts_within(folder: str | Path, low_m: ArrayLike, high_m: ArrayLike) -> tuple[str, ...]:
@@ -131,7 +132,7 @@ def edit_scene(
         surfaces = [moved([one], matrix)[0] if one.name in names else one for one in surfaces]
         moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
-    check_moves(stated, left, moved_names)
+    _check_moves(stated, left, moved_names)
     kept = {surface.name: materials.surfaces[surface.name] for surface in left}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
@@ -156,3 +157,60 @@ def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[
             raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
         found |= names
     return found
+
+
+def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[str]) -> None:
+    """Refuse a moved part that is wholly outside of the scene, and warn of one partly out of it, or in others."""
+    parts, others = ([one for one in after if (one.name in names) == chosen] for chosen in (True, False))
+    if not parts or not others:
+        return  # a scene that is moved as a whole has no inside
+    earlier = {one.name: one for one in before}
+    low, high = box_of(before)
+    for part in parts:
+        first, last = box_of([part])
+        outside_m = float(np.maximum(low - first, last - high).max())
+        gap_m = float(np.maximum(low - last, first - high).max())
+        # An outer wall may be moved outwards, which enlarges the room, but not farther than the room is large.
+        if gap_m > (0 if part.kind == "other" else (high - low).max()):
+            text = f"moved out of the scene, {gap_m:.2f} m beyond it; give a smaller displacement, or --remove"
+            raise InputError(f"move {part.name}: {text}")
+        if outside_m > TOUCH_M:
+            logger.warning("move %s: reaches %.2f m out of the scene", part.name, outside_m)
+        for other in others:
+            depth_m = _crossing_depth(part, other)
+            if depth_m > TOUCH_M and depth_m > _crossing_depth(earlier[part.name], other) + TOUCH_M:
+                logger.warning("move %s: reaches %.2f m through %s", part.name, depth_m, other.name)
+
+
+def _crossing_depth(part: Surface, other: Surface) -> float:
+    """How far a surface reaches through another one, metres; 0: it does not, or the two touch.
+
+    Of an edge that is cut, the shorter piece counts; of all such edges of a surface, the longest.
+    """
+    triangles, cut = part.vertices_m[part.faces], other.vertices_m[other.faces]
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    # Where surfaces touch, edges lie in faces and rounding decides what is cut: a smaller part touches nothing.
+    smaller = np.clip(triangles, np.minimum(low + TOUCH_M, high), np.maximum(high - TOUCH_M, low))
+    cut = cut[((cut.max(axis=1) >= low) & (cut.min(axis=1) <= high)).all(axis=1)]  # others are out of reach
+    if not any((_depth(smaller, cut), _depth(cut, smaller))):
+        return 0.0
+    # Of edges of the part and of the other, the shorter way back counts.
+    return min((depth for depth in (_depth(triangles, cut), _depth(cut, triangles)) if depth), default=0.0)
+
+
+def _depth(triangles: FloatArray, cut: FloatArray) -> float:
+    """The depth of `_crossing_depth` by the edges of triangles [n, 3, 3] that other triangles [m, 3, 3] are cut by."""
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    normal, proper = trimesh.triangles.normals(cut)  # of triangles with an area alone
+    cut = cut[proper]
+    depth, step = 0.0, max(1, PAIRS_PER_CHUNK // max(len(cut), 1))
+    for first in range(0, len(starts), step):
+        start, end = starts[first : first + step, None], ends[first : first + step, None]
+        # Signed distances [edges, triangles] of both ends from the planes.
+        before, after = (((point - cut[:, 0]) * normal).sum(axis=-1) for point in (start, end))
+        edge, triangle = np.nonzero(before * after < 0)
+        d = before[edge, triangle], after[edge, triangle]
+        met = start[edge, 0] + (d[0] / (d[0] - d[1]))[:, None] * (end - start)[edge, 0]
+        within = (trimesh.triangles.points_to_barycentric(cut[triangle], met) >= 0).all(axis=1)
+        depth = max(depth, float(np.minimum(np.abs(d[0]), np.abs(d[1]))[within].max(initial=0.0)))
+    return depth

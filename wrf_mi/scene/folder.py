@@ -16,19 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import yaml
 from defusedxml.common import DefusedXmlException
 from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, inside, one_line, write_atomically
+from ..core.files import atomic_folder, inside, one_line, write_atomically, write_figure
 from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
-from .surfaces import Surface
+from .surfaces import Surface, box_of
 from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)
@@ -84,7 +83,7 @@ def write_scene(
         InputError: the folder exists or cannot be written, there is no surface, one is too far from the origin, or
             ``materials`` names an unknown surface.
     """
-    from .preview import draw_preview  # matplotlib takes a second, and reading a scene does without
+    from .preview import draw_scene  # matplotlib takes a second, and reading a scene does without
 
     folder = Path(folder)
     if not surfaces:
@@ -95,7 +94,7 @@ def write_scene(
     given = materials or Materials()
     if unknown := [name for name in given.surfaces if name not in names]:
         raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
-    require_near(np.concatenate([surface.vertices_m for surface in surfaces]), source)
+    require_near(box_of(surfaces), source)
     full = given.complete({surface.name: surface.kind for surface in surfaces})
     matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
@@ -115,12 +114,11 @@ def write_scene(
     with atomic_folder(folder, replace=replace) as part:
         (part / "meshes").mkdir()
         for surface in surfaces:
-            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-            mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
+            surface.mesh.export(part / "meshes" / f"{surface.name}.ply", vertex_normal=False)
         write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
-        draw_preview(surfaces, part / PREVIEW_FILE, points=points_m)
+        write_figure(part / PREVIEW_FILE, draw_scene(surfaces, points_m=points_m))
     return folder
 
 

@@ -80,28 +80,10 @@ class Rectangle:
         # On a grid: of outlines that are equal but for rounding, GEOS may else find no intersection.
         return bool(shapely.intersection(*flat, grid_size=GRID_M).area > COVERED * flat[0].area)
 
-    def surface(self) -> Surface:
-        """The face as a surface."""
-        return Surface(self.name, "other", self.corners, np.array([[0, 1, 2], [0, 2, 3]]))
-
-
-@dataclass(frozen=True)
-class Box:
-    """An upright box: corners of its base [4, 2] in the order of the outline, and lowest and highest z, metres."""
-
-    base: FloatArray
-    low: float
-    high: float
-
-    def faces(self) -> Iterator[Rectangle]:
-        """Its sides and its top."""
-        middle = np.append(self.base.mean(axis=0), (self.low + self.high) / 2)
-        along, across = (np.append((self.base[k + 1] - self.base[k]) / 2, 0.0) for k in (0, 1))
-        up = np.array([0.0, 0.0, (self.high - self.low) / 2])
-        for side, other in ((along, across), (across, along)):
-            yield Rectangle(middle - other, np.stack([side, up]))
-            yield Rectangle(middle + other, np.stack([side, up]))
-        yield Rectangle(middle + up, np.stack([along, across]))
+    @property
+    def heights_m(self) -> FloatArray:
+        """Lowest and highest z [2] of a side, whose second half side is upright."""
+        return np.asarray(self.centre[2] + self.sides[1, 2] * np.array([-1, 1]))
 
 
 class Boxes(NamedTuple):
@@ -153,19 +135,31 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
     taken = {surface.name for surface in surfaces}
     names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in taken)
     hidden, members = list[Rectangle](), dict[frozenset[str], None]()
-    for box in _boxes(furniture):
-        sizes = np.linalg.norm(box.base[1:3] - box.base[:2], axis=1)
-        if min(*sizes, box.high - box.low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
+    for base, low, high in _boxes(furniture):
+        sizes = np.linalg.norm(base[1:3] - base[:2], axis=1)
+        if min(*sizes, high - low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
             continue
         own = set[str]()
-        for face in box.faces():
+        for face in _faces_of_box(base, low, high):
             there = [other.name for other in (*furniture, *hidden) if face.covered_by(other)]
             if not there and not any(map(face.covered_by, around)):
                 hidden.append(replace(face, name=next(names)))
                 there = [hidden[-1].name]
             own.update(there)
         members[frozenset(own)] = None
-    return Boxes([face.surface() for face in hidden], list(members))
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    return Boxes([Surface(face.name, "other", face.corners, halves) for face in hidden], list(members))
+
+
+def _faces_of_box(base: FloatArray, low: float, high: float) -> Iterator[Rectangle]:
+    """Sides and top of an upright box: corners of its base [4, 2] in the order of the outline, lowest and highest z."""
+    middle = np.append(base.mean(axis=0), (low + high) / 2)
+    along, across = (np.append((base[k + 1] - base[k]) / 2, 0.0) for k in (0, 1))
+    up = np.array([0.0, 0.0, (high - low) / 2])
+    for side, other in ((along, across), (across, along)):
+        yield Rectangle(middle - other, np.stack([side, up]))
+        yield Rectangle(middle + other, np.stack([side, up]))
+    yield Rectangle(middle + up, np.stack([along, across]))
 
 
 def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
@@ -196,44 +190,39 @@ def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
                 yield Rectangle(centre + (low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes, surface.name)
 
 
-def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
-    """Boxes of which two faces are known."""
+def _boxes(faces: Sequence[Rectangle]) -> Iterator[tuple[FloatArray, float, float]]:
+    """Base [4, 2], lowest and highest z of the boxes of which two faces are known."""
     sides = [face for face in faces if abs(face.normal[2]) < 0.5]
-    tops = [face for face in faces if abs(face.normal[2]) > 0.5]
-    for top in tops:
+    for top in (face for face in faces if abs(face.normal[2]) > 0.5):
         for side in sides:
-            if (low := _below(top, side)) is not None:
-                yield Box(top.corners[:, :2], low, float(top.centre[2]))
+            if _is_below(top, side):
+                yield top.corners[:, :2], side.heights_m[0], top.centre[2]
     for one, other in combinations(sides, 2):
         base = _corner(one, other)
         base = _between(one, other) if base is None else base
         if base is not None:
-            heights = np.array([face.centre[2] + s * face.sides[1, 2] for face in (one, other) for s in (-1, 1)])
-            yield Box(base, float(heights.min()), float(heights.max()))
+            heights = np.concatenate([one.heights_m, other.heights_m])
+            yield base, heights.min(), heights.max()
 
 
-def _below(top: Rectangle, side: Rectangle) -> float | None:
-    """Lowest z of a side that stands below an edge of a top; None: it does not."""
+def _is_below(top: Rectangle, side: Rectangle) -> bool:
+    """Whether a side stands below an edge of a top."""
     for edge, half in ((top.sides[0], top.sides[1]), (top.sides[1], top.sides[0])):
         for sign in (-1, 1):
-            middle, length = top.centre + sign * half, np.linalg.norm(edge)
-            away = side.centre + side.sides[1] - middle
-            along = edge / length
-            parallel = abs(side.normal @ along) < UPRIGHT
+            length = np.linalg.norm(edge)
+            along, away = edge / length, side.centre + side.sides[1] - (top.centre + sign * half)
             near = abs(away @ half) / np.linalg.norm(half) < TOUCH_M and abs(away[2]) < TOUCH_M
-            if parallel and near and abs(away @ along) < length:
-                return float(side.centre[2] - side.sides[1, 2])
-    return None
+            if abs(side.normal @ along) < UPRIGHT and near and abs(away @ along) < length:
+                return True
+    return False
 
 
 def _corner(one: Rectangle, other: Rectangle) -> FloatArray | None:
     """Base [4, 2] of the box of two sides that meet; None: they do not, or not at right angles."""
     if abs(one.normal @ other.normal) > UPRIGHT:
         return None
-    overlap = min(one.centre[2] + one.sides[1, 2], other.centre[2] + other.sides[1, 2]) - max(
-        one.centre[2] - one.sides[1, 2], other.centre[2] - other.sides[1, 2]
-    )
-    if overlap < LEAST_SIDE_M:
+    (low, high), (other_low, other_high) = one.heights_m, other.heights_m
+    if min(high, other_high) - max(low, other_low) < LEAST_SIDE_M:
         return None
     a, b = one.sides[0, :2], other.sides[0, :2]
     for s in (-1, 1):

@@ -14,12 +14,17 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
+from .cloud import surfaces_from_points
 from .coordinates import Up, require_fine, require_near, up_of, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
+from .mesh import SUFFIXES, planes_of_mesh, read_mesh
+from .plan import layout_walls, plan_surfaces
 from .plan_sources import PlanGrid, Row0, read_layout, read_plan
-from .points import check_extent, lidar_package, read_points
+from .points import check_extent, read_points
 from .polygon_files import FACES, LONGEST_HEADER, ply_header
+from .positions import check_positions, read_positions, reflections
+from .register import register_walls, wall_points
 from .surfaces import Surface, moved, sampled
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
@@ -104,17 +109,10 @@ def make_scene(
         rotation = matrix[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
             raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
-    for name in ("shapely", "mapbox_earcut"):
-        lidar_package(name)
     if origin_m is not None and (len(origin_m) != 3 or not np.isfinite(origin_m).all()):
         raise InputError(f"{file}: origin {tuple(origin_m)}: give three finite numbers of metres, x, y and z")
     if up not in (None, "y", "z"):
         raise InputError(f"{file}: {up!r} is up: give y or z")
-    from .cloud import surfaces_from_points
-    from .plan import layout_walls
-    from .positions import check_positions, read_positions, reflections
-    from .register import register_walls, wall_points
-
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     surfaces, points, grid = _read(file, units, up, height_m, floor_m, resolution_m, row_0)
@@ -124,7 +122,7 @@ def make_scene(
             require_near(trimesh.transform_points(points, shift), file)  # before minutes are spent on its planes
         surfaces = surfaces_from_points(points)
     if known_walls is not None:
-        matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file)).matrix
+        matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
     sample, counts = None, {}
@@ -162,9 +160,6 @@ def _read(
     row_0: Row0 | None,
 ) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
     """The surfaces of a plan or mesh, the points of a scan, and the cells of an occupancy grid."""
-    from .mesh import planes_of_mesh, read_mesh
-    from .plan import plan_surfaces
-
     if is_plan(file):
         if file.suffix.lower() == ".csv" and _has_heights(file):
             text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
@@ -229,8 +224,6 @@ def _has_heights(file: Path) -> bool:
 
 def has_faces(file: Path) -> bool:
     """Whether a file is a mesh and not a cloud; PLY may be either."""
-    from .mesh import SUFFIXES
-
     suffix = file.suffix.lower()
     if suffix != ".ply" or not file.is_file():
         return suffix in SUFFIXES and file.is_file()

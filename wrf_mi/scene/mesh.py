@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -14,7 +13,7 @@ import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from .classify import STOREY_M, UPRIGHT, WALL_SHARE, footprint, kinds, least_level_area, span
+from .classify import STOREY_M, UPRIGHT, WALL_SHARE, Face, kinds, least_level_area
 from .coordinates import Up, require_precise
 from .planes import THICKEST_M, Plane, with_axes
 from .points import FORMATS, UNITS_M, check_extent, source_file
@@ -56,12 +55,10 @@ class _Body:
         return np.stack([self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))])
 
 
-@dataclass(frozen=True)
-class _Facet:
-    """A flat part of a body, with the body's number."""
+@dataclass(frozen=True, eq=False)
+class _Facet(Face):
+    """A flat part of a body, with its triangles and the body's number."""
 
-    plane: Plane
-    area: Any
     corners_m: FloatArray
     body: int
 
@@ -139,8 +136,7 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
         return list(surfaces)
     heights = np.concatenate([facet.corners_m[..., 2].ravel() for facet in facets])
     middle = float(heights.min() + heights.max()) / 2
-    planes, areas = [facet.plane for facet in facets], [facet.area for facet in facets]
-    roles = _both_faces(planes, areas, kinds(planes, areas, middle))
+    roles = _both_faces(facets, kinds(facets, middle))
     if set(roles) == {"other"}:
         return list(surfaces)
     parts: list[tuple[Kind, FloatArray]] = []
@@ -232,19 +228,18 @@ def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:
     return bool(inside and np.prod(np.ptp(inner_m, axis=0)) < 0.99 * np.prod(np.ptp(outer_m, axis=0)))
 
 
-def _both_faces(planes: Sequence[Plane], areas: Sequence[Any], roles: Sequence[Kind]) -> list[Kind]:
+def _both_faces(faces: Sequence[Face], roles: Sequence[Kind]) -> list[Kind]:
     """Roles with both faces of a floor or roof given the same role; a scan sees only one face."""
     found = list(roles)
-    shadow = [footprint(plane, area) for plane, area in zip(planes, areas, strict=True)]
-    height = [float(np.mean(span(plane, area))) for plane, area in zip(planes, areas, strict=True)]
-    level = [i for i, plane in enumerate(planes) if abs(plane.normal[2]) > PARALLEL]
-    least = least_level_area([planes[i] for i in level], [areas[i] for i in level])
+    height = [float(np.mean(face.span_m)) for face in faces]
+    level = [i for i, face in enumerate(faces) if face.slope > PARALLEL]
+    least = least_level_area([faces[i] for i in level])
     for i in level:
-        if areas[i].area < least:
+        if faces[i].area.area < least:
             continue
         for j in level:
-            apart, both = abs(height[i] - height[j]), shapely.intersection(shadow[i], shadow[j]).area
-            if i == j or apart > LAYERS_M or both < 0.5 * min(shadow[i].area, shadow[j].area):
+            apart, shadows = abs(height[i] - height[j]), (faces[i].shadow, faces[j].shadow)
+            if i == j or apart > LAYERS_M or shapely.intersection(*shadows).area < 0.5 * min(s.area for s in shadows):
                 continue
             roof = roles[i] == "floor" and roles[j] == "ceiling" and height[i] > height[j]
             above = any(roles[k] == "ceiling" and height[k] > height[i] + STOREY_M for k in level)

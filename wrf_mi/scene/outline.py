@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 from shapely import affinity
@@ -186,9 +185,10 @@ def _transformed(area: Any, matrix: FloatArray, shift: FloatArray) -> Any:
 
 def triangulated(area: Any) -> tuple[FloatArray, IntArray]:
     """Vertices [v, 2] and faces [f, 3] that fill an area (shapely)."""
-    parts = [trimesh.creation.triangulate_polygon(part, engine="earcut") for part in polygons(area)]
-    vertices, faces = trimesh.util.append_faces(*zip(*parts, strict=True))
-    return np.asarray(vertices, float), np.asarray(faces, np.int64)
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(shapely.multipolygons(polygons(area))))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]  # of a ring, whose last is its first
+    vertices, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    return vertices, faces.reshape(-1, 3)
 
 
 def large_parts(mask: Mask, cells: float, structure: NDArray[Any] | None = None) -> Mask:

@@ -35,11 +35,11 @@ def layout_walls(vertices_m: FloatArray) -> FloatArray:
     return np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in paths])
 
 
-def floor_of(walls_m: FloatArray, name: str = "plan") -> BaseGeometry:
+def floor_of(walls_m: FloatArray) -> BaseGeometry:
     """The area (shapely) that walls [n, 2, 2] enclose, openings between them closed; outlines without inner yards.
 
     Raises:
-        InputError: they enclose nothing; the message begins with ``name``.
+        InputError: they enclose nothing.
     """
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
@@ -51,7 +51,7 @@ def floor_of(walls_m: FloatArray, name: str = "plan") -> BaseGeometry:
         covered = shapely.length(shapely.intersection(lines, shapely.buffer(area, EDGE_M)))
         if area.area >= SMALLEST_FLOOR_M2 and covered >= COVERED * lines.length:
             return shapely.simplify(area, EDGE_M / 2)
-    raise InputError(f"{name}: the {len(walls_m)} walls found enclose no floor; give a plan that shows whole rooms")
+    raise InputError(f"the {len(walls_m)} walls found enclose no floor; give a plan that shows whole rooms")
 
 
 def _filled(area: BaseGeometry) -> BaseGeometry:
@@ -60,23 +60,21 @@ def _filled(area: BaseGeometry) -> BaseGeometry:
     return shapely.unary_union(outlines) if outlines else Polygon()
 
 
-def walls_of_plan(
-    source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None, name: str = "plan"
-) -> FloatArray:
+def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None) -> FloatArray:
     """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres.
 
     Points whose scans are known by their times are aligned with one another first, and free space is found from the
     places of the sensor (`wrf_mi.scene.plan_align`).
 
     Raises:
-        InputError: no wall; the message begins with ``name``.
+        InputError: no wall.
     """
     if isinstance(source, PlanPoints):
         if source.time_s is None:
-            source = grid_from_points(source.xy_m, resolution_m, name)
+            source = grid_from_points(source.xy_m, resolution_m)
         else:
-            source = grid_from_scans(source.xy_m, source.time_s, name)
-    return find_walls(source, name) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
+            source = grid_from_scans(source.xy_m, source.time_s)
+    return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
 
 
 def plan_surfaces(
@@ -104,8 +102,11 @@ def plan_surfaces(
     """
     if not (np.isfinite(height_m) and height_m > 0 and np.isfinite(floor_m)):
         raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--height, metres)")
-    walls_m = walls_of_plan(source, resolution_m, name)
-    flat, faces = triangulated(floor_of(walls_m, name))
+    try:
+        walls_m = walls_of_plan(source, resolution_m)
+        flat, faces = triangulated(floor_of(walls_m))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
     top_m = floor_m + height_m
     parts: list[tuple[Kind, FloatArray, IntArray]] = [
         ("floor", _at(flat, floor_m), faces),

@@ -112,24 +112,23 @@ class _Canvas:
         return pose, mean
 
 
-def grid_from_scans(xy_m: FloatArray, time_s: FloatArray, name: str = "scans") -> PlanGrid:
+def grid_from_scans(xy_m: FloatArray, time_s: FloatArray) -> PlanGrid:
     """A map in cells of `POINT_CELL_M`: cells that were hit, and cells that beams went through.
 
     Args:
         xy_m: returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres.
         time_s: time of each return's scan, shape [n].
-        name: name of the source, for errors.
 
     Raises:
         InputError: as `wrf_mi.scene.plan_sources.grid_from_points`.
     """
-    grid_from_points(xy_m, None, name)  # raises before the search
+    grid_from_points(xy_m)  # raises before the search
     canvas = _Canvas(xy_m)
     stops = _stops(xy_m, time_s, canvas)
     _place(stops, canvas)
     for _ in range(ROUNDS):
         _refine(stops, canvas)
-    return _voted(stops, name)
+    return _voted(stops)
 
 
 def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]:
@@ -223,10 +222,10 @@ def _refine(stops: list[_Stop], canvas: _Canvas) -> None:
         count = count + canvas.image(stop.moved(stop.points))
 
 
-def _voted(stops: list[_Stop], name: str) -> PlanGrid:
+def _voted(stops: list[_Stop]) -> PlanGrid:
     """A cell is occupied if at least half as many stops hit it as look through it, else free if any looks through."""
     clouds = [stop.moved(stop.points) for stop in stops]
-    grid = grid_from_points(np.concatenate(clouds), None, name)
+    grid = grid_from_points(np.concatenate(clouds))
     hits, passes = np.zeros(grid.occupied.shape, int), np.zeros(grid.occupied.shape, int)
     for stop, cloud in zip(stops, clouds, strict=True):
         column, row = ((cloud - grid.origin_m) / grid.resolution_m).astype(int).T

@@ -94,7 +94,7 @@ def grid_from_probability(
     return PlanGrid(occupied, free, float(resolution_m), np.asarray(origin_m, float))
 
 
-def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: str = "points") -> PlanGrid:
+def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> PlanGrid:
     """A grid of the cells that hold points [n, 2]; none is free, since points do not show which cells are empty.
 
     Raises:
@@ -102,10 +102,10 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: s
     """
     xy = np.asarray(xy_m, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
-        raise InputError(f"{name}: points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
+        raise InputError(f"points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
     if not np.isfinite(xy).all():
         bad = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
-        raise InputError(f"{name}: point {bad} is not finite; remove such points")
+        raise InputError(f"point {bad} is not finite; remove such points")
     cell = POINT_CELL_M if resolution_m is None else float(resolution_m)
     # An empty rim keeps every window of the search inside.
     low = (np.floor(xy.min(axis=0) / cell) - 2) * cell
@@ -113,7 +113,7 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None, name: s
     if rows * columns > LARGEST_GRID_CELLS:
         size = np.ptp(xy, axis=0)
         raise InputError(
-            f"{name}: {size[0]:.0f} m x {size[1]:.0f} m in cells of {cell} m are too many; are the units metres? "
+            f"{size[0]:.0f} m x {size[1]:.0f} m in cells of {cell} m are too many; are the units metres? "
             "Remove stray points or give a coarser resolution"
         )
     occupied = np.zeros((rows, columns), bool)

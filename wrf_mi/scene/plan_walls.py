@@ -57,13 +57,13 @@ FREE_SHARE = 0.1
 """Largest share of a stretch with free cells that is attributed to noise."""
 
 
-def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
+def find_walls(grid: PlanGrid) -> FloatArray:
     """Straight walls of a plan: end points [n, 2, 2] in metres, the longest wall first.
 
     Walls along and across the main direction are taken first; the remaining cells may show further directions.
 
     Raises:
-        InputError: no wall was found; the message begins with ``name``.
+        InputError: no wall was found.
     """
     grid = without_specks(grid)
     left, found = grid, []
@@ -87,7 +87,7 @@ def find_walls(grid: PlanGrid, name: str = "plan") -> FloatArray:
         occupied[row[near], column[near]] = False
         left = without_specks(replace(left, occupied=occupied))
     if not found:
-        raise InputError(f"{name}: no straight wall was found; is the resolution right, and is it a plan of walls?")
+        raise InputError("no straight wall was found; is the resolution right, and is it a plan of walls?")
     walls_m = _without_clutter(joined(np.array(found)))
     return walls_m[np.argsort(-np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=-1), kind="stable")]
 

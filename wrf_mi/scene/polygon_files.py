@@ -8,7 +8,7 @@ faces or continued lines; plyfile has the GPL.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,7 +136,7 @@ class PlyElement:
 
     name: str
     count: int
-    properties: Sequence[tuple[str, str, str | None]]
+    properties: list[tuple[str, str, str | None]]
 
 
 def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
@@ -158,9 +158,9 @@ def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
             case ["element", name, count] if count.isdecimal():
                 elements.append(PlyElement(name, int(count), []))
             case ["property", "list", count, kind, name] if elements and {count, kind} <= set(PLY_TYPES):
-                elements[-1] = _with(elements[-1], (name, PLY_TYPES[kind], PLY_TYPES[count]))
+                elements[-1].properties.append((name, PLY_TYPES[kind], PLY_TYPES[count]))
             case ["property", kind, name] if elements and kind in PLY_TYPES:
-                elements[-1] = _with(elements[-1], (name, PLY_TYPES[kind], None))
+                elements[-1].properties.append((name, PLY_TYPES[kind], None))
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -168,10 +168,6 @@ def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
     if order is None:
         raise ValueError("no known format in the header")
     return elements, order, end.end()
-
-
-def _with(element: PlyElement, stated: tuple[str, str, str | None]) -> PlyElement:
-    return PlyElement(element.name, element.count, [*element.properties, stated])
 
 
 def read_ply(path: Path) -> Polygons:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-import trimesh
 from scipy import sparse
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import cKDTree
@@ -24,7 +23,7 @@ from ..core.angles import FloatArray
 from ..datasets.folder_files import read_csv
 from .plan_sources import PlanGrid
 from .register import best_motion, wall_points
-from .surfaces import Surface, moved
+from .surfaces import Surface, box_of, cut_lines, moved
 
 logger = logging.getLogger(__name__)
 
@@ -80,15 +79,13 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
         raise InputError("the scene has no wall that positions could cross; leave out --positions")
     places = distinct(positions_m)
     lines = shapely.linestrings(_tree(places))
-    heights, z_m = np.concatenate([wall.vertices_m[:, 2] for wall in walls]), positions_m[:, 2]
-    cut_m = min(surface.vertices_m[:, 2].min() for surface in surfaces) + WALKING_HEIGHT_M
+    (low_m, high_m), z_m = box_of(walls)[:, 2], positions_m[:, 2]
+    cut_m = box_of(surfaces)[0, 2] + WALKING_HEIGHT_M
     if np.isfinite(z_m).all():
-        cut_m = float(np.median(z_m))
-    margin = EDGE_SHARE * np.ptp(heights)
-    level_m = (0, 0, float(np.clip(cut_m, heights.min() + margin, heights.max() - margin)))
-    meshes = [trimesh.Trimesh(wall.vertices_m, wall.faces, process=False) for wall in walls]
-    pieces = np.concatenate([trimesh.intersections.mesh_plane(mesh, (0, 0, 1), level_m) for mesh in meshes])
-    cut = shapely.STRtree(shapely.linestrings(pieces[..., :2]))
+        cut_m = np.median(z_m)
+    margin = EDGE_SHARE * (high_m - low_m)
+    level_m = float(np.clip(cut_m, low_m + margin, high_m - margin))
+    cut = shapely.STRtree(shapely.linestrings(np.concatenate([cut_lines(wall, level_m) for wall in walls])))
     crossings = len(np.unique(cut.query(lines, predicate="intersects")[0]))
     level = [surface for surface in surfaces if surface.kind in ("floor", "ceiling")]
     if not level:
@@ -150,8 +147,7 @@ def reflections(
             remedies = ("flip the picture left to right", "flip the picture upside down")
         flips = [(axis, float(totals[axis]), remedies[axis]) for axis in (1, 0)]
     else:
-        vertices = np.concatenate([surface.vertices_m for surface in surfaces])
-        totals = vertices.min(axis=0) + vertices.max(axis=0)
+        totals = box_of(surfaces).sum(axis=0)
         flips = [(axis, 0.0, f"change the sign of its {'xy'[axis]}") for axis in (1, 0)]
         for axis, letter in ((1, "y"), (0, "x")):
             flips.append((axis, float(totals[axis]), f"replace its {letter} by {totals[axis]:.6g} - {letter}"))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
-from ..core.files import write_figure
 from ..core.paths import Paths
-from .surfaces import Surface
+from .surfaces import Surface, box_of, cut_lines
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
@@ -62,20 +60,17 @@ class GaussianCloud:
         scale_m: standard deviations along the Gaussians' axes [n, 3].
         rotation_xyzw: quaternions, Gaussians' axes to world [n, 4].
         strength_db: value that colours them, [n]; for example 20 log10 of the signal's magnitude.
-        label: name of the strength.
     """
 
     position_m: FloatArray
     scale_m: FloatArray
     rotation_xyzw: FloatArray
     strength_db: FloatArray
-    label: str = "signal of a Gaussian (dB)"
 
     def strongest(self, count: int) -> GaussianCloud:
         """The ``count`` strongest, weakest first, so that the strong are drawn last."""
         order = np.argsort(self.strength_db, kind="stable")[-count:]
-        values = {key: np.asarray(value)[order] for key, value in vars(self).items() if key != "label"}
-        return GaussianCloud(**values, label=self.label)
+        return GaussianCloud(**{key: np.asarray(value)[order] for key, value in vars(self).items()})
 
     def silhouettes(self, across: FloatArray) -> FloatArray:
         """Outlines [n, points, 2] at one standard deviation in the plane of two unit vectors [2, 3]."""
@@ -83,11 +78,6 @@ class GaussianCloud:
         half = np.linalg.cholesky(axes @ np.swapaxes(axes, -1, -2) + 1e-12 * np.eye(2))
         turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS)
         return np.swapaxes(half @ np.stack([np.cos(turn), np.sin(turn)]), -1, -2)
-
-
-def draw_preview(surfaces: Sequence[Surface], path: str | Path, points: ArrayLike | None = None) -> Path:
-    """Write a picture of a scene and a scan [n, 3] or [n, 2] of it as PNG, atomically."""
-    return write_figure(Path(path), draw_scene(surfaces, points_m=points))
 
 
 def draw_scene(
@@ -124,8 +114,7 @@ def draw_scene(
     grid = figure.add_gridspec(1, 2, width_ratios=[1.2, 1])
     slant: Any = figure.add_subplot(grid[0], projection="3d", computed_zorder=False)
     plan = figure.add_subplot(grid[1])
-    vertices = np.concatenate([surface.vertices_m for surface in surfaces])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = box_of(surfaces)
     _draw_slant(slant, surfaces, colours, low, high)
     _draw_plan(plan, surfaces, colours, low, high)
     if points_m is not None and len(scan := np.asarray(points_m, float)):
@@ -152,7 +141,7 @@ def draw_scene(
 
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
     """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
-    rgba = _coloured(figure, cloud.strength_db, "viridis", cloud.label, 0.4)
+    rgba = _coloured(figure, cloud.strength_db, "viridis", "signal of a Gaussian (dB)", 0.4)
     right = np.cross([0, 0, 1], EYE) / np.linalg.norm(np.cross([0, 0, 1], EYE))
     screen = np.stack([right, np.cross(EYE, right)])
     outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen
@@ -220,7 +209,7 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
     edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
     found = edges[trimesh.grouping.group_rows(edges, require_count=1)]
     if creases:
-        mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
+        mesh = surface.mesh
         found = np.concatenate([found, mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_RAD]])
     return np.asarray(surface.vertices_m[found], float).reshape(-1, 2, 3)
 
@@ -270,13 +259,6 @@ def _draw_slant(
     axes.tick_params(labelsize=7, pad=0)
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.grid(False)
-
-
-def cut_lines(surface: Surface, height_m: float) -> FloatArray:
-    """Horizontal cut of a surface at a height: lines [n, 2, 2] in plan, metres; none where it is not met."""
-    mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-    cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height_m])
-    return np.asarray(cut, float).reshape(-1, 2, 3)[..., :2]
 
 
 def _draw_plan(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage, optimize, signal
 from scipy.spatial import cKDTree
@@ -45,30 +45,6 @@ APART_CELLS, APART_RAD = 5, np.radians(12)
 """Least difference between two starts; nearer starts lead to the same pose."""
 
 
-@dataclass(frozen=True)
-class Registration:
-    """A rigid motion to another frame and how well it fits.
-
-    Attributes:
-        matrix: shape [4, 4], applied to columns (x, y, z, 1) in metres.
-        rms_m: rms residual; of a fit to walls, over the points that agree.
-        share: share of the points within `NEAR_M` of a wall; 1 for pairs.
-        scale: factor on the source's lengths that would fit best; far from 1, the units or the resolution are wrong.
-            It is not in the matrix.
-    """
-
-    matrix: FloatArray
-    rms_m: float
-    share: float
-    scale: float
-
-    def apply(self, points_m: ArrayLike) -> FloatArray:
-        """Points [..., 2] or [..., 3] in the target's frame; two coordinates are taken at z = 0."""
-        points = np.asarray(points_m, float)
-        n = points.shape[-1]
-        return np.asarray(points @ self.matrix[:n, :n].T + self.matrix[:n, 3])
-
-
 def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
     """Pairs of points from a CSV file: ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y`` in metres.
 
@@ -83,8 +59,8 @@ def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
     return table[:, :n], table[:, n:]
 
 
-def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs") -> Registration:
-    """The rotation and shift that bring points to their partners with the least squared error (Umeyama 1991).
+def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs") -> FloatArray:
+    """The rotation and shift [4, 4] that bring points to their partners with the least squared error (Umeyama 1991).
 
     Args:
         source_m: shape [n, 2] (turned about z alone) or [n, 3].
@@ -117,8 +93,7 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             better = f"lengths times {similar.scale:.3f} would fit better ({scaled:.2f} m rms)"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
-    matrix = _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
-    return Registration(matrix, rms, 1.0, float(similar.scale))
+    return _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
 
 
 def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
@@ -155,8 +130,8 @@ def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     return _motion(rotation_2d(pose[2]), pose[:2])
 
 
-def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> Registration:
-    """The turn about z and shift that lay a scene's walls on known walls.
+def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> FloatArray:
+    """The turn about z and shift [4, 4] that lay a scene's walls on known walls.
 
     Turns all around, each with the shifts where both plans correlate best, are refined by robust least squares over the
     points' distances from the walls (point-to-line ICP with a Cauchy loss: Fitzgibbon 2003); the pose where most points
@@ -176,17 +151,15 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     points = points[:: -(-len(points) // MOST_POINTS)]
     fits = _find_poses(points, walls)
     pose, score = fits[0]
-    residual = distance_to_walls(_moved(points, pose), walls)
-    near = residual[residual <= NEAR_M]
-    share = len(near) / len(residual)
     _, mirrored = _find_poses(points * [-1, 1], walls)[0]
     if mirrored > max(score + CLEAR_LEAD, LEAST_AGREEMENT):
         raise InputError(
             f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
             "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
-    scale, agreement = _best_scale(points, pose, walls)
     if score < LEAST_AGREEMENT:
+        scale, agreement = best_scale(points, pose, walls)
+        share = np.mean(distance_to_walls(_moved(points, pose), walls) <= NEAR_M)
         text = f"{name}: it does not fit the walls: agreement {score:.2f} (at least {LEAST_AGREEMENT}), "
         text += f"{share:.0%} within {NEAR_M} m"
         if agreement > score + CLEAR_LEAD:
@@ -201,26 +174,18 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
             raise InputError(
                 f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
             )
-    matrix, rms = _motion(rotation_2d(pose[2]), pose[:2]), float(np.sqrt(np.mean(near**2)))
-    return Registration(matrix, rms, share, scale)
+    return _motion(rotation_2d(pose[2]), pose[:2])
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
     """Points [n, 2] along walls [m, 2, 2]: the middles of equal parts no longer than a step."""
-    parts = []
-    for begin, end in np.asarray(walls_m, float):
-        count = max(1, int(np.ceil(np.linalg.norm(end - begin) / step_m)))
-        parts.append(begin + (np.arange(count)[:, None] + 0.5) / count * (end - begin))
-    return np.concatenate(parts)
+    ends = [shapely.get_coordinates(wall) for wall in shapely.segmentize(shapely.linestrings(walls_m), step_m)]
+    return np.concatenate([(xy[:-1] + xy[1:]) / 2 for xy in ends])
 
 
 def distance_to_walls(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """Distance of each point [n, 2] from the nearest of walls [m, 2, 2], shape [n]."""
-    begin, along = walls_m[:, 0], walls_m[:, 1] - walls_m[:, 0]
-    offset = points_m[:, None] - begin
-    part = np.clip((offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12), 0, 1)
-    away = offset - part[..., None] * along
-    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))
+    return np.asarray(shapely.distance(shapely.points(points_m), shapely.multilinestrings(list(walls_m))))
 
 
 def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
@@ -294,8 +259,10 @@ def _image(cells: FloatArray, shape: IntArray) -> FloatArray:
     return image
 
 
-def _best_scale(points: FloatArray, pose: FloatArray, walls: FloatArray) -> tuple[float, float]:
-    """The factor on lengths, 1/2 to 2, that fits best near a pose, and the agreement with it."""
+def best_scale(points: FloatArray, pose: FloatArray, walls: FloatArray) -> tuple[float, float]:
+    """The factor on lengths, 1/2 to 2, with which points [n, 2] fit walls [m, 2, 2] best near a pose (x, y, angle), and
+    the agreement with it; far from 1, units or resolution are wrong.
+    """
     middle = points.mean(axis=0)
 
     def placed(pose_and_scale: FloatArray) -> FloatArray:

@@ -19,26 +19,17 @@ OUTLIERS = 0.01
 """Share of stray returns: edges, glass, people walking by."""
 
 
-def simulate_scan(
-    scene: Any,
-    poses_m: ArrayLike,
-    *,
-    rays_per_pose: int = RAYS_PER_POSE,
-    range_noise_m: float = RANGE_NOISE_M,
-    outliers: float = OUTLIERS,
-    seed: int = 1,
-) -> FloatArray:
+def simulate_scan(scene: Any, poses_m: ArrayLike, *, rays_per_pose: int = RAYS_PER_POSE, seed: int = 1) -> FloatArray:
     """Points of a simulated LiDAR at some positions.
 
     The rays of a position are spread evenly over the sphere (a Fibonacci lattice, turned at random); each return is
-    moved along its ray by Gaussian noise, and a share of them to a uniform random part of its range.
+    moved along its ray by Gaussian noise (`RANGE_NOISE_M`), and a share of them (`OUTLIERS`) to a uniform random part
+    of its range.
 
     Args:
         scene: a Mitsuba scene file, or a ``mi.Scene`` (for a ``sionna.rt.Scene``: its ``mi_scene``).
         poses_m: scanner positions [k, 3], metres.
         rays_per_pose: number of rays from each position.
-        range_noise_m: standard deviation of the range, metres.
-        outliers: share of stray returns, 0 to 1.
         seed: seed of the noise.
 
     Returns:
@@ -64,8 +55,8 @@ def simulate_scan(
         ray = mi.Ray3f(mi.Point3f(*pose.tolist()), to_vectors(directions, mi.Vector3f))
         distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
         seen = np.isfinite(distance)
-        distance = distance[seen] + rng.normal(0, range_noise_m, np.count_nonzero(seen))
-        stray = rng.random(len(distance)) < outliers
+        distance = distance[seen] + rng.normal(0, RANGE_NOISE_M, np.count_nonzero(seen))
+        stray = rng.random(len(distance)) < OUTLIERS
         distance[stray] *= rng.random(np.count_nonzero(stray))
         parts.append(pose + directions[seen] * distance[:, None])
     points = np.concatenate(parts)

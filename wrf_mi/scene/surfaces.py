@@ -49,9 +49,9 @@ class Surface:
     faces: IntArray
 
     @property
-    def area_m2(self) -> float:
-        """Sum of the areas of its faces."""
-        return float(trimesh.triangles.area(self.vertices_m[self.faces]).sum())
+    def mesh(self) -> trimesh.Trimesh:
+        """Its vertices and faces as they are."""
+        return trimesh.Trimesh(self.vertices_m, self.faces, process=False)
 
 
 def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
@@ -142,6 +142,18 @@ def number_names(kinds: Sequence[Kind]) -> list[str]:
 def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     """Surfaces moved by a matrix [4, 4]."""
     return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]
+
+
+def box_of(surfaces: Sequence[Surface]) -> FloatArray:
+    """Lower and upper corner [2, 3] of the box around surfaces, metres."""
+    corners = np.concatenate([surface.vertices_m for surface in surfaces])
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def cut_lines(surface: Surface, height_m: float) -> FloatArray:
+    """Horizontal cut of a surface at a height: lines [n, 2, 2] in plan, metres; none where it is not met."""
+    cut = trimesh.intersections.mesh_plane(surface.mesh, [0, 0, 1], [0, 0, height_m])
+    return np.asarray(cut, float).reshape(-1, 2, 3)[..., :2]
 
 
 def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:

@@ -8,15 +8,13 @@ user.
 
 from __future__ import annotations
 
-import logging
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from wrf_mi_scenes import floor_plans
@@ -27,16 +25,14 @@ from wrf_mi_scenes.registry import content_sha256
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..datasets import make_splits, read_nerf2_csi, user_cache, write_nerf2_csi
-from ..tracing.options import TraceOptions
+from ..datasets import make_splits, read_nerf2_csi, write_nerf2_csi
 from ..tracing.scenes import open_scene
-from .furnished_room import trace_channels
-from .laboratory import RECIPE, is_made, provided, scene_files
-
-logger = logging.getLogger(__name__)
+from .searches import Searches, trace_channels
+from .stored import Files, scene_files, stored
 
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
 PREFIX = "traced-csi-"  # of the names of the data sets
+ORIGIN = "wrf_mi_scenes.floor_plans"
 MEASURED = "floor"  # folder beside the channels with the measured scene, the input of models
 CHUNK_SIZE = 100  # users that are traced together
 FORMAT = 4  # version of the files, to be raised when they change for equal parameters
@@ -49,39 +45,26 @@ ORIENTATION = (0.5, 0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
-class Walk:
-    """Parameters of a floor's channels.
+class Walk(Searches):
+    """Parameters of a floor's channels, beside those of `Searches`.
 
     Attributes:
         rows, columns: numbers of the base station's antennas.
         users, places: numbers of users on each route, and of positions of each user.
         wander_m: largest deviation of users from the route, along x and along y.
         height_m, sway_m: height of a user's antenna and its largest deviation.
-        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
-            scattered path.
-        rays, scattered_rays: numbers of rays for specular paths and for diffuse reflection.
-        scattering: share of the reflected amplitude that every surface scatters.
         snr_db: signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers.
-        mesh_error_m: standard deviation of the measured walls' positions along each axis, metres.
-        seed: seed of ways, noise, rays, split and errors of the measured floor.
     """
 
     rows: int = 8
     columns: int = 13
     users: int = 2
     places: int = 80
+    scattered_depth: int | None = 2
     wander_m: float = 0.12
     height_m: float = 1.2
     sway_m: float = 0.15
-    depth: int = 5
-    reflections: int = 3
-    rays: int = 1 << 17
-    scattered_rays: int = 1 << 9
-    scattered_depth: int = 2
-    scattering: float = 0.3
     snr_db: float = 25.0
-    mesh_error_m: float = 0.02
-    seed: int = 1
 
 
 DEFAULT = Walk()
@@ -109,33 +92,45 @@ def walked_channels(
     """
     if place not in PLACES:
         raise InputError(f"place {place!r}: unknown; give one of {', '.join(PLACES)}")
-    name = f"{PREFIX}{place}"
-    if folder is None:
-        if (found := provided(name)) is not None:
-            return found
-        folder = user_cache() / name
-    folder, plan = Path(folder), PLACES[place]()
+    name, plan = f"{PREFIX}{place}", PLACES[place]()
+    facts = {
+        "format": FORMAT,
+        "place": place,
+        "station_m": plan.station_m,
+        "routes_m": plan.routes,
+        **asdict(walk),
+        "frequency_hz": CARRIER_HZ,
+        "subcarrier_spacing_hz": SPACING_HZ,
+    }
+
+    def write(folder: Path, scene_folder: Path, extra: Files) -> None:
+        write_nerf2_csi(folder, _trace(scene_folder, name, plan, walk, progress), replace=True, extra=extra)
+
+    return made_on_floor(name, folder, plan, walk, facts, write, read_nerf2_csi)
+
+
+def made_on_floor(
+    name: str,
+    folder: str | Path | None,
+    plan: FloorPlan,
+    searches: Searches,
+    facts: dict[str, Any],
+    write: Callable[[Path, Path, Files], None],
+    read: Callable[[Path, str], Record],
+) -> Record:
+    """The record of a folder (`wrf_mi.synthetic.stored.stored`), after tracing it on a floor unless it is there.
+
+    ``write`` takes the folder, that of the true scene, and further files, of which the parameters come last.
+    """
     with tempfile.TemporaryDirectory() as work:
-        write_scene(Path(work), plan.parts, f"{place.capitalize()} of several rooms", "wrf_mi_scenes.floor_plans")
-        facts = {
-            "format": FORMAT,
-            "place": place,
-            "scene_sha256": content_sha256(Path(work), "scene.xml"),
-            "station_m": list(plan.station_m),
-            "routes_m": [[list(corner) for corner in route] for route in plan.routes],
-            **asdict(walk),
-            "frequency_hz": CARRIER_HZ,
-            "subcarrier_spacing_hz": SPACING_HZ,
-            "sionna_rt": version("sionna-rt"),
-        }
-        recipe = yaml.safe_dump(facts, sort_keys=False, default_flow_style=None)
-        if not is_made(folder, recipe):
-            logger.info("tracing channels in the %s into %s", place, folder)
-            record = _trace(Path(work), name, plan, walk, progress)
-            bare = floor_plans.measured(plan, walk.mesh_error_m, walk.seed)
-            extra: dict[str, str | bytes] = {RECIPE: recipe, **scene_files(bare, MEASURED, "wrf_mi_scenes.floor_plans")}
-            write_nerf2_csi(folder, record, replace=True, extra=extra)
-    return read_nerf2_csi(folder, name)
+        write_scene(Path(work), plan.parts, "A floor of several rooms", ORIGIN)
+
+        def write_floor(folder: Path, recipe: Files) -> None:
+            bare = floor_plans.measured(plan, searches.mesh_error_m, searches.seed)
+            write(folder, Path(work), scene_files(bare, MEASURED, ORIGIN) | recipe)
+
+        facts = {**facts, "scene_sha256": content_sha256(Path(work), "scene.xml")}
+        return stored(name, folder, facts, write_floor, read)
 
 
 def users_way(route: tuple[tuple[float, float], ...], walk: Walk, rng: np.random.Generator) -> FloatArray:
@@ -170,12 +165,9 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     positions = np.concatenate(ways)
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
     receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION), array_m=array_m)
-    shared: dict[str, Any] = {"transmission": True, "seed": walk.seed, "scattering_coefficient": walk.scattering}
-    specular = TraceOptions(max_depth=walk.depth, max_reflections=walk.reflections, rays=walk.rays, **shared)
-    rough = TraceOptions(scattering=True, max_depth=walk.scattered_depth, rays=walk.scattered_rays, **shared)
-    frequencies = np.concatenate([UPLINK_HZ, DOWNLINK_HZ])
-    how: dict[str, Any] = {"chunk_size": CHUNK_SIZE, "progress": f"tracing {name}" if progress else None}
-    channel = trace_channels(scene, receiver, positions, frequencies, (specular, rough), **how)
+    frequencies, text = np.concatenate([UPLINK_HZ, DOWNLINK_HZ]), f"tracing {name}" if progress else None
+    how: dict[str, Any] = {"chunk_size": CHUNK_SIZE, "progress": text}
+    channel = trace_channels(scene, receiver, positions, frequencies, walk.options(), **how)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(

@@ -7,11 +7,8 @@ reflections nor diffuse scattering reach.
 
 from __future__ import annotations
 
-import logging
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,28 +18,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from wrf_mi_scenes import floor_plans
 from wrf_mi_scenes.floor_plans import FloorPlan
-from wrf_mi_scenes.mitsuba_xml import write_scene
-from wrf_mi_scenes.registry import content_sha256
 
 from ..core import Paths, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
-from ..datasets import read_ble_folder, read_deepmimo, user_cache, write_ble_folder
+from ..datasets import read_ble_folder, read_deepmimo, write_ble_folder
 from ..datasets.ble_folder import CARRIER_HZ
 from ..datasets.deepmimo import CHANNEL_PARAMS
 from ..datasets.folder_files import write_extra, write_official
 from ..receivers.channel import rssi_dbm
 from ..tracing.deepmimo import write_deepmimo
 from ..tracing.devices import winding_number
-from ..tracing.options import TraceOptions
 from ..tracing.result import TraceResult
 from ..tracing.scenes import open_scene
 from ..tracing.solve import trace_paths
-from .floor_channels import MEASURED
-from .furnished_room import SCATTERING, free_positions, set_scattering
-from .laboratory import RECIPE, SCAN, is_made, provided, scan_file, scene_files
-
-logger = logging.getLogger(__name__)
+from .floor_channels import made_on_floor
+from .searches import SCATTERING, Searches, free_positions, set_scattering
+from .stored import Files, scan_file
 
 NAME = "traced-floor-receivers"
 CHANNELS = f"{NAME}-csi"
@@ -69,8 +61,8 @@ SCANNER_M = tuple(
 
 
 @dataclass(frozen=True)
-class FloorReceivers:
-    """Parameters of the floor's receivers.
+class FloorReceivers(Searches):
+    """Parameters of the floor's receivers, beside those of `Searches`.
 
     Attributes:
         columns, rows: numbers of receivers along x and y, one in each cell of a grid over the floor.
@@ -78,16 +70,11 @@ class FloorReceivers:
         mount_m: height of the receivers, metres.
         low_m, high_m: bounds of the transmitter's height, metres.
         clear_m, from_receiver_m: least distances of antennas from surfaces, and of transmitters from receivers, metres.
-        depth, reflections: most interactions of a path, and reflections among them in paths without scattering.
-        rays, scattered_rays: numbers of rays for specular and for scattered paths.
-        scattering: share of the reflected amplitude that every surface scatters.
         power_dbm: power that the transmitter radiates.
         sensitivity_dbm: signal strength below which nothing is received.
         offset_db: standard deviation of the receivers' offsets, each the same for all rows.
         noise_db: standard deviation of the noise of each signal strength.
         subcarriers, bandwidth_hz: number of the channels' subcarriers, from the carrier upwards, and their bandwidth.
-        mesh_error_m: standard deviation of the measured walls' positions along each axis, metres.
-        seed: seed of positions, rays, offsets, noise and errors of the measured floor.
     """
 
     columns: int = 4
@@ -99,19 +86,12 @@ class FloorReceivers:
     high_m: float = 1.6
     clear_m: float = 0.1
     from_receiver_m: float = 0.5
-    depth: int = 5
-    reflections: int = 3
-    rays: int = 1 << 17
-    scattered_rays: int = 1 << 9
-    scattering: float = 0.3
     power_dbm: float = 0.0
     sensitivity_dbm: float = -75.0
     offset_db: float = 1.0
     noise_db: float = 1.0
     subcarriers: int = 16
     bandwidth_hz: float = 20e6
-    mesh_error_m: float = 0.02
-    seed: int = 1
 
 
 DEFAULT = FloorReceivers()
@@ -134,7 +114,7 @@ def traced_floor_strengths(
         A record with ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity.
     """
 
-    def write(folder: Path, traced: TraceResult, extra: dict[str, str | bytes]) -> None:
+    def write(folder: Path, traced: TraceResult, extra: Files) -> None:
         write_ble_folder(folder, strengths_of(traced, floor), replace=True, extra=extra)
 
     return _made(NAME, folder, floor, progress, write, read_ble_folder)
@@ -155,7 +135,7 @@ def traced_floor_channels(
         A record with ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
     """
 
-    def write(folder: Path, traced: TraceResult, extra: dict[str, str | bytes]) -> None:
+    def write(folder: Path, traced: TraceResult, extra: Files) -> None:
         ofdm = {"bandwidth": floor.bandwidth_hz, "subcarriers": floor.subcarriers}
         params = {"base_stations": "all", "ofdm": ofdm | {"selected_subcarriers": list(range(floor.subcarriers))}}
         write_deepmimo(folder, traced, replace=True)
@@ -171,35 +151,21 @@ def _made(
     folder: str | Path | None,
     floor: FloorReceivers,
     progress: bool,
-    write: Callable[[Path, TraceResult, dict[str, str | bytes]], None],
+    write: Callable[[Path, TraceResult, Files], None],
     read: Callable[[Path, str], Record],
 ) -> Record:
     """The record of a folder, after tracing and writing it unless it is there.
 
-    ``write`` takes the folder, the trace and the content of further files, of which the recipe is the last.
+    ``write`` takes the folder, the trace and further files, of which the parameters come last.
     """
-    if folder is None:
-        if (found := provided(name)) is not None:
-            return found
-        folder = user_cache() / name
-    folder, plan = Path(folder), floor_plans.office()
-    with tempfile.TemporaryDirectory() as work:
-        xml = write_scene(Path(work), plan.parts, "Office of several rooms", "wrf_mi_scenes.floor_plans")
-        facts = {
-            "format": FORMAT,
-            "scene_sha256": content_sha256(Path(work), xml.name),
-            **asdict(floor),
-            "frequency_hz": CARRIER_HZ,
-            "sionna_rt": version("sionna-rt"),
-        }
-        recipe = yaml.safe_dump(facts, sort_keys=False)
-        if not is_made(folder, recipe):
-            logger.info("tracing %s into %s", name, folder)
-            traced = trace_floor(Path(work), plan, floor, progress)
-            extra: dict[str, str | bytes] = {SCAN: scan_file(xml, floor.seed, SCANNER_M)}
-            bare = floor_plans.measured(plan, floor.mesh_error_m, floor.seed)
-            write(folder, traced, extra | scene_files(bare, MEASURED, "wrf_mi_scenes.floor_plans") | {RECIPE: recipe})
-    return read(folder, name)
+    plan = floor_plans.office()
+
+    def write_traced(folder: Path, scene_folder: Path, extra: Files) -> None:
+        scan = scan_file(scene_folder / "scene.xml", floor.seed, SCANNER_M)
+        write(folder, trace_floor(scene_folder, plan, floor, progress), scan | extra)
+
+    facts = {"format": FORMAT, **asdict(floor), "frequency_hz": CARRIER_HZ}
+    return made_on_floor(name, folder, plan, floor, facts, write_traced, read)
 
 
 def trace_floor(scene_folder: Path, plan: FloorPlan, floor: FloorReceivers, progress: bool = False) -> TraceResult:
@@ -207,11 +173,7 @@ def trace_floor(scene_folder: Path, plan: FloorPlan, floor: FloorReceivers, prog
     scene = open_scene(scene_folder, CARRIER_HZ)
     receivers, transmitters = floor_devices(scene, plan, floor)
     set_scattering(scene, floor.scattering)
-    shared: dict[str, Any] = {"transmission": True, "max_depth": floor.depth, "seed": floor.seed}
-    shared["scattering_coefficient"] = floor.scattering
-    exact = TraceOptions(max_reflections=floor.reflections, rays=floor.rays, **shared)
-    rough = TraceOptions(scattering=True, rays=floor.scattered_rays, **shared)
-    parts = [trace_paths(scene, transmitters, receivers, options, progress) for options in (exact, rough)]
+    parts = [trace_paths(scene, transmitters, receivers, options, progress) for options in floor.options()]
     scattered = (parts[1].paths.interactions == SCATTERING).any(axis=1)
     return _joined(parts[0], parts[1].select(scattered))
 

@@ -11,7 +11,7 @@ Which paths with both diffraction and reflections are found depends on the draw,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +21,15 @@ from numpy.typing import NDArray
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..datasets import user_cache
 from ..receivers.array import bartlett_spectrum, minmax_scale
 from ..receivers.channel import array_channels
 from ..tracing.options import TraceOptions
 from ..tracing.result import recompute
 from ..tracing.scenes import open_scene
-from .furnished_room import (
-    TracedRoom,
-    made_in_room,
-    opaque_parts,
-    room_searches,
-    searched_paths,
-    set_scattering,
-    transmitters,
-)
-from .laboratory import provided
+from .furnished_room import TracedRoom, made_in_room, opaque_parts, transmitters
+from .searches import searched_paths, set_scattering
 
 NAME = "traced-room-bands"
-FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 
 
 @dataclass(frozen=True)
@@ -94,13 +84,10 @@ def traced_room_bands(folder: str | Path | None = None, bands: RoomBands = DEFAU
     Returns:
         A record with ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1.
     """
-    if folder is None:
-        if (found := provided(NAME)) is not None:
-            return found
-        folder = user_cache() / NAME
     poses = {rx.name: [*rx.position_m.tolist(), *rx.orientation_xyzw.tolist()] for rx in RECEIVERS}
-    facts = {"format": FORMAT, **asdict(bands), "carriers_hz": list(bands.carriers_hz), "receivers": poses}
-    return made_in_room(Path(folder), NAME, facts, bands, lambda scene_folder: _trace(scene_folder, bands, progress))
+    return made_in_room(
+        folder, NAME, {"receivers": poses}, bands, lambda scene_folder: _trace(scene_folder, bands, progress)
+    )
 
 
 def channels_at_carriers(
@@ -114,14 +101,7 @@ def channels_at_carriers(
 ) -> NDArray[np.complex128]:
     """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, at the carriers of f scenes.
 
-    Args:
-        scenes: ``sionna.rt.Scene`` of each carrier, with its materials.
-        receiver: pose and array.
-        positions: transmitters [n, 3], metres.
-        searched_at: scene in which paths are searched for.
-        options: as `wrf_mi.synthetic.furnished_room.searched_paths`.
-        opaque: likewise.
-        progress: likewise.
+    Paths are those of `wrf_mi.synthetic.searches.searched_paths` in the scene ``searched_at``.
     """
     assert receiver.array_m is not None
     channel = np.zeros((len(positions), len(receiver.array_m), len(scenes)), complex)
@@ -141,7 +121,7 @@ def _trace(scene_folder: Path, bands: RoomBands, progress: bool) -> Record:
         [open_scene(scene_folder, hz) for hz in carriers] for carriers in (bands.carriers_hz, [bands.searched_at_hz])
     )
     positions = transmitters(searched_at[0], bands, np.stack([receiver.position_m for receiver in receivers]))
-    how = positions, searched_at[0], room_searches(bands), opaque_parts()
+    how = positions, searched_at[0], bands.options(diffraction=True), opaque_parts()
     size = len(positions), len(scenes), bands.height, bands.width
     spectra = np.empty((len(receivers), *size), np.float32)
     for index, receiver in enumerate(receivers):

@@ -16,8 +16,8 @@ from wrf_mi.models.uplink.csi_bands import Bands
 from wrf_mi.models.uplink.r2f2 import distinct
 from wrf_mi.models.uplink.uplink_paths import Start, find_paths
 from wrf_mi.models.uplink.uplink_waves import waves_of
-from wrf_mi.synthetic.furnished_room import trace_channels
 from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
+from wrf_mi.synthetic.searches import trace_channels
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.options import TraceOptions

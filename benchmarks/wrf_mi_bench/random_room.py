@@ -16,18 +16,18 @@ from scipy.spatial.transform import Rotation
 from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
-from ..core import Receiver, Record
-from ..core.angles import FloatArray
-from ..core.antenna import UPRIGHT
-from ..core.array_files import write_arrays
-from ..receivers.instruments import ChannelInstrument
-from ..scene.make import make_scene
-from ..scene.scan import simulate_scan
-from ..tracing.options import TraceOptions
-from ..tracing.scenes import open_scene
-from ..tracing.tracer import RayTracer
-from .floor_channels import with_noise
-from .furnished_room import free_positions
+from wrf_mi.core import Receiver, Record
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.antenna import UPRIGHT
+from wrf_mi.core.array_files import write_arrays
+from wrf_mi.receivers.instruments import ChannelInstrument
+from wrf_mi.scene.make import make_scene
+from wrf_mi.scene.scan import simulate_scan
+from wrf_mi.synthetic.floor_channels import with_noise
+from wrf_mi.synthetic.searches import free_positions
+from wrf_mi.tracing.options import TraceOptions
+from wrf_mi.tracing.scenes import open_scene
+from wrf_mi.tracing.tracer import RayTracer
 
 CARRIER_HZ = 2.44e9
 SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
@@ -35,33 +35,26 @@ OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 18, seed=1)
 """Paths of the true channels."""
 
 
+LOW_M, HIGH_M = 0.5, 2.0
+"""Bounds of the transmitters' height."""
+CLEAR_M, FROM_STATION_M = 0.1, 0.5
+"""Least distances of transmitters from surfaces and from the access point."""
+SNR_DB = 30.0
+POSES = 4
+"""Number of the LiDAR's positions."""
+FRAME_M, FRAME_RAD = 0.055, 0.009
+"""Length of the scan's displacement and angle of its rotation, in random directions."""
+POSE_M, POSE_RAD = 0.01, 0.001
+"""Standard deviations, along and about each axis, of the errors of each position of the LiDAR."""
+
+
 @dataclass(frozen=True)
 class Survey:
-    """Parameters of a random room's measurements.
-
-    Attributes:
-        train, test: numbers of training and test rows.
-        low_m, high_m: bounds of the transmitters' height, metres.
-        clear_m, from_station_m: least distances from surfaces and from the access point, metres.
-        snr_db: signal-to-noise ratio of each row.
-        poses, rays: number of the LiDAR's positions, and of rays at each.
-        frame_m, frame_rad: length of the scan's displacement and angle of its rotation, in random directions.
-        pose_m, pose_rad: standard deviations, along and about each axis, of the errors of each position of the LiDAR.
-    """
+    """Numbers of training and test rows, and of rays at each position of the LiDAR."""
 
     train: int = 300
     test: int = 100
-    low_m: float = 0.5
-    high_m: float = 2.0
-    clear_m: float = 0.1
-    from_station_m: float = 0.5
-    snr_db: float = 30.0
-    poses: int = 4
     rays: int = 60_000
-    frame_m: float = 0.055
-    frame_rad: float = 0.009
-    pose_m: float = 0.01
-    pose_rad: float = 0.001
 
 
 DEFAULT = Survey()
@@ -88,8 +81,8 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
     scene = open_scene(true.parent, CARRIER_HZ)
     station = np.array(room.station_m)
     count, rng = survey.train + survey.test, np.random.default_rng([seed, 1])
-    bounds = np.array([0.0, 0.0, survey.low_m]), np.array([*room.size_m[:2], survey.high_m])
-    positions = free_positions(scene, *bounds, count, survey.clear_m, rng, seed, station, survey.from_station_m)
+    bounds = np.array([0.0, 0.0, LOW_M]), np.array([*room.size_m[:2], HIGH_M])
+    positions = free_positions(scene, *bounds, count, CLEAR_M, rng, seed, station, FROM_STATION_M)
     record = Record(
         f"random-room-{seed}",
         "csi",
@@ -100,8 +93,8 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
         frequencies_hz=SUBCARRIERS_HZ,
     )
     channel = RayTracer(true.parent, ChannelInstrument(record.receivers, SUBCARRIERS_HZ), OPTIONS)(positions)[0]
-    noisy = with_noise(channel[:, None], survey.snr_db, np.random.default_rng([seed, 2]))[:, 0]
-    poses = free_positions(scene, *bounds, survey.poses, SCANNER_CLEAR_M, rng, seed)
+    noisy = with_noise(channel[:, None], SNR_DB, np.random.default_rng([seed, 2]))[:, 0]
+    poses = free_positions(scene, *bounds, POSES, SCANNER_CLEAR_M, rng, seed)
     scan = write_arrays(folder / "scan.npz", {"points": _scan(true, poses, seed, survey).astype(np.float32)})
     measured = make_scene(scan, folder / "measured", replace=True).folder
     observed = noisy.astype(np.complex64)[None]
@@ -112,11 +105,11 @@ def _scan(xml: Path, poses_m: FloatArray, seed: int, survey: Survey) -> FloatArr
     """Points [n, 3] in a frame that is off by the errors of the survey, metres."""
     rng, parts = np.random.default_rng([seed, 3]), []
     along, about = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
-    common = survey.frame_m * along, Rotation.from_rotvec(survey.frame_rad * about)
+    common = FRAME_M * along, Rotation.from_rotvec(FRAME_RAD * about)
     middle = poses_m.mean(axis=0)
     for number, pose in enumerate(poses_m):
         points = simulate_scan(xml, pose[None], rays_per_pose=survey.rays, seed=seed * len(poses_m) + number)
-        own = Rotation.from_rotvec(rng.normal(0, survey.pose_rad, 3))
-        points = own.apply(points - pose) + pose + rng.normal(0, survey.pose_m, 3)
+        own = Rotation.from_rotvec(rng.normal(0, POSE_RAD, 3))
+        points = own.apply(points - pose) + pose + rng.normal(0, POSE_M, 3)
         parts.append(common[1].apply(points - middle) + middle + common[0])
     return np.concatenate(parts)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wrf_mi_bench.random_room import SNR_DB, Survey, random_room_record
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
 
 from wrf_mi.core import Record
-from wrf_mi.synthetic.random_room import Survey, random_room_record
 
 ROOMS = [random_room(seed) for seed in range(200, 240)]
 SMALL = Survey(train=30, test=4, rays=10_000)
@@ -65,4 +65,4 @@ def test_noise_has_the_stated_power(made: tuple[Record, Path, Path]) -> None:
     record, *_ = made
     noise = np.square(np.abs(record.observation - record.truth)).mean(axis=2)
     signal = np.square(np.abs(record.truth)).mean(axis=2)
-    assert 10 * np.log10((signal / noise).mean()) == pytest.approx(SMALL.snr_db, abs=1.5)
+    assert 10 * np.log10((signal / noise).mean()) == pytest.approx(SNR_DB, abs=1.5)

@@ -1,0 +1,161 @@
+"""Paths and positions of synthetic data: searches for specular and scattered paths, and places in the free volume."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+from scipy.spatial import cKDTree
+
+from ..core import Receiver
+from ..core.angles import FloatArray
+from ..core.antenna import UPRIGHT
+from ..receivers.channel import array_channels
+from ..tracing.devices import solid_around
+from ..tracing.options import TraceOptions
+from ..tracing.result import TraceResult
+from ..tracing.solve import trace_paths
+from ..tracing.surfaces import scene_surfaces
+
+SCATTERING, DIFFRACTION = 2, 8
+"""Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
+CHUNK_SIZE = 200  # transmitters that are traced together
+
+
+@dataclass(frozen=True)
+class Searches:
+    """Searches for paths, and parameters that all synthetic data have.
+
+    Attributes:
+        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
+            scattered path (None: the former).
+        rays, scattered_rays: numbers of rays for specular paths and diffraction, and for diffuse reflection.
+        scattering: share of the reflected amplitude that every surface scatters.
+        mesh_error_m: standard deviation of the measured surfaces' positions along each axis, metres.
+        seed: seed of positions, rays, noise, split and errors of the measured scene.
+    """
+
+    depth: int = 5
+    reflections: int = 3
+    scattered_depth: int | None = None
+    rays: int = 1 << 17
+    scattered_rays: int = 1 << 9
+    scattering: float = 0.3
+    mesh_error_m: float = 0.02
+    seed: int = 1
+
+    def options(self, diffraction: bool = False) -> tuple[TraceOptions, TraceOptions]:
+        """Options of the search for specular, and perhaps diffracted, paths, and of that for scattered ones."""
+        shared: dict[str, Any] = {"transmission": True, "seed": self.seed, "scattering_coefficient": self.scattering}
+        exact = TraceOptions(
+            diffraction=diffraction, max_depth=self.depth, max_reflections=self.reflections, rays=self.rays, **shared
+        )
+        shared["max_depth"] = self.scattered_depth or self.depth
+        return exact, TraceOptions(scattering=True, rays=self.scattered_rays, **shared)
+
+
+def free_positions(
+    scene: Any,
+    low_m: FloatArray,
+    high_m: FloatArray,
+    count: int,
+    clear_m: float,
+    rng: np.random.Generator,
+    seed: int,
+    station_m: FloatArray | None = None,
+    from_station_m: float = 0.0,
+) -> FloatArray:
+    """Positions [count, 3] in metres, uniform over the free part of a box, to 0.1 mm.
+
+    Args:
+        scene: a ``sionna.rt.Scene``.
+        low_m: lower corner of the box [3], metres.
+        high_m: upper corner, likewise.
+        count: number of positions.
+        clear_m: least distance from surfaces, metres.
+        rng: generator of the positions.
+        seed: seed of the points by which distances from surfaces are judged.
+        station_m: position [3], or positions [k, 3], to keep away from, metres; None: none.
+        from_station_m: least distance from these, metres.
+    """
+    surfaces = scene_surfaces(scene)
+    mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
+    # A point every 2 cm or so: much less than the clearance.
+    tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=seed)[0])
+    found = np.zeros((0, 3))
+    while len(found) < count:
+        drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
+        free = tree.query(drawn)[0] > clear_m
+        if station_m is not None:
+            apart = np.linalg.norm(drawn[:, None] - np.atleast_2d(station_m), axis=-1)
+            free &= apart.min(axis=1) > from_station_m
+        free &= solid_around(surfaces, drawn) < 0
+        found = np.concatenate([found, drawn[free]])
+    return found[:count]
+
+
+def trace_channels(
+    scene: Any,
+    receiver: Receiver,
+    positions: FloatArray,
+    frequencies_hz: FloatArray,
+    options: Sequence[TraceOptions],
+    opaque: Sequence[str] = (),
+    chunk_size: int = CHUNK_SIZE,
+    progress: str | None = None,
+) -> NDArray[np.complex128]:
+    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over searches for paths.
+
+    Paths are those of `searched_paths`.
+    """
+    assert receiver.array_m is not None
+    channel = np.zeros((len(positions), len(receiver.array_m), len(frequencies_hz)), complex)
+    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, chunk_size, progress):
+        channel[rows] += array_channels(traced.paths, receiver, receiver.array_m, frequencies_hz)
+    return channel
+
+
+def searched_paths(
+    scene: Any,
+    receiver: Receiver,
+    positions: FloatArray,
+    options: Sequence[TraceOptions],
+    opaque: Sequence[str] = (),
+    chunk_size: int = CHUNK_SIZE,
+    progress: str | None = None,
+) -> Iterator[tuple[slice, TraceResult]]:
+    """Paths from a receiver's array, as "transmitter", to chunks of positions [n, 3], as "receivers".
+
+    A search with scattering counts its scattered paths, another search all but those diffracted at other edges than of
+    the ``opaque`` objects. ``progress`` is the text of a progress bar on standard error.
+
+    Yields:
+        Rows of a chunk, and its paths by a search.
+    """
+    set_scattering(scene, options[0].scattering_coefficient)
+    with Progress(console=Console(stderr=True), transient=True, disable=progress is None) as bar:
+        for start in bar.track(range(0, len(positions), chunk_size), description=progress or ""):
+            part = positions[start : start + chunk_size]
+            ends = [Receiver(str(row), position, np.array(UPRIGHT)) for row, position in enumerate(part)]
+            for search in options:
+                # The array searches, so that all positions see the same patches of rough wall and the same edges.
+                # With diffraction Sionna RT searches from transmitters, so the array is the transmitter.
+                traced = trace_paths(scene, receiver.position_m, ends, search, search_from="transmitters")
+                paths = traced.paths
+                kept = (paths.interactions == SCATTERING).any(axis=1)
+                if not search.scattering:
+                    names = np.array([paths.object_names.index(name) for name in opaque if name in paths.object_names])
+                    kept = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
+                yield slice(start, start + len(part)), traced.select(kept)
+
+
+def set_scattering(scene: Any, coefficient: float) -> None:
+    """Set the share of the reflected amplitude that every surface of a ``sionna.rt.Scene`` scatters."""
+    for material in scene.radio_materials.values():
+        material.scattering_coefficient = coefficient
