@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 from ..backend.device import to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core.angles import FloatArray
-from ..gaussians.footprint import Pose
-from ..gaussians.tiles import Plane
 from ..graph.graph import Batch
-from .step import Params, evaluated
+from .step import Params, Place, evaluated
 
-Where = tuple[int, Pose, Plane, float | None]
-"""Number and pose of a receiver, directions, and `Batch.carrier`."""
 OfBatch = Callable[[Mapping[str, Any], Batch], tuple[Any, ...]]
 """``function(params, batch)``: arrays with as many numbers for each transmitter of the batch."""
 
@@ -42,7 +38,7 @@ class Recordings:
         function: OfBatch,
         params: Params,
         condition: FloatArray,
-        where: Where,
+        place: Place,
         weight: NDArray[Any] | None = None,
         state: Callable[[], Any] | None = None,
     ) -> tuple[Any, ...]:
@@ -54,14 +50,13 @@ class Recordings:
             function: the function.
             params: its parameters.
             condition: positions or features of transmitters [k, m], m at most ``size``.
-            where: receiver.
+            place: port.
             weight: `Batch.weight` [m].
             state: returns the arrays that the function reads beside its arguments; None: no arrays.
 
         Returns:
             Arrays of the m transmitters.
         """
-        number, pose, plane, log_carrier = where
         if (name, size) not in self._recorded:
 
             def recordable(params: Params, batch: Batch) -> tuple[Any, ...]:
@@ -69,16 +64,14 @@ class Recordings:
                     return function(params, batch)
 
             # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(function, params, condition[:, :1], *where)
+            evaluated(function, params, condition[:, :1], place)
             self._recorded[name, size] = Recorded(recordable, state)
         count = condition.shape[1]
         filled = np.minimum(np.arange(size), count - 1)
         tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, size)
         dr.make_opaque(slots)
         weights = None if weight is None else to_float(weight[filled])
-        carrier = None if log_carrier is None else dr.opaque(mi.Float, log_carrier)
-        batch = Batch(tx, slots, dr.opaque(mi.UInt32, number), pose, plane, weights, carrier)
-        found: tuple[Any, ...] = self._recorded[name, size](params, batch)
+        arrays: tuple[Any, ...] = self._recorded[name, size](params, place.batch(tx, slots, weights))
         if count == size:
-            return found
-        return tuple(dr.gather(type(one), one, dr.arange(mi.UInt32, count * (dr.width(one) // size))) for one in found)
+            return arrays
+        return tuple(dr.gather(type(one), one, dr.arange(mi.UInt32, count * (dr.width(one) // size))) for one in arrays)

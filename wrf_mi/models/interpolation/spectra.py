@@ -189,25 +189,27 @@ class KrigedSpectra:
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[np.float32]:
         """Spectra [m, height, width] at positions [m, 3], metres; headings are not used."""
+        return self._estimated(tx_pos, None)
+
+    def prediction(self, tx_pos: FloatArray) -> Prediction:
+        """Spectra and standard deviations at positions [m, 3], metres."""
+        std = np.empty((len(tx_pos), *self.report.shape))
+        mean = self._estimated(tx_pos, std)
+        std *= self.spread
+        return Prediction(mean, std)
+
+    def _estimated(self, tx_pos: FloatArray, std: Image | None) -> NDArray[np.float32]:
+        """Spectra [m, height, width] and, written into ``std``, standard deviations before `spread`."""
+        # Filled chunk by chunk: joined chunks would take the memory twice.
         mean = np.empty((len(tx_pos), *self.report.shape), np.float32)
         with one_blas_thread():
             for begin in range(0, len(tx_pos), CHUNK):
                 rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
-                mean[rows] = self.mixed(self.signals.predict(at), self.nearby.predict(at), None)[0]
+                nearby_std = None if std is None else self.nearby.std(at)
+                mean[rows], deviation = self.mixed(self.signals.predict(at), self.nearby.predict(at), nearby_std)
+                if std is not None:
+                    std[rows] = deviation
         return np.clip(mean, 0, 1)
-
-    def prediction(self, tx_pos: FloatArray) -> Prediction:
-        """Spectra and standard deviations at positions [m, 3], metres."""
-        # Filled chunk by chunk: joined chunks would take the memory twice.
-        mean, std = np.empty((len(tx_pos), *self.report.shape), np.float32), np.empty((len(tx_pos), *self.report.shape))
-        with one_blas_thread():
-            for begin in range(0, len(tx_pos), CHUNK):
-                rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
-                mean[rows], std[rows] = self.mixed(
-                    self.signals.predict(at), self.nearby.predict(at), self.nearby.std(at)
-                )
-        std *= self.spread
-        return Prediction(np.clip(mean, 0, 1), std)
 
     def facts(self) -> dict[str, Any]:
         """Lengths, shares and weights."""
