@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,15 +21,14 @@ from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.chunks import CHUNK_SIZE
 from ..gaussians.parameters import Gaussians
-from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
 from .reach import Reach
-from .recordings import Recordings, Where
+from .recordings import Recordings
 from .static_operator import StaticOperator
-from .step import Params, device_pose, evaluated
+from .step import Params, evaluated, places_of
 
 if TYPE_CHECKING:
     from ..tracing.traced_field import TracedField
@@ -76,9 +74,8 @@ class Predictor:
         # Operator and recorded prediction give the splatted magnitude at each direction.
         self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
         self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
-        self._poses = [device_pose(r) for r in self.receivers for _ in range(self.graph.carriers)]
+        self._places = places_of(self.graph)
         self._others: dict[float, Predictor] = {}
-        self._plane = perception_plane(height, width, mi.Float)
         self._field, self._count = field, -1
         single = self._pixels and self.graph.form.carriers_hz is None
         self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
@@ -117,8 +114,7 @@ class Predictor:
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
             assert self._field is not None, "an operator needs Gaussians"
-            size = self._plane.height, self._plane.width
-            self._still = StaticOperator(self._field, params, self.receivers, *size, self._store)
+            self._still = StaticOperator(self._field, params, self.receivers, *self.graph.form.size, self._store)
         return self._still
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
@@ -136,9 +132,8 @@ class Predictor:
             return self, receiver * self.graph.carriers + int(np.searchsorted(known, carrier_hz))
         if carrier_hz not in self._others:
             graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
-            made = Predictor(self._field, {}, self.receivers, *size, graph=graph)
-            made.update(self._params)
-            self._others[carrier_hz] = made
+            self._others[carrier_hz] = Predictor(self._field, {}, self.receivers, *size, graph=graph)
+            self._others[carrier_hz].update(self._params)
         self._others[carrier_hz].reach = self.reach
         return self._others[carrier_hz], receiver
 
@@ -157,8 +152,16 @@ class Predictor:
     def _sides(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
     ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
-        """Groups of positions: their numbers, predictor and port, and traced side."""
-        for rows in self._searched_together(tx_pos_m, carriers_hz):
+        """Groups of positions: their numbers, predictor and port, and traced side.
+
+        Positions at several carriers are in the same group, as are all without a scene.
+        """
+        order = np.arange(len(tx_pos_m))
+        size = SEARCHED if self.graph.scene is not None else max(len(order), 1)
+        if self.graph.scene is not None and carriers_hz is not None:
+            order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
+        for start in range(0, len(order), size):
+            rows = order[start : start + size]
             turned, carriers = (None if part is None else part[rows] for part in (heading_rad, carriers_hz))
             sides = self.graph.trace(tx_pos_m[rows], receiver, turned, carriers, self._params)
             for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
@@ -205,42 +208,10 @@ class Predictor:
         whole[used] = found
         return whole
 
-    def _searched_together(self, tx_pos_m: FloatArray, carriers_hz: FloatArray | None) -> list[IntArray]:
-        """Rows of positions [m, 3] in groups, those of one position at several carriers in the same."""
-        if self.graph.scene is None:
-            return [np.arange(len(tx_pos_m))]
-        if carriers_hz is None:
-            order, size = np.arange(len(tx_pos_m)), SEARCHED
-        else:
-            order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
-        return [order[start : start + size] for start in range(0, len(order), size)]
-
-    def _evaluated(
-        self,
-        tx_pos_m: FloatArray,
-        receiver: int,
-        side: TracedField | None,
-        slots: IntArray | None,
-        weight: NDArray[Any] | None,
-        alone: Alone | None = None,
-    ) -> Any:
-        """Report of both sides, flat, recorded where it can be; positions of weight 0 have paths only."""
-        learned = self._field is not None and alone != "traced"
-        learned &= side is None or weight is None or bool(np.any(weight))
-        if side is not None and len(side) == 1 and self._may_record(1):
-            return self._single(tx_pos_m.T, receiver, side, learned, weight, alone)
-        signal = self._signal(tx_pos_m.T, receiver) if learned else None
-        report = self.graph.report(receiver, side, learned, alone=alone)
-        return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight, signal)
-
-    def _where(self, port: int) -> Where:
-        """Number, pose and directions of a port's receiver, and the logarithm of its carrier."""
-        return port // self.graph.carriers, self._poses[port], self._plane, self.graph.log_carrier(port)
-
     def of_side(
         self,
-        tx_pos_m: FloatArray,
-        receiver: int,
+        conditions: FloatArray,
+        port: int,
         side: TracedField | None,
         slots: IntArray,
         weight: NDArray[Any] | None,
@@ -249,38 +220,62 @@ class Predictor:
         """Predictions for transmitters whose paths are known.
 
         Args:
-            tx_pos_m: positions [m, 3], metres.
-            receiver: number of the receiver.
+            conditions: positions [m, 3], metres, or features [m, features].
+            port: number of the port.
             side: its traced side, or None.
             slots: rows of the traced side [m].
             weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
-            alone: one of both sides (`Graph.report`); None: both.
+            alone: component reported alone (`Graph.report`); None: both together.
 
         Returns:
             Predictions as of `__call__`.
         """
-
-        def found(part: slice) -> Any:
+        shape, count = self.graph.models[port].shape, len(conditions)
+        if self.graph.form.features:  # of one antenna of the array
+            shape = shape[-2:]
+        out = np.empty((count, *shape), np.float32)
+        together = self._together if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
+        for start in range(0, count, together):
+            part = slice(start, min(start + together, count))
             weights = None if weight is None else weight[part]
-            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weights, alone)
+            flat = self._evaluated(conditions[part].T, port, side, slots[part], weights, alone)
+            out[part] = flat.numpy().reshape(part.stop - part.start, *shape)
+        return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 
-        return self._in_parts(len(tx_pos_m), receiver, found)
+    def _evaluated(
+        self,
+        condition: FloatArray,
+        port: int,
+        side: TracedField | None,
+        slots: IntArray,
+        weight: NDArray[Any] | None,
+        alone: Alone | None,
+    ) -> Any:
+        """Report for conditions [3 or features, m], flat, recorded where it can be; paths alone at weights 0."""
+        if self._recordable:
+            return self._learned(condition, port, weight)
+        learned = self._field is not None and alone != "traced"
+        learned &= side is None or weight is None or bool(np.any(weight))
+        if side is not None and len(side) == 1 and self._may_record(1):
+            return self._single(condition, port, side, learned, weight, alone)
+        signal = self._signal(condition, port) if learned else None
+        report = self.graph.report(port, side, learned, alone=alone)
+        return evaluated(report, self._params, condition, self._places[port], slots, weight, signal)
 
-    def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """Report for conditions [3 or features, at most `TOGETHER`], flat; recorded unless networks run in chunks."""
-        where = self._where(receiver)
+    def _learned(self, condition: FloatArray, port: int, weight: NDArray[Any] | None) -> Any:
+        """Report of Gaussians alone for at most `TOGETHER` conditions; recorded unless networks run in chunks."""
+        place = self._places[port]
         if self._count * self._together > CHUNK_SIZE:
-            report = self.graph.report(receiver, None, chunked=True)
-            return evaluated(report, self._params, condition, *where, weight=weight)
-        report = self.graph.report(receiver, None)
+            report = self.graph.report(port, None, chunked=True)
+            return evaluated(report, self._params, condition, place, weight=weight)
+        report = self.graph.report(port, None)
 
         def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any, ...]:
             return (report(params, batch),)
 
         # One recording serves the pixels of all ports.
-        port, state = None if self._pixels else receiver, partial(self.graph.arrays, receiver, None)
-        name = "report", port
-        return self._recordings(name, self._together, reported, self._params, condition, where, weight, state)[0]
+        name, state = ("report", None if self._pixels else port), partial(self.graph.arrays, port, None)
+        return self._recordings(name, self._together, reported, self._params, condition, place, weight, state)[0]
 
     def _may_record(self, size: int) -> bool:
         """Whether functions of Gaussians are recorded for batches of a size: see `Recordings`."""
@@ -305,7 +300,7 @@ class Predictor:
         def read() -> list[Any]:
             return self.graph.arrays(port, self._traced[name])
 
-        return self._recordings(name, 1, reported, self._params, condition, self._where(port), weight, read)[0]
+        return self._recordings(name, 1, reported, self._params, condition, self._places[port], weight, read)[0]
 
     def _signal(self, condition: FloatArray, port: int) -> tuple[Any, ...] | None:
         """Recorded signal of the Gaussians for conditions [3, m], without its unit; None: it is not recorded.
@@ -315,8 +310,8 @@ class Predictor:
         if not TOGETHER // 2 < condition.shape[1] <= TOGETHER or not self._may_record(TOGETHER):
             return None
         # One recording serves the poses of all receivers unless they are trained.
-        name, where = ("signal", port if self.graph.moves else None), self._where(port)
-        return self._recordings(name, TOGETHER, partial(self.graph.learned, port), self._params, condition, where)
+        name, place = ("signal", port if self.graph.moves else None), self._places[port]
+        return self._recordings(name, TOGETHER, partial(self.graph.learned, port), self._params, condition, place)
 
     def _reported(
         self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
@@ -336,26 +331,7 @@ class Predictor:
         if self.graph.scene is None and weight is not None and not weight.any():
             return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
 
-        if self._recordable or not len(given):
-
-            def recorded(part: slice) -> Any:
-                return self._learned(given[part].T, receiver, None if weight is None else weight[part])
-
-            return self._in_parts(len(given), receiver, recorded)
-
         return self.of_side(given, receiver, side, slots, weight)
-
-    def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
-        """Reports for all transmitters, from flat reports of batches."""
-        shape = self.graph.models[receiver].shape
-        if self.graph.form.features:  # of one antenna of the array
-            shape = shape[-2:]
-        out = np.empty((count, *shape), np.float32)
-        together = self._together if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
-        for start in range(0, count, together):
-            part = slice(start, min(start + together, count))
-            out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
-        return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
 
     def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
         """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""

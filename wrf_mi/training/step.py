@@ -117,19 +117,6 @@ class TrainingData:
         return scale * dr.gather(type(self.truth), self.weight, row)
 
 
-@dataclass
-class StepReport:
-    """Result of a step.
-
-    Attributes:
-        loss: loss of the batch before the step, one value.
-        view_gradient_norm: norm of the gradient by each Gaussian's direction from the receiver, [n].
-    """
-
-    loss: Any
-    view_gradient_norm: Any
-
-
 def make_step(
     report: Report,
     rates: Mapping[str, float],
@@ -149,9 +136,10 @@ def make_step(
         evaluation: evaluation of the report's Gaussians; None: one that Dr.Jit can record.
 
     Returns:
-        Function that takes step ``number`` (from 1) of ``adam`` in place, with conditions ``rows`` in place of those of
-        ``batch``, and returns the new running mean of the
-        parameters, the report of values that are not finite, after which nothing changes any more, and a `StepReport`.
+        Function that takes step ``number`` (from 1) of ``adam`` in place, on conditions ``rows`` at the port of
+        ``batch``, which has none. It returns the new running mean of the parameters, the report of values that are not
+        finite, after which nothing changes any more, the batch's loss before the step, and the norm of the gradient by
+        each Gaussian's direction from the receiver, [n].
     """
     values = math.prod(shape)
 
@@ -165,7 +153,7 @@ def make_step(
         decay: Any,
         number: Any,
         trouble: NonFiniteReport,
-    ) -> tuple[Params, NonFiniteReport, StepReport]:
+    ) -> tuple[Params, NonFiniteReport, Any, Any]:
         params = rated_params(adam, rates, factor)
         condition, truth = data.select(rows, batch.receiver, values)
         scale = data.factor(rows, batch.receiver, values)
@@ -181,14 +169,14 @@ def make_step(
             pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
             distance = dr.sqrt(sum(c * c for c in offset))
             view_gradient_norm = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
-        result = StepReport(dr.detach(loss), view_gradient_norm)
-        dr.eval(adam, mean, trouble, result)
-        return mean, trouble, result
+        loss = dr.detach(loss)
+        dr.eval(adam, mean, trouble, loss, view_gradient_norm)
+        return mean, trouble, loss, view_gradient_norm
 
     if evaluation is None or evaluation.recordable:
         return Recorded(step, state)
 
-    def unrecorded(*arguments: Any) -> tuple[Params, NonFiniteReport, StepReport]:
+    def unrecorded(*arguments: Any) -> tuple[Params, NonFiniteReport, Any, Any]:
         # As in a recording: a row that is a constant would compile the kernels anew.
         dr.make_opaque(arguments)
         result = step(*arguments)

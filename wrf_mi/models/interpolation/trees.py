@@ -39,6 +39,7 @@ class Trees(CheckedSettings):
             tx_pos: shape [n, 3], metres.
             observation: real, shape [n]; NaN, where nothing was received, is left out.
             tx_heading_rad: shape [n], or None to leave headings out.
+            seed: seed of the cuts.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, or complex observations.
