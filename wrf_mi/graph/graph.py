@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
+from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.chunks import gaussians_in_parts
 from ..gaussians.footprint import Pose
@@ -42,7 +43,7 @@ from ..tracing.solve import Prepared
 from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
-from .evaluations import evaluation_of
+from .evaluations import EVALUATIONS, Evaluation
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
@@ -132,7 +133,7 @@ class Graph:
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.tx_antenna = tx_antenna
         self.surface: SurfaceGaussians | None = None
-        self.evaluation = evaluation_of(evaluation, scene, traced)
+        self.evaluation: Evaluation = resolve(EVALUATIONS[evaluation])(scene, traced)
         self._stated_hz = form.carrier_hz
         self._take(form)
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import to_tensor
+from ..backend.device import to_float, to_tensor
+from ..backend.recorded import Recorded
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text, rows_by_carrier
@@ -26,7 +28,6 @@ from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
 from .reach import Reach
-from .recordings import Recordings
 from .static_operator import StaticOperator
 from .step import Params, evaluated, places_of
 
@@ -79,7 +80,7 @@ class Predictor:
         self._field, self._count = field, -1
         single = self._pixels and self.graph.form.carriers_hz is None
         self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
-        self._recordings = Recordings()
+        self._recordings: dict[tuple[Hashable, int], Recorded] = {}
         self._traced: dict[Hashable, TracedField] = {}
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
@@ -90,7 +91,7 @@ class Predictor:
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
             # A recording is valid for one number of Gaussians.
-            self._count, self._recordings = count, Recordings()
+            self._count, self._recordings = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
         for other in self._others.values():
@@ -252,66 +253,80 @@ class Predictor:
         alone: Alone | None,
     ) -> Any:
         """Report for conditions [3 or features, m], flat, recorded where it can be; paths alone at weights 0."""
+        place = self._places[port]
         if self._recordable:
-            return self._learned(condition, port, weight)
+            if not self._may_record(self._together):
+                report = self.graph.report(port, None, chunked=True)
+                return evaluated(report, self._params, condition, place, weight=weight)
+            # One recording serves the pixels of all ports.
+            name, arrays = ("report", None if self._pixels else port), partial(self.graph.arrays, port, None)
+            return self._recorded(name, self._together, self.graph.report(port, None), condition, port, weight, arrays)
         learned = self._field is not None and alone != "traced"
         learned &= side is None or weight is None or bool(np.any(weight))
         if side is not None and len(side) == 1 and self._may_record(1):
-            return self._single(condition, port, side, learned, weight, alone)
-        signal = self._signal(condition, port) if learned else None
+            # Recordings of one transmitter serve others, whose traced side is an input.
+            of_one = "both", port, learned, alone, side.form
+            self._traced[of_one] = side
+
+            def reported(params: Params, batch: Batch) -> Any:
+                return self.graph.report(port, self._traced[of_one], learned, alone=alone)(params, batch)
+
+            def read() -> list[Any]:
+                return self.graph.arrays(port, self._traced[of_one])
+
+            return self._recorded(of_one, 1, reported, condition, port, weight, read)
+        signal = None
+        # Batches of `TOGETHER` are recorded; copies that filled others would cost more than they save.
+        if learned and TOGETHER // 2 < condition.shape[1] <= TOGETHER and self._may_record(TOGETHER):
+            # One recording serves the poses of all receivers unless they are trained.
+            of_signal = "signal", port if self.graph.moves else None
+            signal = self._recorded(of_signal, TOGETHER, partial(self.graph.learned, port), condition, port)
         report = self.graph.report(port, side, learned, alone=alone)
-        return evaluated(report, self._params, condition, self._places[port], slots, weight, signal)
-
-    def _learned(self, condition: FloatArray, port: int, weight: NDArray[Any] | None) -> Any:
-        """Report of Gaussians alone for at most `TOGETHER` conditions; recorded unless networks run in chunks."""
-        place = self._places[port]
-        if self._count * self._together > CHUNK_SIZE:
-            report = self.graph.report(port, None, chunked=True)
-            return evaluated(report, self._params, condition, place, weight=weight)
-        report = self.graph.report(port, None)
-
-        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any, ...]:
-            return (report(params, batch),)
-
-        # One recording serves the pixels of all ports.
-        name, state = ("report", None if self._pixels else port), partial(self.graph.arrays, port, None)
-        return self._recordings(name, self._together, reported, self._params, condition, place, weight, state)[0]
+        return evaluated(report, self._params, condition, place, slots, weight, signal)
 
     def _may_record(self, size: int) -> bool:
-        """Whether functions of Gaussians are recorded for batches of a size: see `Recordings`."""
+        """Whether functions of Gaussians are recorded for batches of a size: see `_recorded`."""
         return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
 
-    def _single(
+    def _recorded(
         self,
+        name: Hashable,
+        size: int,
+        function: Callable[[Params, Batch], Any],
         condition: FloatArray,
         port: int,
-        side: TracedField,
-        learned: bool,
-        weight: NDArray[Any] | None,
-        alone: Alone | None,
+        weight: NDArray[Any] | None = None,
+        state: Callable[[], Any] | None = None,
     ) -> Any:
-        """Recorded report of the only transmitter of a traced side, whose arrays are inputs of the recording."""
-        name = "both", port, learned, alone, side.form
-        self._traced[name] = side
+        """Evaluate a function of at most ``size`` conditions, which Dr.Jit records at its first call by a name.
 
-        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any]:
-            return (self.graph.report(port, self._traced[name], learned, alone=alone)(params, batch),)
-
-        def read() -> list[Any]:
-            return self.graph.arrays(port, self._traced[name])
-
-        return self._recordings(name, 1, reported, self._params, condition, self._places[port], weight, read)[0]
-
-    def _signal(self, condition: FloatArray, port: int) -> tuple[Any, ...] | None:
-        """Recorded signal of the Gaussians for conditions [3, m], without its unit; None: it is not recorded.
-
-        Batches of `TOGETHER` are; copies that filled others would cost more than they save.
+        The number of transmitters is a constant of the recorded kernels: each size is a recording of its own, and
+        copies of the last transmitter fill a batch. Networks are not evaluated in chunks, and lists of tiles, which a
+        recorded function cannot count, have room for all: neither is for very many Gaussians. ``state`` returns the
+        arrays that the function reads beside its arguments.
         """
-        if not TOGETHER // 2 < condition.shape[1] <= TOGETHER or not self._may_record(TOGETHER):
-            return None
-        # One recording serves the poses of all receivers unless they are trained.
-        name, place = ("signal", port if self.graph.moves else None), self._places[port]
-        return self._recordings(name, TOGETHER, partial(self.graph.learned, port), self._params, condition, place)
+        count, place = condition.shape[1], self._places[port]
+        if (name, size) not in self._recordings:
+
+            def recordable(params: Params, batch: Batch) -> Any:
+                with dr.suspend_grad():
+                    return function(params, batch)
+
+            # Arrays that are made from NumPy's memory at first use must exist before a recording.
+            evaluated(function, self._params, condition[:, :1], place)
+            self._recordings[name, size] = Recorded(recordable, state)
+        filled = np.minimum(np.arange(size), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, size)
+        dr.make_opaque(slots)
+        weights = None if weight is None else to_float(weight[filled])
+        arrays = self._recordings[name, size](self._params, place.batch(tx, slots, weights))
+
+        def leading(values: Any) -> Any:
+            return dr.gather(type(values), values, dr.arange(mi.UInt32, count * (dr.width(values) // size)))
+
+        if count == size:
+            return arrays
+        return tuple(map(leading, arrays)) if isinstance(arrays, tuple) else leading(arrays)
 
     def _reported(
         self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
