@@ -125,4 +125,4 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.M
     parts = Predictor(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
     assert not parts._recordings
-    assert all(one.n_recordings > 0 for one in recorded._recordings._recorded.values())
+    assert all(one.n_recordings > 0 for one in recorded._recordings.values())

@@ -19,6 +19,7 @@ from wrf_mi.backend.device import on_device, to_tensor
 from wrf_mi.core import InputError, Receiver, Record, pixel_directions
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.registry import resolve
+from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.blend_rays import blend_rays
 from wrf_mi.gaussians.bundles import all_lists, ray_bundles
@@ -35,6 +36,7 @@ from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.pose import pose_names, receiver_pose
 from wrf_mi.tracing.slab import slab
 from wrf_mi.training.compress import Compression
+from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer
