@@ -38,10 +38,10 @@ def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -
     on_wall = np.abs(start.position_m[:, :, None] - np.array([[0, LENGTH], [0, WIDTH], [0, HEIGHT]])).min(axis=(1, 2))
     assert (on_wall < 0.1).mean() > 0.4
     # What carries most power is a direct path, and starts as the strongest and least transparent.
-    strongest = int(np.abs(start.signal).argmax())
+    strongest = int(np.abs(start.signals).argmax())
     assert np.linalg.norm(tx - start.position_m[strongest], axis=1).min() < 1.0
     assert start.opacity.argmax() == strongest
-    assert np.isclose(np.abs(start.signal).max(), 0.3)
+    assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 
 def test_image_maps_are_orthogonal(traced: tuple[Paths, np.ndarray]) -> None:
@@ -81,7 +81,7 @@ def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) ->
     start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
-    assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signal.astype(np.complex64))
+    assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
     assert np.isfinite(weights["opacity"]).all()
     assert np.ptp(weights["opacity"]) > 0
 

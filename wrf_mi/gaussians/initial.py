@@ -22,7 +22,8 @@ class InitialGaussians:
         position_m: shape [n, 3], world frame.
         scale_m: standard deviation of each (isotropic) Gaussian, shape [n].
         opacity: alpha at the centre, common to all or of each, shape [n], in (0, 1).
-        signal: standard deviation of the random starting signals, or the complex signal of each, shape [n].
+        signal: standard deviation of the random starting signals.
+        signals: complex signal of each, shape [n], in place of random ones; None: random.
         image_map: affine map [n, 3, 4] of the transmitter to the image that each represents, image = A [x, 1]; None:
             the identity.
     """
@@ -30,7 +31,8 @@ class InitialGaussians:
     position_m: NDArray[np.float64]
     scale_m: NDArray[np.float64]
     opacity: float | NDArray[np.float64] = 0.1
-    signal: float | NDArray[np.complex128] = 0.3
+    signal: float = 0.3
+    signals: NDArray[np.complex128] | None = None
     image_map: NDArray[np.float64] | None = None
 
     @property
@@ -54,8 +56,8 @@ class InitialGaussians:
 
     def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
         """The parameter ``signal`` [2, n] of a field with a static signal: real and imaginary parts."""
-        if isinstance(self.signal, np.ndarray):
-            return np.stack([self.signal.real, self.signal.imag]).astype(np.float32)
+        if self.signals is not None:
+            return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
         return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
 
     def image(self) -> NDArray[np.float32]:

@@ -96,7 +96,7 @@ def gaussians_from_paths(
     amplitude = signal * np.sqrt(relative)
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
-    return InitialGaussians(position + jitter, scale, opacities, amplitude * np.exp(1j * phase), affine)
+    return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase), affine)
 
 
 def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Generator) -> InitialGaussians:

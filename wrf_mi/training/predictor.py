@@ -268,7 +268,7 @@ class Predictor:
             of_one = "both", port, learned, alone, side.form
             self._traced[of_one] = side
 
-            def reported(params: Params, batch: Batch) -> Any:
+            def reported(params: Mapping[str, Any], batch: Batch) -> Any:
                 return self.graph.report(port, self._traced[of_one], learned, alone=alone)(params, batch)
 
             def read() -> list[Any]:
@@ -292,7 +292,7 @@ class Predictor:
         self,
         name: Hashable,
         size: int,
-        function: Callable[[Params, Batch], Any],
+        function: Callable[[Mapping[str, Any], Batch], Any],
         condition: FloatArray,
         port: int,
         weight: NDArray[Any] | None = None,
