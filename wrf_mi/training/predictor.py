@@ -144,11 +144,12 @@ class Predictor:
         """Reports for positions [m, 3] at their carriers [m], Hz, each with paths of one search for all carriers."""
         if not len(tx_pos_m):
             return self._reported(tx_pos_m, receiver * self.graph.carriers)
-        found, order = list[NDArray[Any]](), list[IntArray]()
-        for rows, predictor, port, side in self._sides(tx_pos_m, receiver, heading_rad, carriers_hz):
-            found.append(predictor._reported(tx_pos_m[rows], port, side))
-            order.append(rows)
-        return np.concatenate(found)[np.argsort(np.concatenate(order))]
+        groups = [
+            (rows, predictor._reported(tx_pos_m[rows], port, side))
+            for rows, predictor, port, side in self._sides(tx_pos_m, receiver, heading_rad, carriers_hz)
+        ]
+        order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
+        return reports[np.argsort(order)]
 
     def _sides(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
@@ -188,10 +189,10 @@ class Predictor:
         reports, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
         for rows, predictor, port, side in self._sides(tx_pos_m, receiver, turned, carriers_hz):
             assert side is not None, "a graph without a scene has one side"
-            here = tx_pos_m[rows]
-            reports.append({"whole": predictor._reported(here, port, side)})
+            positions = tx_pos_m[rows]
+            reports.append({"whole": predictor._reported(positions, port, side)})
             if self._field is not None:
-                reports[-1] |= {alone: predictor._of_one_side(here, port, side, alone) for alone in get_args(Alone)}
+                reports[-1] |= {one: predictor._of_one_side(positions, port, side, one) for one in get_args(Alone)}
             statistics.append(side.statistics(self._params))
             order.append(rows)
         back = np.argsort(np.concatenate(order))

@@ -151,10 +151,9 @@ class Trainer(TrainingLoop):
         gains: dict[str, list[NDArray[np.float32]]] = {}
         for port, side in enumerate(self._sides):
             if side is not None and side.gain_name in values and len(side):
-                seen = self.targets.truth[port // self.graph.carriers, self.plan.known[port]]
-                for name, gain in self.graph.match_gain(port, side, {}, seen).items():
-                    gains.setdefault(name, []).append(gain)
-        values |= {name: np.mean(found, axis=0, dtype=np.float32) for name, found in gains.items()}
+                observed = self.targets.truth[port // self.graph.carriers, self.plan.known[port]]
+                gains.setdefault(side.gain_name, []).append(self.graph.match_gain(port, side, observed))
+        values |= {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
         if LEVEL in values:
             values[LEVEL][0] = [self._level(values, self.plan.ports(r)[0]) for r in range(len(self.record.receivers))]
         return values

@@ -57,15 +57,6 @@ class Trend:
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-constant = Trend()
-"""Trend of one unknown mean."""
-
-
-def log_distance(receiver_m: ArrayLike) -> Trend:
-    """Trend of the log-distance law at a receiver's position [3], metres."""
-    return Trend(np.asarray(receiver_m, float))
-
-
 SCALE = "scale"
 """Key of the arrays that kriging without standard deviations has not."""
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
@@ -211,7 +202,7 @@ class Kriging(CovarianceSettings):
         seed: seed of the rows of the likelihood.
     """
 
-    trend: Trend = constant
+    trend: Trend = Trend()
     trend_fit: Literal["gls", "ols"] = "gls"
     seed: int = 0
 
@@ -340,7 +331,7 @@ class KrigingSettings(CovarianceSettings):
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
-    return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
+    return Trend(receiver.position_m if name == LOG_DISTANCE else None)
 
 
 def fit_generic(rows: ReceiverRows) -> Kriged:
