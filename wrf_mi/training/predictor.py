@@ -330,30 +330,30 @@ class Predictor:
         return tuple(map(leading, arrays)) if isinstance(arrays, tuple) else leading(arrays)
 
     def _reported(
-        self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
+        self, conditions: FloatArray, port: int, side: TracedField | None = None, slots: IntArray | None = None
     ) -> NDArray[Any]:
         """Reports for positions [m, 3] or features [m, features], complex numbers as such.
 
         ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
         """
-        slots = np.arange(len(given)) if slots is None else slots
-        weight = None if self.reach is None else self.reach.weight(given, receiver // self.graph.carriers)
-        if weight is not None and weight.any() and not weight.all():
-            # Gaussians of weight 0 are not evaluated.
-            parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
-            found = [self._reported(given[part], receiver, side, slots[part]) for part in parts]
-            return np.concatenate(found)[np.argsort(np.concatenate(parts))]
-
-        if self.graph.scene is None and weight is not None and not weight.any():
-            return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
-
-        return self.of_side(given, receiver, side, slots, weight)
+        slots = np.arange(len(conditions)) if slots is None else slots
+        weight = None if self.reach is None else self.reach.weight(conditions, port // self.graph.carriers)
+        if weight is not None and not weight.all():
+            if weight.any():
+                # Gaussians of weight 0 are not evaluated.
+                parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
+                reports = [self._reported(conditions[part], port, side, slots[part]) for part in parts]
+                return np.concatenate(reports)[np.argsort(np.concatenate(parts))]
+            if self.graph.scene is None:
+                return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
+        return self.of_side(conditions, port, side, slots, weight)
 
     def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
         """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
         features, divisor = normalised_uplink(known_uplink(uplink))
-        found = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1) * divisor[..., None]
-        return (found if len(self.graph.form.outputs) > 1 else found[:, 0]).astype(np.complex64)
+        reports = self._reported(np.asarray(features, float), receiver)
+        channels = reports.reshape(*divisor.shape, -1) * divisor[..., None]
+        return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
 
     def __call__(
         self,
@@ -395,12 +395,9 @@ class Predictor:
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
-        given = np.asarray(tx_pos_m, float)
-        turned = known_headings(tx_heading_rad, len(given), self.graph.form.headings)
-        self.graph.check(given)
-        if self.graph.form.carriers_hz is None:
-            return self._of_positions(given, index, turned, None)
-        if carriers_hz is None:
-            known = carriers_text(self.graph.form.carriers_hz)
-            raise InputError(f"trained with {known}; give the carrier of every transmitter")
-        return self._of_positions(given, index, turned, np.asarray(carriers_hz, float))
+        exact, trained_hz = np.asarray(tx_pos_m, float), self.graph.form.carriers_hz
+        turned = known_headings(tx_heading_rad, len(exact), self.graph.form.headings)
+        self.graph.check(exact)
+        if trained_hz is not None and carriers_hz is None:
+            raise InputError(f"trained with {carriers_text(trained_hz)}; give the carrier of every transmitter")
+        return self._of_positions(exact, index, turned, None if trained_hz is None else np.asarray(carriers_hz, float))
