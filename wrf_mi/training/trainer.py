@@ -23,7 +23,7 @@ from ..graph.settings import TRACED_NAMES
 from .adam import NonFiniteReport
 from .config import TrainConfig
 from .fields import check_params
-from .fit_plan import FitPlan
+from .fit_plan import FIELD, SURFACES, FitPlan
 from .initial import initial_gaussians
 from .judging import HeldOutReports, Judge
 from .loop import TrainingLoop
@@ -31,7 +31,6 @@ from .predictor import Predictor
 from .reach import Reach
 from .state import FitState
 from .step import Loss, TrainingData, evaluated, make_step, places_of
-from .targets import FIELD, SURFACES
 
 logger = logging.getLogger(__name__)
 
