@@ -59,7 +59,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     plane, pose = perception_plane(*made.observation.shape[-2:], mi.Float), device_pose(RECEIVER)
     data = TrainingData(to_tensor(made.tx_pos_m.T), to_float(made.observation), to_float([1.0]))
     batch = config.batch
-    tx, truth = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
+    tx, truth, _ = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
     shown = grey(trainer.field, params, tx, pose, plane)
     dr.backward(spectrum_loss(shown, truth, batch, plane.height, plane.width, config.loss.ssim_weight)[0])
     found |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}

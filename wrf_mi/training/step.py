@@ -97,24 +97,20 @@ class TrainingData:
     scale: Any
     weight: Any = None
 
-    def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any]:
-        """Conditions [3 or features, batch] and observations [batch * values] of some conditions at one receiver."""
+    def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any, Any]:
+        """Some conditions [3 or features, batch] and their observations [batch * values] at one receiver, and the
+        factor of differences in the loss: one value, or [batch * values] with ``weight``.
+        """
         k, n = self.condition.shape
         batch, index_type = dr.width(rows), type(rows)
         flat = self.condition.array
         tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
         slot = dr.arange(index_type, batch * values)
         row = dr.gather(index_type, rows, slot // values) + receiver * n
-        return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values)
-
-    def factor(self, rows: Any, receiver: Any, values: int) -> Any:
-        """Factor of differences in the loss: one value, or [batch * values] with ``weight``."""
-        scale = dr.gather(type(self.truth), self.scale, receiver)
-        if self.weight is None:
-            return scale
-        slot = dr.arange(type(rows), dr.width(rows) * values)
-        row = dr.gather(type(rows), rows, slot // values) + receiver * self.condition.shape[1]
-        return scale * dr.gather(type(self.truth), self.weight, row)
+        factor = dr.gather(type(self.truth), self.scale, receiver)
+        if self.weight is not None:
+            factor *= dr.gather(type(self.truth), self.weight, row)
+        return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values), factor
 
 
 def make_step(
@@ -155,8 +151,7 @@ def make_step(
         trouble: NonFiniteReport,
     ) -> tuple[Params, NonFiniteReport, Any, Any]:
         params = rated_params(adam, rates, factor)
-        condition, truth = data.select(rows, batch.receiver, values)
-        scale = data.factor(rows, batch.receiver, values)
+        condition, truth, scale = data.select(rows, batch.receiver, values)
         truth = truth * scale
         # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather again.
         dr.schedule(truth, scale)
