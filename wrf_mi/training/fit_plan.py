@@ -34,14 +34,7 @@ def check_rows(split: Split, record: Record, source: str) -> None:
 
 
 class FitPlan:
-    """Data, graph and schedule of a fit, a function of its arguments only.
-
-    Args:
-        record: measurements of any task that a receiver model reports.
-        split: rows for training and for the choice of settings.
-        config: settings.
-        field: field that replaces the one of ``config.model``.
-        scene: scene whose paths are trained; None: Gaussians alone.
+    """Data, graph and schedule of a fit, a function of its arguments, those of `wrf_mi.training.trainer.Trainer`.
 
     Attributes:
         record, split: data.
