@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from ..backend.device import on_device, to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core import Receiver
-from ..core.types import SQUARED_MAGNITUDE_EPS
 from ..gaussians.footprint import Pose
-from ..gaussians.render import splat
 from ..gaussians.tiles import Plane, perception_plane
 from ..graph.evaluations import Evaluation
-from ..graph.graph import Batch, Field, Graph, Report
+from ..graph.graph import Batch, Graph, Report
 from ..tracing.field_calculator import Complex
 from .adam import NonFiniteReport, Params, guarded_step, rated_params
 
@@ -73,12 +71,6 @@ def places_of(graph: Graph) -> list[Place]:
     receivers = [port // graph.carriers for port in ports]
     poses = [device_pose(graph.receivers[receiver]) for receiver in receivers]
     return [Place(receivers[port], poses[port], plane, graph.log_carrier(port)) for port in ports]
-
-
-def grey(field: Field, params: Mapping[str, Any], tx_pos: Any, pose: Pose, plane: Plane) -> Any:
-    """Spectrum |R| of the pixel receiver, [batch * height * width], row-major, of transmitters [3, batch] in metres."""
-    re, im = splat(field.gaussians(params, tx_pos), pose, plane)
-    return dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS)
 
 
 @dataclass
