@@ -83,7 +83,7 @@ class Judge:
         if plan.graph.corrects:
             self.scores = self._corrected_scores(predict, state, rows)
         elif plan.graph.scene is not None:
-            each = [self._scores(predict, port, some) for port, some in enumerate(rows) if len(some)]
+            each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
             self.scores = np.concatenate([np.zeros(0), *each])
         else:
             record, known, score = plan.record, plan.split.validation, plan.task.training_score

@@ -143,8 +143,8 @@ class Trainer(TrainingLoop):
         rng = np.random.default_rng([self.config.seed, 0])
         values: dict[str, NDArray[np.float32]] = {}
         if self.graph.field is not None:
-            seen = replace(self.record, receivers=self.graph.receivers)
-            start = initial or initial_gaussians(self.config.initial, seen, self.split.train, rng, self.graph.sphere)
+            placed = replace(self.record, receivers=self.graph.receivers)
+            start = initial or initial_gaussians(self.config.initial, placed, self.split.train, rng, self.graph.sphere)
             values = self.graph.field.init(start, rng)
         values |= self.graph.parameters(self._sides) | self.graph.cover(self._sides)
         gains: dict[str, list[NDArray[np.float32]]] = {}

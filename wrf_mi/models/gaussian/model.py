@@ -205,8 +205,8 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         record, rows = trained_part(problem.record, split)
         plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
         drawn = np.random.default_rng([plan.config.seed, 0])
-        seen = replace(record, receivers=plan.graph.receivers)
-        initial_gaussians(plan.config.initial, seen, rows.train, drawn)
+        placed = replace(record, receivers=plan.graph.receivers)
+        initial_gaussians(plan.config.initial, placed, rows.train, drawn)
 
 
 @cache
