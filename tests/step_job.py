@@ -38,8 +38,9 @@ def main(folder: str, out: str, backend: str) -> None:
     from wrf_mi.backend.device import to_float, to_tensor
     from wrf_mi.datasets import load
     from wrf_mi.gaussians.tiles import perception_plane
+    from wrf_mi.graph.graph import Batch
     from wrf_mi.tasks.losses import spectrum_loss
-    from wrf_mi.training.step import TrainingData, device_pose, grey
+    from wrf_mi.training.step import TrainingData, device_pose
     from wrf_mi.training.trainer import Trainer
 
     record = load(folder)
@@ -49,8 +50,8 @@ def main(folder: str, out: str, backend: str) -> None:
     data = TrainingData(to_tensor(record.tx_pos_m.T), to_float(record.observation), to_float([1.0]))
     dr.enable_grad(params)
     batch = trainer.config.batch
-    tx, truth = data.select(mi.UInt32(trainer.split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
-    image = grey(trainer.field, params, tx, pose, plane)
+    tx, truth, _ = data.select(mi.UInt32(trainer.split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
+    image = trainer.graph.report(0, None)(params, Batch(tx, None, None, pose, plane))
     dr.backward(spectrum_loss(image, truth, batch, plane.height, plane.width, trainer.config.loss.ssim_weight)[0])
     gradients = {name: dr.grad(value).numpy() for name, value in params.items()}
     np.savez(out, image=dr.detach(image).numpy(), **gradients)

@@ -33,12 +33,13 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     from wrf_mi.core.settings import with_settings
     from wrf_mi.datasets import make_splits
     from wrf_mi.gaussians.tiles import perception_plane
+    from wrf_mi.graph.graph import Batch
     from wrf_mi.runs.api import train
     from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
     from wrf_mi.tasks.losses import spectrum_loss
     from wrf_mi.tracing import TraceOptions
     from wrf_mi.training.config import TrainConfig
-    from wrf_mi.training.step import TrainingData, device_pose, grey
+    from wrf_mi.training.step import TrainingData, device_pose
     from wrf_mi.training.trainer import Trainer
 
     from .traced import random_field, splatted
@@ -59,8 +60,8 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     plane, pose = perception_plane(*made.observation.shape[-2:], mi.Float), device_pose(RECEIVER)
     data = TrainingData(to_tensor(made.tx_pos_m.T), to_float(made.observation), to_float([1.0]))
     batch = config.batch
-    tx, truth = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
-    shown = grey(trainer.field, params, tx, pose, plane)
+    tx, truth, _ = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
+    shown = trainer.graph.report(0, None)(params, Batch(tx, None, None, pose, plane))
     dr.backward(spectrum_loss(shown, truth, batch, plane.height, plane.width, config.loss.ssim_weight)[0])
     found |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
     if backend == "llvm":

@@ -32,11 +32,12 @@ from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.graph.graph import Batch
 from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.training.config import TrainConfig, calibration_config
-from wrf_mi.training.step import TrainingData, device_pose, grey
+from wrf_mi.training.step import TrainingData, device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
@@ -109,7 +110,7 @@ def _batch() -> tuple[Call, Call]:
     dr.eval(params)
 
     def spectra(params: Any, tx_pos: Any, pose: Any, plane: Any) -> Any:
-        return grey(trainer.field, params, tx_pos, pose, plane)
+        return trainer.graph.report(0, None)(params, Batch(tx_pos, None, None, pose, plane))
 
     together, alone = Recorded(spectra), Recorded(spectra)
 

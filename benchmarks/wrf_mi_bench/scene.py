@@ -14,6 +14,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.array_files import write_arrays
+from wrf_mi.core.memory import peak_memory_mb
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
 from wrf_mi.scene.make import make_scene
@@ -21,7 +22,6 @@ from wrf_mi.scene.points import lidar_package
 from wrf_mi.scene.scan import OUTLIERS, RANGE_NOISE_M, RAYS_PER_POSE, simulate_scan
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.surfaces import scene_surfaces
-from wrf_mi.training.trainer import peak_memory_mb
 
 from .comparison import line, room_file
 from .trace import ROOMS, assign

@@ -124,5 +124,5 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.M
     monkeypatch.setattr(tiles, "RESERVED", 0)
     parts = Predictor(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
-    assert not parts._recordings._recorded
-    assert all(one.n_recordings > 0 for one in recorded._recordings._recorded.values())
+    assert not parts._recordings
+    assert all(one.n_recordings > 0 for one in recorded._recordings.values())

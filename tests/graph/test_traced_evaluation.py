@@ -21,10 +21,12 @@ from wrf_mi_plugins.ray_response import ray_footprints
 from wrf_mi.backend.device import on_device, to_tensor
 from wrf_mi.core import InputError, Receiver, Record, pixel_directions
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.registry import resolve
+from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.footprint import depth_order
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.evaluations import evaluation_of
+from wrf_mi.graph.evaluations import EVALUATIONS
 from wrf_mi.graph.graph import Batch, Graph
 from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
@@ -34,6 +36,7 @@ from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.pose import pose_names, receiver_pose
 from wrf_mi.tracing.slab import slab
 from wrf_mi.training.compress import Compression
+from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer
@@ -154,7 +157,7 @@ def test_traced_pose_gradient_matches_splatting_for_small_gaussians() -> None:
     plane = perception_plane(*FINE, mi.Float)
 
     def greys(name: str) -> Any:
-        evaluate = evaluation_of(name, None, TracedConfig())
+        evaluate = resolve(EVALUATIONS[name])(None, TracedConfig())
 
         def of(params: Any) -> Any:
             pose = receiver_pose(RECEIVERS[0], params, mi.Float)
@@ -315,8 +318,8 @@ def test_traced_run_with_a_scene_reproduces_its_score(tmp_path: Path) -> None:
 def test_untraceable_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"set traced.shift=0 and traced.tilt=0, or evaluation=splatted"):
         behind_the_ceiling(tmp_path, shift=1e-3)
-    with pytest.raises(InputError, match="'cast' is unknown; choose from splatted, traced"):
-        Graph(MODELS["wrf-gs"], RECEIVERS[:1], Form("pixel", SIZE), evaluation="cast")
+    with pytest.raises(InputError, match="evaluation: 'cast'; choose from splatted, traced"):
+        with_settings(TrainConfig(), ["evaluation=cast"])
     record, _ = made_record(24)
     with pytest.raises(InputError, match=r"--evaluation belongs to Gaussians .*, not to idw"):
         train(record, tmp_path / "idw", "idw", evaluation="traced")

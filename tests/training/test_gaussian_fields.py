@@ -337,7 +337,7 @@ def test_loss_divides_differences_by_stated_noise() -> None:
     data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(scale), to_float(weight))
     for r in (0, 1):
         number = mi.UInt32(batch.tolist())
-        truth, factor = data.select(number, r, 1)[1], data.factor(number, r, 1)
+        _, truth, factor = data.select(number, r, 1)
         found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), ssim_weight=0.0)
         # Everything is 2 dB too high; the sum of two numbers near -50 in single precision.
         np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)

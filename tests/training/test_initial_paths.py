@@ -40,7 +40,7 @@ def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -
     # What carries most power is a direct path, and starts as the strongest and least transparent.
     strongest = int(np.abs(start.signals).argmax())
     assert np.linalg.norm(tx - start.position_m[strongest], axis=1).min() < 1.0
-    assert start.opacities.argmax() == strongest
+    assert start.opacity.argmax() == strongest
     assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 

@@ -54,5 +54,5 @@ def test_predictions_are_recorded_once(one_gateway: Record) -> None:
     assert trainer.predictor() is predictor
     after = predictor(one_gateway.tx_pos_m[:3])
     assert np.abs(after - before).max() > 0
-    recorded = predictor._recordings._recorded.values()
+    recorded = predictor._recordings.values()
     assert 1 <= sum(one.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm

@@ -197,5 +197,5 @@ def test_held_out_rows_do_not_extend_the_reach(holdout_steps_fraction: float, kn
     reach = trainer.reach()
     assert trainer.state.chosen
     assert reach is not None
-    assert len(reach.known_m[0]) == (known or len(trainer.choosing.train))
-    assert len(trainer.choosing.train) < 40
+    assert len(reach.known_m[0]) == (known or len(trainer.plan.choosing.train))
+    assert len(trainer.plan.choosing.train) < 40

@@ -21,14 +21,19 @@ class InitialGaussians:
     Attributes:
         position_m: shape [n, 3], world frame.
         scale_m: standard deviation of each (isotropic) Gaussian, shape [n].
-        opacity: alpha at the centre, common to all, in (0, 1).
+        opacity: alpha at the centre, common to all or of each, shape [n], in (0, 1).
         signal: standard deviation of the random starting signals.
+        signals: complex signal of each, shape [n], in place of random ones; None: random.
+        image_map: affine map [n, 3, 4] of the transmitter to the image that each represents, image = A [x, 1]; None:
+            the identity.
     """
 
     position_m: NDArray[np.float64]
     scale_m: NDArray[np.float64]
-    opacity: float = 0.1
+    opacity: float | NDArray[np.float64] = 0.1
     signal: float = 0.3
+    signals: NDArray[np.complex128] | None = None
+    image_map: NDArray[np.float64] | None = None
 
     @property
     def count(self) -> int:
@@ -47,18 +52,18 @@ class InitialGaussians:
 
     def opacity_logit(self) -> NDArray[np.float32]:
         """The parameter ``opacity``, shape [1, n], as a logit."""
-        return np.full((1, self.count), logit(self.opacity), np.float32)
+        return np.broadcast_to(logit(self.opacity), (1, self.count)).astype(np.float32)
 
     def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
         """The parameter ``signal`` [2, n] of a field with a static signal: real and imaginary parts."""
+        if self.signals is not None:
+            return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
         return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
 
     def image(self) -> NDArray[np.float32]:
-        """The parameter ``image``: the affine map A, b of the transmitter to its image, rows [A b], shape [12, n].
-
-        It starts as the identity.
-        """
-        return np.tile(np.eye(3, 4).reshape(12, 1), self.count).astype(np.float32)
+        """The parameter ``image``: `image_map`, rows [A b], shape [12, n]."""
+        maps = np.tile(np.eye(3, 4), (self.count, 1, 1)) if self.image_map is None else self.image_map
+        return np.ascontiguousarray(maps.reshape(-1, 12).T, np.float32)
 
 
 def random_gaussians(

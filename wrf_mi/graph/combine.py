@@ -44,9 +44,9 @@ FLOOR_DB = 1e-3
 """Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
 
 
-def magnitude(traced: Complex | None, learned: Complex | None, how: How, dark: float = SQUARED_MAGNITUDE_EPS) -> Any:
+def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
     """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent side."""
-    return dr.sqrt(power(traced, learned, how) + dark)
+    return dr.sqrt(power(traced, learned, how) + SQUARED_MAGNITUDE_EPS)
 
 
 def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
@@ -225,19 +225,17 @@ class CsiReceiver:
 
     def signals(self, traced: TracedPaths | None, learned: Complex | None) -> tuple[Complex | None, Complex | None]:
         """Both sides at the antennas, [batch * outputs]; None where a side is None."""
-        float_type = _float_type(learned)
-        here, there = None, None
+        float_type, count = _float_type(learned), self._ports.count
+        sides: list[Complex | None] = [None, None]
         if traced is not None:
             re, im = path_sum(traced, self._ports)
-            here = float_type(re), float_type(im)
+            sides[0] = float_type(re), float_type(im)
         if learned is not None:
             parts = weighted(learned, direction_weights(self.height, self.width, 2, float_type))
             re, im = (dr.block_reduce(dr.ReduceOp.Add, part, 2 * self.height * self.width) for part in parts)
-            count = self._ports.count
-            there = (
-                (dr.repeat(re, count), dr.repeat(im, count)) if self.basis is None else self._basis.forward((re, im))
-            )
-        return here, there
+            equal = dr.repeat(re, count), dr.repeat(im, count)
+            sides[1] = equal if self.basis is None else self._basis.forward((re, im))
+        return sides[0], sides[1]
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Channels [batch * outputs * 2], real and imaginary part in turn, of the two sides; either may be None.
@@ -254,8 +252,8 @@ class CsiReceiver:
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
-        there, here = (np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report))
-        return float(np.log(there / here) / 2)
+        powers = [np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report)]
+        return float(np.log(powers[0] / powers[1]) / 2)
 
 
 @dataclass(frozen=True)
@@ -282,13 +280,13 @@ class PowerReceiver(CsiReceiver):
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
         count = self._ports.count
-        here, there = self.signals(traced if self.interference else None, learned)
+        of_paths, of_gaussians = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
             # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
             power_of_paths = dr.block_reduce(dr.ReduceOp.Add, sum(part * part for part in traced.gain), traced.each)
             mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
-            here = mean, dr.zeros(type(mean), dr.width(mean))
-        received = dr.block_reduce(dr.ReduceOp.Add, power(here, there, self.how), count) / count
+            of_paths = mean, dr.zeros(type(mean), dr.width(mean))
+        received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count
         received = dr.select(received > SILENCE, received + LEAST_POWER, self.floor)
         return 10 * dr.log2(received) / math.log2(10)
 

@@ -11,8 +11,6 @@ from typing import Any
 
 import drjit as dr
 
-from ..core import InputError
-from ..core.registry import resolve
 from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
@@ -64,23 +62,6 @@ class Evaluation:
 
     def release(self) -> None:
         """Drop the references that the last call kept for its reverse pass."""
-
-
-def evaluation_of(name: str, scene: Any | None, traced: TracedConfig) -> Evaluation:
-    """The evaluation of a name.
-
-    Args:
-        name: a key of `EVALUATIONS`.
-        scene: scene from `wrf_mi.tracing.open_scene`; None: no scene.
-        traced: parameters of the scene that are trained.
-
-    Raises:
-        InputError: no evaluation of that name, or one that cannot serve the scene.
-    """
-    if name not in EVALUATIONS:
-        raise InputError(f"setting evaluation: {name!r} is unknown; choose from {', '.join(EVALUATIONS)}")
-    made: Evaluation = resolve(EVALUATIONS[name])(scene, traced)
-    return made
 
 
 def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:

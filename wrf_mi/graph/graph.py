@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
+from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component, gaussians_in_parts
@@ -41,7 +42,7 @@ from ..tracing.solve import Prepared
 from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
-from .evaluations import evaluation_of
+from .evaluations import EVALUATIONS, Evaluation
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
@@ -131,7 +132,7 @@ class Graph:
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.tx_antenna = tx_antenna
         self.surface: SurfaceGaussians | None = None
-        self.evaluation = evaluation_of(evaluation, scene, traced)
+        self.evaluation: Evaluation = resolve(EVALUATIONS[evaluation])(scene, traced)
         self._stated_hz = form.carrier_hz
         self._take(form)
 
@@ -350,27 +351,24 @@ class Graph:
             power = float(dr.sum(re * re + im * im)[0]) / len(side)
         return float(np.log(power) / 2) if power > 0 else 0.0
 
-    def match_gain(
-        self, number: int, side: TracedField, params: Mapping[str, Any], observed: NDArray[Any]
-    ) -> dict[str, NDArray[np.float32]]:
-        """The receiver's starting gain, which matches the mean of the traced reports of a port to the observations.
+    def match_gain(self, number: int, side: TracedField, observed: NDArray[Any]) -> NDArray[np.float32]:
+        """The receiver's starting gain [2], which matches the mean of the traced reports of a port to the observations.
 
         Args:
             number: number of the port.
             side: traced side of the observed transmitters.
-            params: values by name, in place of the stated ones.
             observed: observations [n, *shape of a report], NaN where nothing was received.
         """
         model = self.models[number]
         unscaled: Any = getattr(model, "unscaled", model)
         known = np.isfinite(observed).reshape(len(observed), -1).all(axis=1)
         gain = np.zeros(2, np.float32)
-        for _ in range(MATCHING):
+        for _ in range(MATCHING if known.any() else 0):
             with dr.suspend_grad():
-                report = unscaled(side({**params, side.gain_name: mi.TensorXf(gain)}), None).numpy()
+                report = unscaled(side({side.gain_name: mi.TensorXf(gain)}), None).numpy()
             report = report.astype(float).reshape(np.shape(observed))
-            gain[0] += model.missing_gain(report[known], observed[known]) if known.any() else 0.0
-        return {side.gain_name: gain}
+            gain[0] += model.missing_gain(report[known], observed[known])
+        return gain
 
 
 def _condition(batch: Batch) -> Any:

@@ -62,8 +62,8 @@ from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
+from ..training.fit_plan import check_rows
 from ..training.session import Interrupted, OnProgress, quiet
-from ..training.trainer import check_rows
 from .evaluate import Part, score_other, score_part, score_run
 from .folder import (
     FITTED,

@@ -16,6 +16,7 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.array_files import ArrayStream, write_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import write_atomically
+from ..core.memory import peak_memory_mb
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
@@ -25,7 +26,6 @@ from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
-from ..training.trainer import peak_memory_mb
 from .constant import CONSTANT, SCORES, against_constant, constant_scores
 from .folder import METRICS, PREDICTIONS, RunConfig
 from .results import Observations, reference_key

@@ -42,7 +42,7 @@ from ..models import Model, known_model
 from ..models.calibrated import with_intervals
 from ..models.model import Arrays
 from ..tasks import TASKS
-from ..training.trainer import check_rows
+from ..training.fit_plan import check_rows
 
 FORMAT = 4
 """Version of ``config.yaml`` and ``model.npz``."""

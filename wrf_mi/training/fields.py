@@ -71,6 +71,12 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
     return FIELDS[model](encoding=encoding, components=components, **sizes)
 
 
+def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
+    """Shapes of the parameters of a field with four Gaussians, by name."""
+    place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
+    return {name: values.shape for name, values in field.init(random_gaussians([place], 4, rng), rng).items()}
+
+
 def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
     """Refuse parameters of a file that are not those of a field: the backend ends the process on other shapes.
 
@@ -87,10 +93,9 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
             raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
     if field is None:
         return
-    place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
     count = params["position"].shape[1] if "position" in params else 0
-    for name, like in field.init(random_gaussians([place], 4, rng), rng).items():
-        wanted = (like.shape[0], count) if name in field.per_gaussian else like.shape
+    for name, shape in _shapes(field).items():
+        wanted = (shape[0], count) if name in field.per_gaussian else shape
         found = params[name].shape if name in params else "none"
         if found != wanted or not count:
             text = f"parameter {name} of shape {found}, where the settings need {wanted}"
@@ -105,9 +110,7 @@ def check_memory(config: TrainConfig, field: Field) -> None:
     """
     density = config.density
     count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)
-    place = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1]))
-    rng = np.random.default_rng(0)
-    sizes = {name: values.shape for name, values in field.init(random_gaussians([place], 4, rng), rng).items()}
+    sizes = _shapes(field)
     neurons = sum(shape[0] for name, shape in sizes.items() if name.endswith(".bias"))
     own = sum(sizes[name][0] for name in field.per_gaussian)
     widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=own)

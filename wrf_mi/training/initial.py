@@ -7,11 +7,10 @@ that power. A mesh alone gives the surfaces that can scatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from wrf_mi_scenes.mitsuba_xml import PERFECT
@@ -33,33 +32,6 @@ LEAST_SHARE = 1e-3
 """Smallest starting power relative to the strongest cluster, so that weak Gaussians can grow."""
 
 
-@dataclass(frozen=True)
-class PathGaussians(InitialGaussians):
-    """Starting values with a signal and an opacity of each Gaussian.
-
-    Attributes:
-        signals: complex, shape [n]: amplitude relative to the strongest times ``signal``, and phase of the path.
-        opacities: alpha at the centre of each, shape [n].
-        image_map: affine map [n, 3, 4] of the transmitter to the image that each Gaussian represents: image = A [x, 1].
-    """
-
-    signals: NDArray[np.complex128] = field(kw_only=True)
-    opacities: FloatArray = field(kw_only=True)
-    image_map: FloatArray = field(kw_only=True)
-
-    def opacity_logit(self) -> NDArray[np.float32]:
-        """The parameter ``opacity``, shape [1, n], as a logit."""
-        return np.log(self.opacities / (1 - self.opacities))[None].astype(np.float32)
-
-    def static_signal(self, rng: np.random.Generator) -> NDArray[np.float32]:
-        """The parameter ``signal`` [2, n] from the paths; nothing is drawn."""
-        return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
-
-    def image(self) -> NDArray[np.float32]:
-        """The parameter ``image``, shape [12, n], from the chains of surfaces of the paths."""
-        return np.ascontiguousarray(self.image_map.reshape(-1, 12).T, np.float32)
-
-
 def gaussians_from_paths(
     paths: Paths,
     tx_pos_m: FloatArray,
@@ -68,7 +40,7 @@ def gaussians_from_paths(
     rng: np.random.Generator,
     opacity: float = 0.4,
     signal: float = 0.3,
-) -> PathGaussians:
+) -> InitialGaussians:
     """Gaussians on clusters of the last points of interaction of traced paths (of direct paths: the transmitter).
 
     Points are clustered by direction and distance from their receiver, weighted by power; a cluster's mean is the
@@ -124,28 +96,16 @@ def gaussians_from_paths(
     amplitude = signal * np.sqrt(relative)
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
-    return PathGaussians(
-        position + jitter,
-        scale,
-        opacity,
-        signal,
-        signals=amplitude * np.exp(1j * phase),
-        opacities=opacities,
-        image_map=affine,
-    )
+    return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase), affine)
 
 
-def gaussians_from_mesh(
-    triangles_m: FloatArray, count: int, rng: np.random.Generator, opacity: float = 0.4, signal: float = 0.3
-) -> InitialGaussians:
+def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Generator) -> InitialGaussians:
     """Gaussians on a mesh's surfaces, drawn evenly by area, with scales as in `gaussians_from_points`.
 
     Args:
         triangles_m: corners [f, 3, 3], metres.
         count: number of Gaussians, at least 4.
         rng: generator of the points.
-        opacity: alpha at the centre.
-        signal: standard deviation of the starting signals.
 
     Raises:
         InputError: no surface.
@@ -159,8 +119,7 @@ def gaussians_from_mesh(
     flip = a + b > 1
     a, b = np.where(flip, 1 - a, a), np.where(flip, 1 - b, b)
     first, second, third = corners[face].transpose(1, 0, 2)
-    start = gaussians_from_points(first + a * (second - first) + b * (third - first), count, rng)
-    return InitialGaussians(start.position_m, start.scale_m, opacity, signal)
+    return gaussians_from_points(first + a * (second - first) + b * (third - first), count, rng)
 
 
 def _image_map(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], members: IntArray) -> FloatArray:
@@ -208,14 +167,12 @@ def initial_gaussians(
         # The geometry does not depend on frequency and material.
         bare = Path(config.mesh).suffix.lower() in MESHES
         scene = open_scene(config.mesh, 1e9, material=PERFECT if bare else None)
-        triangles = scene_surfaces(scene).triangles
-        return gaussians_from_mesh(triangles, config.gaussians, rng, config.opacity, config.signal)
-    if config.points:
+        start = gaussians_from_mesh(scene_surfaces(scene).triangles, config.gaussians, rng)
+    elif config.points:
         points_m = read_points(config.points)
         require_near(points_m, config.points)
         start = gaussians_from_points(points_m, config.gaussians, rng)
-        return replace(start, opacity=config.opacity, signal=config.signal)
-    distance = (config.nearest_m, config.farthest_m)
-    return random_gaussians(
-        record.receivers, config.gaussians, rng, distance, config.size_deg, config.opacity, config.signal, sphere
-    )
+    else:
+        distance_m = config.nearest_m, config.farthest_m
+        start = random_gaussians(record.receivers, config.gaussians, rng, distance_m, config.size_deg, sphere=sphere)
+    return replace(start, opacity=config.opacity, signal=config.signal)

@@ -14,22 +14,21 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.device import to_tensor
+from ..backend.device import to_float, to_tensor
+from ..backend.recorded import Recorded
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text, rows_by_carrier
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.parameters import CHUNK_SIZE, Gaussians
-from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
 from .reach import Reach
-from .recordings import Recordings, Where
 from .static_operator import StaticOperator
-from .step import Params, device_pose, evaluated
+from .step import Params, evaluated, places_of
 
 if TYPE_CHECKING:
     from ..tracing.traced_field import TracedField
@@ -75,13 +74,12 @@ class Predictor:
         # Operator and recorded prediction give the splatted magnitude at each direction.
         self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
         self._pixels = field is not None and self._recordable and self.graph.form.receiver == PIXEL
-        self._poses = [device_pose(r) for r in self.receivers for _ in range(self.graph.carriers)]
+        self._places = places_of(self.graph)
         self._others: dict[float, Predictor] = {}
-        self._plane = perception_plane(height, width, mi.Float)
         self._field, self._count = field, -1
         single = self._pixels and self.graph.form.carriers_hz is None
         self._by_operator, self._store = operator and single and getattr(field, "static_geometry", False), store
-        self._recordings = Recordings()
+        self._recordings: dict[tuple[Hashable, int], Recorded] = {}
         self._traced: dict[Hashable, TracedField] = {}
         self._together = 1 if self._pixels else TOGETHER
         self._still: StaticOperator | None = None
@@ -92,7 +90,7 @@ class Predictor:
         count = params["position"].shape[1] if "position" in params else 0
         if count != self._count:
             # A recording is valid for one number of Gaussians.
-            self._count, self._recordings = count, Recordings()
+            self._count, self._recordings = count, {}
         self._params, self._still = params, None
         dr.eval(self._params)
         for other in self._others.values():
@@ -116,8 +114,7 @@ class Predictor:
         if self._still is None:
             params = {name: dr.detach(values).numpy() for name, values in self._params.items()}
             assert self._field is not None, "an operator needs Gaussians"
-            size = self._plane.height, self._plane.width
-            self._still = StaticOperator(self._field, params, self.receivers, *size, self._store)
+            self._still = StaticOperator(self._field, params, self.receivers, *self.graph.form.size, self._store)
         return self._still
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
@@ -135,9 +132,8 @@ class Predictor:
             return self, receiver * self.graph.carriers + int(np.searchsorted(known, carrier_hz))
         if carrier_hz not in self._others:
             graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
-            made = Predictor(self._field, {}, self.receivers, *size, graph=graph)
-            made.update(self._params)
-            self._others[carrier_hz] = made
+            self._others[carrier_hz] = Predictor(self._field, {}, self.receivers, *size, graph=graph)
+            self._others[carrier_hz].update(self._params)
         self._others[carrier_hz].reach = self.reach
         return self._others[carrier_hz], receiver
 
@@ -147,17 +143,26 @@ class Predictor:
         """Reports for positions [m, 3] at their carriers [m], Hz, each with paths of one search for all carriers."""
         if not len(tx_pos_m):
             return self._reported(tx_pos_m, receiver * self.graph.carriers)
-        found, order = list[NDArray[Any]](), list[IntArray]()
-        for rows, predictor, port, side in self._sides(tx_pos_m, receiver, heading_rad, carriers_hz):
-            found.append(predictor._reported(tx_pos_m[rows], port, side))
-            order.append(rows)
-        return np.concatenate(found)[np.argsort(np.concatenate(order))]
+        groups = [
+            (rows, predictor._reported(tx_pos_m[rows], port, side))
+            for rows, predictor, port, side in self._sides(tx_pos_m, receiver, heading_rad, carriers_hz)
+        ]
+        order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
+        return reports[np.argsort(order)]
 
     def _sides(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
     ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
-        """Groups of positions: their numbers, predictor and port, and traced side."""
-        for rows in self._searched_together(tx_pos_m, carriers_hz):
+        """Groups of positions: their numbers, predictor and port, and traced side.
+
+        Positions at several carriers are in the same group, as are all without a scene.
+        """
+        order = np.arange(len(tx_pos_m))
+        size = SEARCHED if self.graph.scene is not None else max(len(order), 1)
+        if self.graph.scene is not None and carriers_hz is not None:
+            order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
+        for start in range(0, len(order), size):
+            rows = order[start : start + size]
             turned, carriers = (None if part is None else part[rows] for part in (heading_rad, carriers_hz))
             sides = self.graph.trace(tx_pos_m[rows], receiver, turned, carriers, self._params)
             for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
@@ -183,10 +188,10 @@ class Predictor:
         reports, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
         for rows, predictor, port, side in self._sides(tx_pos_m, receiver, turned, carriers_hz):
             assert side is not None, "a graph without a scene has one side"
-            here = tx_pos_m[rows]
-            reports.append({"whole": predictor._reported(here, port, side)})
+            positions = tx_pos_m[rows]
+            reports.append({"whole": predictor._reported(positions, port, side)})
             if self._field is not None:
-                reports[-1] |= {alone: predictor._of_one_side(here, port, side, alone) for alone in get_args(Alone)}
+                reports[-1] |= {one: predictor._of_one_side(positions, port, side, one) for one in get_args(Alone)}
             statistics.append(side.statistics(self._params))
             order.append(rows)
         back = np.argsort(np.concatenate(order))
@@ -204,42 +209,10 @@ class Predictor:
         whole[used] = found
         return whole
 
-    def _searched_together(self, tx_pos_m: FloatArray, carriers_hz: FloatArray | None) -> list[IntArray]:
-        """Rows of positions [m, 3] in groups, those of one position at several carriers in the same."""
-        if self.graph.scene is None:
-            return [np.arange(len(tx_pos_m))]
-        if carriers_hz is None:
-            order, size = np.arange(len(tx_pos_m)), SEARCHED
-        else:
-            order, size = np.lexsort(tx_pos_m.T), SEARCHED * len(np.unique(carriers_hz))
-        return [order[start : start + size] for start in range(0, len(order), size)]
-
-    def _evaluated(
-        self,
-        tx_pos_m: FloatArray,
-        receiver: int,
-        side: TracedField | None,
-        slots: IntArray | None,
-        weight: NDArray[Any] | None,
-        alone: Alone | None = None,
-    ) -> Any:
-        """Report of both sides, flat, recorded where it can be; positions of weight 0 have paths only."""
-        learned = self._field is not None and alone != "traced"
-        learned &= side is None or weight is None or bool(np.any(weight))
-        if side is not None and len(side) == 1 and self._may_record(1):
-            return self._single(tx_pos_m.T, receiver, side, learned, weight, alone)
-        signal = self._signal(tx_pos_m.T, receiver) if learned else None
-        report = self.graph.report(receiver, side, learned, alone=alone)
-        return evaluated(report, self._params, tx_pos_m.T, *self._where(receiver), slots, weight, signal)
-
-    def _where(self, port: int) -> Where:
-        """Number, pose and directions of a port's receiver, and the logarithm of its carrier."""
-        return port // self.graph.carriers, self._poses[port], self._plane, self.graph.log_carrier(port)
-
     def of_side(
         self,
-        tx_pos_m: FloatArray,
-        receiver: int,
+        conditions: FloatArray,
+        port: int,
         side: TracedField | None,
         slots: IntArray,
         weight: NDArray[Any] | None,
@@ -248,119 +221,138 @@ class Predictor:
         """Predictions for transmitters whose paths are known.
 
         Args:
-            tx_pos_m: positions [m, 3], metres.
-            receiver: number of the receiver.
+            conditions: positions [m, 3], metres, or features [m, features].
+            port: number of the port.
             side: its traced side, or None.
             slots: rows of the traced side [m].
             weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
-            alone: one of both sides (`Graph.report`); None: both.
+            alone: component reported alone (`Graph.report`); None: both together.
 
         Returns:
             Predictions as of `__call__`.
         """
-
-        def found(part: slice) -> Any:
-            weights = None if weight is None else weight[part]
-            return self._evaluated(tx_pos_m[part], receiver, side, slots[part], weights, alone)
-
-        return self._in_parts(len(tx_pos_m), receiver, found)
-
-    def _learned(self, condition: FloatArray, receiver: int, weight: NDArray[Any] | None = None) -> Any:
-        """Report for conditions [3 or features, at most `TOGETHER`], flat; recorded unless networks run in chunks."""
-        where = self._where(receiver)
-        if self._count * self._together > CHUNK_SIZE:
-            report = self.graph.report(receiver, None, chunked=True)
-            return evaluated(report, self._params, condition, *where, weight=weight)
-        report = self.graph.report(receiver, None)
-
-        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any, ...]:
-            return (report(params, batch),)
-
-        # One recording serves the pixels of all ports.
-        port, state = None if self._pixels else receiver, partial(self.graph.arrays, receiver, None)
-        name = "report", port
-        return self._recordings(name, self._together, reported, self._params, condition, where, weight, state)[0]
-
-    def _may_record(self, size: int) -> bool:
-        """Whether functions of Gaussians are recorded for batches of a size: see `Recordings`."""
-        return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
-
-    def _single(
-        self,
-        condition: FloatArray,
-        port: int,
-        side: TracedField,
-        learned: bool,
-        weight: NDArray[Any] | None,
-        alone: Alone | None,
-    ) -> Any:
-        """Recorded report of the only transmitter of a traced side, whose arrays are inputs of the recording."""
-        name = "both", port, learned, alone, side.form
-        self._traced[name] = side
-
-        def reported(params: Mapping[str, Any], batch: Batch) -> tuple[Any]:
-            return (self.graph.report(port, self._traced[name], learned, alone=alone)(params, batch),)
-
-        def read() -> list[Any]:
-            return self.graph.arrays(port, self._traced[name])
-
-        return self._recordings(name, 1, reported, self._params, condition, self._where(port), weight, read)[0]
-
-    def _signal(self, condition: FloatArray, port: int) -> tuple[Any, ...] | None:
-        """Recorded signal of the Gaussians for conditions [3, m], without its unit; None: it is not recorded.
-
-        Batches of `TOGETHER` are; copies that filled others would cost more than they save.
-        """
-        if not TOGETHER // 2 < condition.shape[1] <= TOGETHER or not self._may_record(TOGETHER):
-            return None
-        # One recording serves the poses of all receivers unless they are trained.
-        name, where = ("signal", port if self.graph.moves else None), self._where(port)
-        return self._recordings(name, TOGETHER, partial(self.graph.learned, port), self._params, condition, where)
-
-    def _reported(
-        self, given: FloatArray, receiver: int, side: TracedField | None = None, slots: IntArray | None = None
-    ) -> NDArray[Any]:
-        """Reports for positions [m, 3] or features [m, features], complex numbers as such.
-
-        ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
-        """
-        slots = np.arange(len(given)) if slots is None else slots
-        weight = None if self.reach is None else self.reach.weight(given, receiver // self.graph.carriers)
-        if weight is not None and weight.any() and not weight.all():
-            # Gaussians of weight 0 are not evaluated.
-            parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
-            found = [self._reported(given[part], receiver, side, slots[part]) for part in parts]
-            return np.concatenate(found)[np.argsort(np.concatenate(parts))]
-
-        if self.graph.scene is None and weight is not None and not weight.any():
-            return np.zeros((len(given), *self.graph.models[receiver].shape[:-1]), np.complex64)
-
-        if self._recordable or not len(given):
-
-            def recorded(part: slice) -> Any:
-                return self._learned(given[part].T, receiver, None if weight is None else weight[part])
-
-            return self._in_parts(len(given), receiver, recorded)
-
-        return self.of_side(given, receiver, side, slots, weight)
-
-    def _in_parts(self, count: int, receiver: int, found: Callable[[slice], Any]) -> NDArray[Any]:
-        """Reports for all transmitters, from flat reports of batches."""
-        shape = self.graph.models[receiver].shape
+        shape, count = self.graph.models[port].shape, len(conditions)
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
         out = np.empty((count, *shape), np.float32)
         together = self._together if self._recordable else max(TOGETHER, TRACED_NUMBERS // math.prod(shape))
         for start in range(0, count, together):
             part = slice(start, min(start + together, count))
-            out[part] = found(part).numpy().reshape(part.stop - part.start, *shape)
+            weights = None if weight is None else weight[part]
+            flat = self._evaluated(conditions[part].T, port, side, slots[part], weights, alone)
+            out[part] = flat.numpy().reshape(part.stop - part.start, *shape)
         return out.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else out
+
+    def _evaluated(
+        self,
+        condition: FloatArray,
+        port: int,
+        side: TracedField | None,
+        slots: IntArray,
+        weight: NDArray[Any] | None,
+        alone: Alone | None,
+    ) -> Any:
+        """Report for conditions [3 or features, m], flat, recorded where it can be; paths alone at weights 0."""
+        place = self._places[port]
+        if self._recordable:
+            if not self._may_record(self._together):
+                report = self.graph.report(port, None, chunked=True)
+                return evaluated(report, self._params, condition, place, weight=weight)
+            # One recording serves the pixels of all ports.
+            name, arrays = ("report", None if self._pixels else port), partial(self.graph.arrays, port, None)
+            return self._recorded(name, self._together, self.graph.report(port, None), condition, port, weight, arrays)
+        learned = self._field is not None and alone != "traced"
+        learned &= side is None or weight is None or bool(np.any(weight))
+        if side is not None and len(side) == 1 and self._may_record(1):
+            # Recordings of one transmitter serve others, whose traced side is an input.
+            of_one = "both", port, learned, alone, side.form
+            self._traced[of_one] = side
+
+            def reported(params: Mapping[str, Any], batch: Batch) -> Any:
+                return self.graph.report(port, self._traced[of_one], learned, alone=alone)(params, batch)
+
+            def read() -> list[Any]:
+                return self.graph.arrays(port, self._traced[of_one])
+
+            return self._recorded(of_one, 1, reported, condition, port, weight, read)
+        signal = None
+        # Batches of `TOGETHER` are recorded; copies that filled others would cost more than they save.
+        if learned and TOGETHER // 2 < condition.shape[1] <= TOGETHER and self._may_record(TOGETHER):
+            # One recording serves the poses of all receivers unless they are trained.
+            of_signal = "signal", port if self.graph.moves else None
+            signal = self._recorded(of_signal, TOGETHER, partial(self.graph.learned, port), condition, port)
+        report = self.graph.report(port, side, learned, alone=alone)
+        return evaluated(report, self._params, condition, place, slots, weight, signal)
+
+    def _may_record(self, size: int) -> bool:
+        """Whether functions of Gaussians are recorded for batches of a size: see `_recorded`."""
+        return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
+
+    def _recorded(
+        self,
+        name: Hashable,
+        size: int,
+        function: Callable[[Mapping[str, Any], Batch], Any],
+        condition: FloatArray,
+        port: int,
+        weight: NDArray[Any] | None = None,
+        state: Callable[[], Any] | None = None,
+    ) -> Any:
+        """Evaluate a function of at most ``size`` conditions, which Dr.Jit records at its first call by a name.
+
+        The number of transmitters is a constant of the recorded kernels: each size is a recording of its own, and
+        copies of the last transmitter fill a batch. Networks are not evaluated in chunks, and lists of tiles, which a
+        recorded function cannot count, have room for all: neither is for very many Gaussians. ``state`` returns the
+        arrays that the function reads beside its arguments.
+        """
+        count, place = condition.shape[1], self._places[port]
+        if (name, size) not in self._recordings:
+
+            def recordable(params: Params, batch: Batch) -> Any:
+                with dr.suspend_grad():
+                    return function(params, batch)
+
+            # Arrays that are made from NumPy's memory at first use must exist before a recording.
+            evaluated(function, self._params, condition[:, :1], place)
+            self._recordings[name, size] = Recorded(recordable, state)
+        filled = np.minimum(np.arange(size), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, size)
+        dr.make_opaque(slots)
+        weights = None if weight is None else to_float(weight[filled])
+        arrays = self._recordings[name, size](self._params, place.batch(tx, slots, weights))
+
+        def leading(values: Any) -> Any:
+            return dr.gather(type(values), values, dr.arange(mi.UInt32, count * (dr.width(values) // size)))
+
+        if count == size:
+            return arrays
+        return tuple(map(leading, arrays)) if isinstance(arrays, tuple) else leading(arrays)
+
+    def _reported(
+        self, conditions: FloatArray, port: int, side: TracedField | None = None, slots: IntArray | None = None
+    ) -> NDArray[Any]:
+        """Reports for positions [m, 3] or features [m, features], complex numbers as such.
+
+        ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
+        """
+        slots = np.arange(len(conditions)) if slots is None else slots
+        weight = None if self.reach is None else self.reach.weight(conditions, port // self.graph.carriers)
+        if weight is not None and not weight.all():
+            if weight.any():
+                # Gaussians of weight 0 are not evaluated.
+                parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
+                reports = [self._reported(conditions[part], port, side, slots[part]) for part in parts]
+                return np.concatenate(reports)[np.argsort(np.concatenate(parts))]
+            if self.graph.scene is None:
+                return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
+        return self.of_side(conditions, port, side, slots, weight)
 
     def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
         """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
         features, divisor = normalised_uplink(known_uplink(uplink))
-        found = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1) * divisor[..., None]
-        return (found if len(self.graph.form.outputs) > 1 else found[:, 0]).astype(np.complex64)
+        reports = self._reported(np.asarray(features, float), receiver)
+        channels = reports.reshape(*divisor.shape, -1) * divisor[..., None]
+        return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
 
     def __call__(
         self,
@@ -402,12 +394,9 @@ class Predictor:
             except MemoryError as error:
                 warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
                 self._by_operator = False
-        given = np.asarray(tx_pos_m, float)
-        turned = known_headings(tx_heading_rad, len(given), self.graph.form.headings)
-        self.graph.check(given)
-        if self.graph.form.carriers_hz is None:
-            return self._of_positions(given, index, turned, None)
-        if carriers_hz is None:
-            known = carriers_text(self.graph.form.carriers_hz)
-            raise InputError(f"trained with {known}; give the carrier of every transmitter")
-        return self._of_positions(given, index, turned, np.asarray(carriers_hz, float))
+        exact, trained_hz = np.asarray(tx_pos_m, float), self.graph.form.carriers_hz
+        turned = known_headings(tx_heading_rad, len(exact), self.graph.form.headings)
+        self.graph.check(exact)
+        if trained_hz is not None and carriers_hz is None:
+            raise InputError(f"trained with {carriers_text(trained_hz)}; give the carrier of every transmitter")
+        return self._of_positions(exact, index, turned, None if trained_hz is None else np.asarray(carriers_hz, float))

@@ -106,11 +106,6 @@ class FitState:
         self._set_moments(first, second, count)
         self._reset_view_gradient()
 
-    def forget_moments(self) -> None:
-        """Restart Adam from the current parameters."""
-        nothing = {name: np.zeros_like(values) for name, values in self.params().items()}
-        self._set_moments(nothing, nothing, 0)
-
     def set_param(self, name: str, values: NDArray[np.float32]) -> None:
         """Set one parameter and reset its momentum (opacity reset)."""
         first, second, count = self.moments()
@@ -135,7 +130,8 @@ class FitState:
         """The best state so far as the start of another stage, at the present step, without moments."""
         state = self.go_back()
         state.step, state.best, state.waited = self.step, self.best, 0
-        state.forget_moments()
+        nothing = {name: np.zeros_like(values) for name, values in state.params().items()}
+        state._set_moments(nothing, nothing, 0)
         return state
 
     def arrays(self) -> Arrays:
@@ -161,13 +157,9 @@ class FitState:
         state = cls(group("param/"), momentum)
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
-        state.step, state.chosen = int(arrays["step"]), int(arrays["chosen"])
-        state.view_gradient_steps, state.reach_m = int(arrays["view_gradient_steps"]), float(arrays["reach_m"])
+        for name in (*KEPT, *OF_FIT):
+            setattr(state, name, np.array(arrays[name]) if np.ndim(arrays[name]) else arrays[name].item())
         state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
-        state.searched_m = np.array(arrays["searched_m"])
-        for name in OF_FIT:
-            setattr(state, name, np.array(arrays[name]))
-        state.surface = bool(arrays["surface"])
         state.best = group("best/") or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state

@@ -26,7 +26,8 @@ from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NE
 from ..gaussians.operator import Images, PixelOperator, pixel_weights
 from ..gaussians.static_signals import static_signals
 from ..gaussians.tiles import perception_plane
-from .step import Field, device_pose
+from ..graph.graph import Field
+from .step import device_pose
 
 FORMAT = 1
 """Version of the file."""

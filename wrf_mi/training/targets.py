@@ -5,23 +5,18 @@ A *condition* is the input of a field: a row's transmitter position, or the upli
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import task_of
 from ..tasks.conditions import normalised_uplink, outputs_of
 from .config import TrainConfig
-from .schedule import Schedule, density_rounds, plan
-
-CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
-"""Stages of a training: parameters of paths; Gaussians on surfaces with them; and the field's Gaussians, too."""
 
 
 @dataclass(frozen=True)
@@ -162,38 +157,3 @@ def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128
     _, vectors = np.linalg.eigh(power)
     # Rows v^H: a channel h has coefficients h v and is their sum with v^H.
     return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
-
-
-def stage_names(config: TrainConfig, field: bool, scene: bool) -> tuple[str, ...]:
-    """Stages of a training in their order: paths, Gaussians on surfaces, those of the ``field`` if there is one."""
-    if not scene:
-        return (FIELD,)
-    more = (SURFACES,) * (config.traced.surface > 0) + (FIELD,) * field
-    return (CALIBRATION, *more) if config.traced.alone else (more or (CALIBRATION,))[-1:]
-
-
-def plan_rows(config: TrainConfig, targets: Targets, split: Split, stages: Sequence[str] = ()) -> Schedule:
-    """The schedule of a fit, in which each port learns from its receiver's observations.
-
-    Args:
-        config: settings with their number of steps.
-        targets: observations.
-        split: rows that train, and validation rows that join them.
-        stages: `stage_names`.
-
-    Raises:
-        InputError: as `wrf_mi.training.schedule.plan`, or no step is left for the last stage.
-    """
-    everything = [targets.received(port, split.all_train) for port in range(targets.ports)]
-    train = [targets.received(port, split.train) for port in range(targets.ports)]
-    # A receiver without training rows learns from its validation rows.
-    train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
-    first = tuple(round(k * config.traced.alone * config.steps) for k in range(1, len(stages)))
-    if first and config.patience and 0 < config.holdout_steps_fraction * config.steps <= first[-1]:
-        end = config.holdout_steps_fraction
-        share = f"{config.traced.alone} of the steps" + (", twice," if len(first) > 1 else "")
-        text = f"{share} are not less than holdout_steps_fraction, {end}"
-        raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
-    rng = np.random.default_rng([config.seed, 1])
-    density = density_rounds(config.density, config.steps, first[-1] if first else 0)
-    return plan(config, train, everything, rng, density, first)

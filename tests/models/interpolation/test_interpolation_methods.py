@@ -119,7 +119,7 @@ def test_kriging_runs_equal_the_library_for_every_task(folder: Path, tmp_path: P
 
 def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path) -> None:
     """Kriging about each receiver's log-distance law, and trees, as the library alone has them."""
-    from wrf_mi.models.interpolation.kriging import Kriging, log_distance
+    from wrf_mi.models.interpolation.kriging import Kriging, Trend
     from wrf_mi.models.interpolation.trees import Trees
 
     record = load(flat_folder)
@@ -132,7 +132,7 @@ def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path)
     for name, settings in given.items():
         found = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):
-            law = log_distance(receiver.position_m)
+            law = Trend(receiver.position_m)
             model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
             known = split.all_train
             expected = model.fit(place[known], record.observation[r, known], turned[known])

@@ -8,7 +8,7 @@ from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.interpolation.kriging import Kriged, Kriging, constant, log_distance
+from wrf_mi.models.interpolation.kriging import Kriged, Kriging, Trend
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, component_root
 from wrf_mi.models.interpolation.trees import Trees
 from wrf_mi.tasks import TASKS
@@ -39,7 +39,7 @@ def test_universal_kriging_solves_the_augmented_system():
     positions, heading, rng = made(25)
     values, at = rng.normal(size=(25, 2)), rng.uniform(0, 4, (6, 3))
     turned = rng.uniform(-9, 9, 6)
-    trend = log_distance([1.0, -1, 0])
+    trend = Trend(np.array([1.0, -1, 0]))
     model = Kriging(0.8, 0.3, 1.5, trend=trend).fit(positions, values, heading)
     assert chosen(model) == {"length_m": 0.8, "heading_length": 1.5, "noise": 0.3}
     b, k = trend(positions), covariance(positions, heading, positions, heading) + 0.3 * np.eye(25)
@@ -71,7 +71,7 @@ def test_restricted_likelihood_is_that_of_contrasts_free_of_the_trend():
 
 def test_regression_kriging_adds_the_residuals_of_least_squares():
     positions, _, rng = made(20, 1)
-    values, at, trend = rng.normal(size=20), rng.uniform(0, 4, (3, 3)), log_distance([0.0, 0, 9])
+    values, at, trend = rng.normal(size=20), rng.uniform(0, 4, (3, 3)), Trend(np.array([0.0, 0, 9]))
     beta = np.linalg.lstsq(trend(positions), values, rcond=None)[0]
     zero = np.zeros(20)
     k = covariance(positions, zero, positions, zero) + 0.1 * np.eye(20)
@@ -147,14 +147,14 @@ def test_bad_arguments_are_refused():
         with pytest.raises(InputError, match="predict with the same"):
             model.fit(positions, values).predict(positions, heading)
     with pytest.raises(InputError, match="training rows received: 1; its trend needs 2, so give more rows"):
-        Kriging(1.0, 0.1, trend=log_distance([0, 0, 0])).fit(positions[:1], values[:1])
+        Kriging(1.0, 0.1, trend=Trend(np.array([0, 0, 0]))).fit(positions[:1], values[:1])
     with pytest.raises(InputError, match="rows coincide"):
         Kriging(1.0, 0).fit(np.zeros((2, 3)), [1.0, 2])
     with pytest.raises(InputError, match="all observations are zero"):
         Kriging().fit(positions, np.zeros(6))
     with pytest.raises(InputError, match="one real number per row"):
         Trees().fit(positions, np.zeros((6, 2)))
-    assert constant(positions).shape == (6, 1)
+    assert Trend()(positions).shape == (6, 1)
 
 
 def test_trees_use_the_heading():
@@ -194,7 +194,7 @@ def test_published_figures_of_signal_strengths():
     kriged, grown = [], []
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
         known, rows, heading = few.all_train, few.test, record.tx_heading_rad
-        model = Kriging(trend=log_distance(receiver.position_m)).fit(record.tx_pos_m[known], observed[known])
+        model = Kriging(trend=Trend(receiver.position_m)).fit(record.tx_pos_m[known], observed[known])
         kriged.append(score(model.predict(record.tx_pos_m[rows]), observed[rows]))
         known = every.all_train
         trees = Trees(40).fit(record.tx_pos_m[known], observed[known], heading[known])

@@ -286,7 +286,7 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, mode
     assert left(fitted.half) <= min(left(half) for half in others)
     inside = []
     for posterior, kriged, deviation in by_gap:
-        mean, std = fitted.mixed(posterior, kriged, deviation)
+        mean, std = fitted.mixed(fitted.report(posterior), posterior.ignorance, kriged, deviation)
         inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 

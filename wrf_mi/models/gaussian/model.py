@@ -24,15 +24,16 @@ from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
-from ...training.fields import check_memory, check_params, field_of
+from ...training.fields import check_params, field_of
+from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
+from ...training.judging import HeldOutReports
 from ...training.loop import Progress
 from ...training.packed import PACKED, pack_params, unpack_params
 from ...training.predictor import Predictor
 from ...training.reach import Reach
 from ...training.state import FitState
-from ...training.targets import form_of, plan_rows, stage_names, targets_of
-from ...training.trainer import HeldOutReports, Trainer
+from ...training.trainer import Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 Params = dict[str, NDArray[np.float32]]
@@ -253,18 +254,10 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
     for split in splits:
         record, rows = trained_part(problem.record, split)
-        known, scene = rows.all_train, _scene(problem, rows)
-        config = problem.settings.resolved(record.tx_pos_m[known])
-        targets = targets_of(record, known, scene is not None)
-        form = form_of(record, config, targets, known, scene is not None)
-        receivers = placed_receivers(record, by_uplink=bool(form.features))
-        field = field_of(config, form)
-        if field is not None:
-            check_memory(config, field)
-        Graph(field, receivers, form, scene, config.traced, evaluation=config.evaluation)
-        plan_rows(config, targets, rows, stage_names(config, field is not None, scene is not None))
-        drawn = np.random.default_rng([config.seed, 0])
-        initial_gaussians(config.initial, replace(record, receivers=receivers), rows.train, drawn)
+        plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
+        drawn = np.random.default_rng([plan.config.seed, 0])
+        placed = replace(record, receivers=plan.graph.receivers)
+        initial_gaussians(plan.config.initial, placed, rows.train, drawn)
 
 
 @cache

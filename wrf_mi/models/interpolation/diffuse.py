@@ -151,11 +151,9 @@ class KrigedChannels:
         """Gain of the line of sight, power of the rest and the field's share of it."""
         power_db = float(10 * np.log10(max(self.field.power, 1e-300)))
         gain_db = float(20 * np.log10(max(abs(self.gain), 1e-300)))
-        return {
-            "parts": "line of sight, diffuse field",
-            "gain_db": gain_db,
-            "gain_phase_rad": float(np.angle(self.gain)),
-        } | {"diffuse_share": self.field.share, "rest_power_db": power_db}
+        gain = {"gain_db": gain_db, "gain_phase_rad": float(np.angle(self.gain))}
+        rest = {"diffuse_share": self.field.share, "rest_power_db": power_db}
+        return {"parts": "line of sight, diffuse field"} | gain | rest
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""

@@ -57,15 +57,6 @@ class Trend:
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-constant = Trend()
-"""Trend of one unknown mean."""
-
-
-def log_distance(receiver_m: ArrayLike) -> Trend:
-    """Trend of the log-distance law at a receiver's position [3], metres."""
-    return Trend(np.asarray(receiver_m, float))
-
-
 SCALE = "scale"
 """Key of the arrays that kriging without standard deviations has not."""
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
@@ -126,26 +117,21 @@ class Kriged:
         return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> Kriged:
-        """The predictions that `arrays` described."""
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver, **more: Any) -> Kriged:
+        """The predictions that `arrays` described, with values ``more`` of further attributes."""
         circle = arrays["circle"] if len(arrays["circle"]) else None
-        trend = _trend(str(arrays["trend"]), receiver)
-        kept: dict[str, Any] = {name: arrays[name] for name in KEPT}
-        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=trend, **kept)
+        kept: dict[str, Any] = {name: arrays[name] for name in KEPT} | more
+        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **kept)
 
 
-@dataclass(frozen=True)
-class UncertainKriged:
-    """Kriging with standard deviations, for data in which other receivers have them.
+@dataclass(frozen=True, kw_only=True)
+class UncertainKriged(Kriged):
+    """Kriging over positions, with a trend by generalised least squares, that states standard deviations.
 
     Attributes:
-        kriged: the kriging over positions, with a trend by generalised least squares.
-        noise: variance of the noise as a share of the field's.
         scale: standard deviation of the field of each component [q].
     """
 
-    kriged: Kriged
-    noise: float
     scale: FloatArray
 
     @classmethod
@@ -156,35 +142,31 @@ class UncertainKriged:
         # y^H Q y / free, Q being the precision free of the trend, whose product with y the weights are. A single row
         # says nothing about the spread: it may be as great as what it observed.
         square = np.einsum("nq,nq->q", values.conj(), kriged.weights if free else values).real / max(free, 1)
-        return cls(kriged, kriged.noise, np.sqrt(np.maximum(square, 0)))
+        return cls(**vars(kriged), scale=np.sqrt(np.maximum(square, 0)))
 
     @cached_property
     def _system(self) -> KrigingSystem:
-        rows, kriged = _coordinates(self.kriged.positions_m, None, self.kriged.lengths), self.kriged
-        return KrigingSystem(correlation(rows, rows, kriged.kernel), self.noise, kriged.trend(kriged.positions_m))
+        rows = self.positions_m / self.lengths[0]
+        return KrigingSystem(correlation(rows, rows, self.kernel), self.noise, self.trend(self.positions_m))
 
     def left_out(self) -> NDArray[Any]:
         """Errors of the rows, each predicted from all others, [n, q] (Dubrule, 1983)."""
-        return np.asarray(self.kriged.weights / np.diag(self._system.precision)[:, None])
-
-    def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
-        """Observations [m, ...] at positions [m, 3], metres; headings are not used."""
-        return self.kriged.predict(tx_pos)
+        return np.asarray(self.weights / np.diag(self._system.precision)[:, None])
 
     def prediction(self, tx_pos: FloatArray) -> Prediction:
         """Observations and standard deviations at positions [m, 3], metres."""
-        mean, length_m = self.predict(tx_pos), self.kriged.lengths[0]
-        cross = correlation(tx_pos / length_m, self.kriged.positions_m / length_m, self.kriged.kernel)
-        unknown = self.noise + self._system.variance(1.0, cross, self.kriged.trend(tx_pos))
+        mean, length_m = self.predict(tx_pos), self.lengths[0]
+        cross = correlation(tx_pos / length_m, self.positions_m / length_m, self.kernel)
+        unknown = self.noise + self._system.variance(1.0, cross, self.trend(tx_pos))
         return Prediction(mean, (np.sqrt(unknown)[:, None] * self.scale).reshape(mean.shape))
 
     def facts(self) -> dict[str, Any]:
         """Form, correlation length and noise."""
-        return {"parts": "generic", "length_m": float(self.kriged.lengths[0]), "noise": self.noise}
+        return {"parts": "generic", "length_m": float(self.lengths[0]), "noise": self.noise}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
-        return self.kriged.arrays() | {"noise": np.array(self.noise), SCALE: self.scale}
+        return super().arrays() | {"noise": np.array(self.noise), SCALE: self.scale}
 
 
 @dataclass(frozen=True)
@@ -220,7 +202,7 @@ class Kriging(CovarianceSettings):
         seed: seed of the rows of the likelihood.
     """
 
-    trend: Trend = constant
+    trend: Trend = Trend()
     trend_fit: Literal["gls", "ols"] = "gls"
     seed: int = 0
 
@@ -349,7 +331,7 @@ class KrigingSettings(CovarianceSettings):
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
-    return log_distance(receiver.position_m) if name == LOG_DISTANCE else constant
+    return Trend(receiver.position_m if name == LOG_DISTANCE else None)
 
 
 def fit_generic(rows: ReceiverRows) -> Kriged:
@@ -373,7 +355,8 @@ def fit_generic(rows: ReceiverRows) -> Kriged:
 SOURCE = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
 
 
-def load_generic(receiver: Receiver, arrays: dict[str, NDArray[Any]]) -> Kriged | UncertainKriged:
+def load_generic(receiver: Receiver, arrays: dict[str, NDArray[Any]]) -> Kriged:
     """The kriging of a receiver from its arrays."""
-    kriged = Kriged.from_arrays(arrays, receiver)
-    return UncertainKriged(kriged, float(arrays["noise"]), arrays[SCALE]) if SCALE in arrays else kriged
+    if SCALE not in arrays:
+        return Kriged.from_arrays(arrays, receiver)
+    return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])

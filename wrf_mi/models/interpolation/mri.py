@@ -21,7 +21,7 @@ from ...core import InputError, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from .by_receiver import ReceiverRows, model_by_receiver
-from .kriging import log_distance
+from .kriging import Trend
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PathLoss:
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Power in dBm, [m] float32, at transmitter positions [m, 3]."""
-        return (log_distance(self.receiver_m)(tx_pos) @ self.law).astype(np.float32)
+        return (Trend(self.receiver_m)(tx_pos) @ self.law).astype(np.float32)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The law."""
@@ -60,7 +60,7 @@ class PathLoss:
 def _fit(rows: ReceiverRows) -> PathLoss:
     record, train, observed = rows.problem.record, rows.split.all_train, rows.observation
     receiver_m = rows.receiver.position_m
-    columns = log_distance(receiver_m)(rows.tx_pos_m)
+    columns = Trend(receiver_m)(rows.tx_pos_m)
     if rows.problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
         return PathLoss(receiver_m, _shared_law(record, train))
     received = ~np.isnan(observed)
@@ -74,7 +74,7 @@ def _fit(rows: ReceiverRows) -> PathLoss:
 
 def _shared_law(record: Record, rows: IntArray) -> FloatArray:
     """Power at one metre and slope that fit some rows of all receivers together."""
-    columns = np.stack([log_distance(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
+    columns = np.stack([Trend(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
     return _law(columns, record.observation[:, rows])
 
 

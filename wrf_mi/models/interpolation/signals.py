@@ -79,15 +79,22 @@ class Covariances:
         A sum over turns is a product of two thin matrices, which takes less memory than the dictionary.
         """
         distance = cdist(a_m, b_m)
-        here, there = np.exp(1j * (a_m @ self.turns.T)), np.exp(-1j * (b_m @ self.turns.T))
+        waves_a, waves_b = np.exp(1j * (a_m @ self.turns.T)), np.exp(1j * (b_m @ self.turns.T))
         total = np.zeros((len(weight), *distance.shape), complex)
         for length, shares in enumerate(weight.reshape(len(weight), len(self.lengths_m), -1).swapaxes(0, 1)):
             decay = np.exp(-distance / self.lengths_m[length])
             for matrix, share in zip(total, shares, strict=True):
-                used = np.flatnonzero(share)
-                if len(used):
-                    matrix += decay * ((here[:, used] * share[used]) @ there[:, used].T)
+                _add_waves(matrix, decay, waves_a, share, waves_b)
         return total
+
+
+def _add_waves(
+    total: ComplexArray, decay: FloatArray, waves_a: ComplexArray, shares: FloatArray, waves_b: ComplexArray
+) -> None:
+    """Add the covariances of one length with shares [t] of waves [n, t] and [m, t], in place."""
+    used = np.flatnonzero(shares)
+    if len(used):
+        total += decay * ((waves_a[:, used] * shares[used]) @ waves_b[:, used].conj().T)
 
 
 class RowCovariances:
@@ -113,10 +120,7 @@ class RowCovariances:
         """Sum of the covariances times weights [count], [n, n]."""
         total = np.zeros(self._decay.shape[1:], complex)
         for decay, shares in zip(self._decay, weight.reshape(self.lengths, -1), strict=True):
-            used = np.flatnonzero(shares)
-            if len(used):
-                waves = self._wave[:, used]
-                total += decay * ((waves * shares[used]) @ waves.conj().T)
+            _add_waves(total, decay, self._wave, shares, self._wave)
         return total
 
     def traces(self, matrix: NDArray[Any], weight: FloatArray) -> FloatArray:

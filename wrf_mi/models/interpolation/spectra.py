@@ -170,14 +170,13 @@ class KrigedSpectra:
     half: float = 1.0
     spread: float = 1.0
 
-    def mixed(self, posterior: Posterior, nearby: Image, nearby_std: Image | None) -> tuple[Image, Image | None]:
-        """Mean and standard deviation of the weighted estimates, [q, height, width]; None for a mean alone."""
-        return self.weighted(self.report(posterior), posterior.ignorance, nearby, nearby_std)
-
-    def weighted(
+    def mixed(
         self, reported: tuple[Image, Image], ignorance: FloatArray, nearby: Image, nearby_std: Image | None
     ) -> tuple[Image, Image | None]:
-        """`mixed` of reported spectra with deviations, and signals' shares of unknown variance [q]."""
+        """Mean and standard deviation of both estimates, [q, height, width], weighted; None for a mean alone.
+
+        ``reported`` are spectra expected from signals and their deviations, ``ignorance`` that of the signals [q].
+        """
         expected, deviation = reported
         weight = signal_weight(ignorance, self.half)[:, None, None]
         difference = expected - nearby
@@ -189,25 +188,28 @@ class KrigedSpectra:
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[np.float32]:
         """Spectra [m, height, width] at positions [m, 3], metres; headings are not used."""
+        return self._estimated(tx_pos, None)
+
+    def prediction(self, tx_pos: FloatArray) -> Prediction:
+        """Spectra and standard deviations at positions [m, 3], metres."""
+        std = np.empty((len(tx_pos), *self.report.shape))
+        mean = self._estimated(tx_pos, std)
+        std *= self.spread
+        return Prediction(mean, std)
+
+    def _estimated(self, tx_pos: FloatArray, std: Image | None) -> NDArray[np.float32]:
+        """Spectra [m, height, width] and, written into ``std``, standard deviations before `spread`."""
+        # Filled chunk by chunk: joined chunks would take the memory twice.
         mean = np.empty((len(tx_pos), *self.report.shape), np.float32)
         with one_blas_thread():
             for begin in range(0, len(tx_pos), CHUNK):
                 rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
-                mean[rows] = self.mixed(self.signals.predict(at), self.nearby.predict(at), None)[0]
+                nearby_std = None if std is None else self.nearby.std(at)
+                posterior, nearby = self.signals.predict(at), self.nearby.predict(at)
+                mean[rows], deviation = self.mixed(self.report(posterior), posterior.ignorance, nearby, nearby_std)
+                if std is not None:
+                    std[rows] = deviation
         return np.clip(mean, 0, 1)
-
-    def prediction(self, tx_pos: FloatArray) -> Prediction:
-        """Spectra and standard deviations at positions [m, 3], metres."""
-        # Filled chunk by chunk: joined chunks would take the memory twice.
-        mean, std = np.empty((len(tx_pos), *self.report.shape), np.float32), np.empty((len(tx_pos), *self.report.shape))
-        with one_blas_thread():
-            for begin in range(0, len(tx_pos), CHUNK):
-                rows, at = slice(begin, begin + CHUNK), tx_pos[begin : begin + CHUNK]
-                mean[rows], std[rows] = self.mixed(
-                    self.signals.predict(at), self.nearby.predict(at), self.nearby.std(at)
-                )
-        std *= self.spread
-        return Prediction(np.clip(mean, 0, 1), std)
 
     def facts(self) -> dict[str, Any]:
         """Lengths, shares and weights."""
@@ -259,29 +261,24 @@ def fit_spectra(rows: ReceiverRows) -> Single:
     Raises:
         InputError: no row that was received.
     """
-    record = rows.problem.record
-    if rows.problem.settings.is_generic or rows.receiver.array_m is None or record.frequencies_hz is None:
+    record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
+    if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
         return fit_generic(rows)
     position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
+    frequency_hz = float(frequencies_hz[0])
     with one_blas_thread():
-        return _fit_known_array(rows, position_m, observed)
-
-
-def _fit_known_array(rows: ReceiverRows, position_m: FloatArray, observed: NDArray[Any]) -> Single:
-    record, receiver = rows.problem.record, rows.receiver
-    assert receiver.array_m is not None
-    assert record.frequencies_hz is not None
-    if len(observed) >= LEAST_ROWS:
-        try:
-            lags = Lags(receiver.array_m, float(record.frequencies_hz[0]), *observed.shape[1:])
-            if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
-                raise InputError(f"{len(observed)} rows are too many for a process of element signals")
-            signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
-        except InputError as error:  # or a line of elements, or elements too far apart for lags
-            logger.warning("%s, receiver %s: the spectra themselves are kriged: %s", record.name, receiver.name, error)
-        else:
-            return _fit_signals_and_nearby(signals, position_m, observed, rows)
-    return UncertainKriged.of(fit_generic(rows), observed)
+        if len(observed) >= LEAST_ROWS:
+            try:
+                lags = Lags(receiver.array_m, frequency_hz, *observed.shape[1:])
+                if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
+                    raise InputError(f"{len(observed)} rows are too many for a process of element signals")
+                signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
+            except InputError as error:  # or a line of elements, or elements too far apart for lags
+                what = f"{record.name}, receiver {receiver.name}"
+                logger.warning("%s: the spectra themselves are kriged: %s", what, error)
+            else:
+                return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
+        return UncertainKriged.of(fit_generic(rows), observed)
 
 
 def _retrieved(observed: NDArray[Any], lags: Lags, seed: int, on_progress: OnProgress) -> ComplexArray:
@@ -295,13 +292,15 @@ def _retrieved(observed: NDArray[Any], lags: Lags, seed: int, on_progress: OnPro
 
 
 def _fit_signals_and_nearby(
-    signals: ComplexArray, position_m: FloatArray, observed: NDArray[Any], rows: ReceiverRows
+    signals: ComplexArray,
+    position_m: FloatArray,
+    observed: NDArray[Any],
+    rows: ReceiverRows,
+    array_m: FloatArray,
+    frequency_hz: float,
 ) -> KrigedSpectra:
     """Fit both estimates and their weights to element signals and spectra of rows at positions [n, 3], metres."""
-    frequencies_hz, array_m = rows.problem.record.frequencies_hz, rows.receiver.array_m
-    assert array_m is not None
-    assert frequencies_hz is not None
-    settings, seed, frequency_hz = rows.problem.settings, rows.problem.seed, float(frequencies_hz[0])
+    settings, seed = rows.problem.settings, rows.problem.seed
     wavelength, observed = speed_of_light / frequency_hz, np.asarray(observed, np.float32)
     receiver_m = rows.receiver.position_m
     towards = line_of_sight(position_m, receiver_m)
@@ -365,7 +364,7 @@ def _fit_weights(
     kriged.half = float(grid[((shares**2 * square) - 2 * shares * product).sum(axis=1).argmin()])
     ratios = []
     for truth, reported, unknown, nearby, nearby_std in predictions:
-        mean, std = kriged.weighted(reported, unknown, nearby, nearby_std)
+        mean, std = kriged.mixed(reported, unknown, nearby, nearby_std)
         assert std is not None
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))

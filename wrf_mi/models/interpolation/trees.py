@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from .by_receiver import ReceiverRows, model_by_receiver, observed_rows
+from .by_receiver import model_by_receiver, observed_rows
 
 
 @dataclass(frozen=True)
@@ -21,22 +21,25 @@ class Trees(CheckedSettings):
     Attributes:
         trees: number of trees.
         leaf_rows: least number of training rows in a leaf, which averages noise out.
-        seed: seed of the random cuts.
+        heading: whether headings count, where the data have them.
 
     Source: Geurts, Ernst and Wehenkel, "Extremely randomized trees" (2006); scikit-learn's `ExtraTreesRegressor`.
     """
 
     trees: Count = 300
     leaf_rows: Count = 5
-    seed: int = 0
+    heading: bool = True
 
-    def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> GrownTrees:
-        """Grow the trees on the rows that were observed.
+    def fit(
+        self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None, seed: int = 0
+    ) -> GrownTrees:
+        """Grow the trees, whose cuts are random, on the rows that were observed.
 
         Args:
             tx_pos: shape [n, 3], metres.
             observation: real, shape [n]; NaN, where nothing was received, is left out.
             tx_heading_rad: shape [n], or None to leave headings out.
+            seed: seed of the cuts.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, or complex observations.
@@ -49,7 +52,7 @@ class Trees(CheckedSettings):
             raise InputError(f"trees: observations {values.shape} of type {values.dtype}; give one real number per row")
         positions, values, heading = observed_rows(tx_pos, values, tx_heading_rad)
         like = np.empty((0, 3 if heading is None else 5), np.result_type(values, np.float32))
-        model = ExtraTreesRegressor(self.trees, min_samples_leaf=self.leaf_rows, random_state=self.seed)
+        model = ExtraTreesRegressor(self.trees, min_samples_leaf=self.leaf_rows, random_state=seed)
         model.fit(_features(positions, heading, like), values.astype(float))
         parts = [tree.tree_ for tree in model.estimators_]
         first = np.concatenate([[0], np.cumsum([part.node_count for part in parts])])
@@ -131,31 +134,11 @@ def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray
     return np.column_stack([positions, np.cos(heading), np.sin(heading)])
 
 
-@dataclass(frozen=True)
-class TreesSettings:
-    """Settings of the trees.
-
-    Attributes:
-        trees: number of trees.
-        leaf_rows: least number of training rows in a leaf.
-        heading: whether headings count, where the data have them.
-    """
-
-    trees: int = 300
-    leaf_rows: int = 5
-    heading: bool = True
-
-
-def _fit(rows: ReceiverRows) -> GrownTrees:
-    trees = Trees(rows.problem.settings.trees, rows.problem.settings.leaf_rows, rows.problem.seed)
-    return trees.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)
-
-
 MODEL = model_by_receiver(
     "trees",
     ("rssi",),
-    TreesSettings,
-    _fit,
+    Trees,
+    lambda rows: rows.problem.settings.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed),
     lambda receiver, arrays: GrownTrees(**arrays),
     "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
     lambda record, settings: settings.heading,

@@ -1,0 +1,150 @@
+"""Scores of held-out rows, by which a fit chooses its state and the reach of its Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.types import IntArray
+from ..tracing.traced_field import TracedField
+from .fit_plan import FitPlan
+from .predictor import Predictor
+from .reach import Reach, choose_reach, improves
+from .state import FitState
+
+
+@dataclass(frozen=True)
+class HeldOutReports:
+    """Reports of training rows that a fit had not seen when it chose its state.
+
+    Attributes:
+        receiver: number of the receiver of each [q].
+        row: row of the record [q].
+        report: reports [q, ...] as observations.
+        score: best mean score of these rows by the stages' names.
+    """
+
+    receiver: IntArray
+    row: IntArray
+    report: NDArray[Any]
+    score: Mapping[str, float]
+
+
+class Judge:
+    """Scores and reports of a fit's held-out rows.
+
+    Args:
+        plan: data, graph and schedule of the fit.
+        sides: traced side of each port; None without a scene.
+
+    Attributes:
+        scores: scores of the held-out rows at the last validation, port by port.
+    """
+
+    def __init__(self, plan: FitPlan, sides: Sequence[TracedField | None]) -> None:
+        self.plan, self._sides, self.scores = plan, sides, np.zeros(0)
+
+    def reach(self, chosen: bool, length_m: float) -> Reach | None:
+        """Reach around the rows that train before or after a state is ``chosen``; None: Gaussians count everywhere."""
+        plan = self.plan
+        if not plan.graph.corrects:
+            return None
+        joined = chosen and plan.schedule.joined < plan.config.steps
+        rows = plan.split.all_train if joined else plan.choosing.train
+        known = [plan.record.tx_pos_m[plan.targets.received(port, rows)] for port in range(plan.targets.ports)]
+        receivers = range(len(plan.record.receivers))
+        return Reach(tuple(np.concatenate([known[port] for port in plan.ports(r)]) for r in receivers), length_m)
+
+    def _held_out(self, chosen: bool) -> list[IntArray]:
+        """Conditions of each port that are held out before or after a state is ``chosen``."""
+        split = self.plan.choosing if self.plan.in_groups and not chosen else self.plan.split
+        return [self.plan.targets.received(port, split.validation) for port in range(self.plan.targets.ports)]
+
+    def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
+        """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
+        slots = np.searchsorted(self.plan.known[port], rows)
+        return predict.of_side(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight)
+
+    def _scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
+        """Scores of `_reports`."""
+        observed = self.plan.record.observation[port // self.plan.graph.carriers, rows]
+        return np.ravel(self.plan.task.training_score(self._reports(predict, port, rows, weight), observed))
+
+    def score(self, predict: Predictor, state: FitState) -> float:
+        """Median of `scores` by a state, all receivers pooled; NaN without held-out rows.
+
+        Where Gaussians correct paths, it chooses the reach of the state.
+        """
+        plan, rows = self.plan, self._held_out(bool(state.chosen))
+        if plan.graph.corrects:
+            self.scores = self._corrected_scores(predict, state, rows)
+        elif plan.graph.scene is not None:
+            each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
+            self.scores = np.concatenate([np.zeros(0), *each])
+        else:
+            record, known, score = plan.record, plan.split.validation, plan.task.training_score
+            receivers = range(len(record.receivers)) if len(known) else ()
+            each = [np.ravel(score(predict.of_rows(record, known, r), record.observation[r, known])) for r in receivers]
+            self.scores = np.concatenate([np.zeros(0), *each])
+        return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
+
+    def _corrected_scores(self, predict: Predictor, state: FitState, rows: list[IntArray]) -> NDArray[np.float64]:
+        """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
+        plan, reach = self.plan, self.reach(bool(state.chosen), state.reach_m)
+        assert reach is not None
+        reach = reach.of_ports(plan.graph.carriers)
+        positions = [plan.record.tx_pos_m[port_rows] for port_rows in rows]
+        lengths = [reach.length_m]
+        if plan.in_groups and not state.chosen:
+            # Before the last stage the field has not been trained.
+            trained = plan.schedule.stage(state.step - 1) == len(plan.schedule.stages)
+            lengths = reach.lengths(positions) if trained else [0.0]
+
+        def score(port: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
+            return self._scores(predict, port, rows[port], weight)
+
+        state.reach_m, scores = choose_reach(reach, lengths, positions, score, plan.task.higher_is_better)
+        return scores
+
+    def stage_score(self, state: FitState) -> float:
+        """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before.
+
+        A mean has less variance than a median. The best mean score of the present stage is noted in the state.
+        """
+        plan, higher = self.plan, self.plan.task.higher_is_better
+        score = float(np.nanmean(self.scores))
+        if not len(state.stage_scores):
+            state.stage_scores = np.full(len(plan.stages), np.nan)
+        # A score right at the end of a stage is that of its last state.
+        stage, better = plan.schedule.stage(state.step - 1), np.fmax if higher else np.fmin
+        state.stage_scores[stage] = better(state.stage_scores[stage], score)
+        if len(state.baseline) and not improves(self.scores, state.baseline, higher):
+            score = -np.inf if higher else np.inf
+        if (score if higher else -score) > state.best_score:
+            state.best_scores = self.scores
+        if state.step in plan.schedule.stages:
+            state.baseline = state.best_scores
+        return score
+
+    def held_out_reports(self, predict: Predictor, state: FitState) -> NDArray[Any]:
+        """Reports of all rows on which a state was chosen, port by port."""
+        reach, reports = self.reach(False, state.reach_m), list[NDArray[Any]]()
+        for port, rows in enumerate(self._held_out(False)):
+            receiver = port // self.plan.graph.carriers
+            weight = None if reach is None else reach.weight(self.plan.record.tx_pos_m[rows], receiver)
+            reports.append(self._reports(predict, port, rows, weight))
+        return np.concatenate(reports)
+
+    def summary(self, state: FitState) -> HeldOutReports | None:
+        """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
+        plan = self.plan
+        if not plan.in_groups or plan.graph.scene is None or not len(state.held_out):
+            return None
+        rows = self._held_out(False)
+        receiver = [np.full(len(port_rows), port // plan.graph.carriers) for port, port_rows in enumerate(rows)]
+        best = {name: float(score) for name, score in zip(plan.stages, state.stage_scores, strict=True)}
+        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), state.held_out, best)
