@@ -32,7 +32,7 @@ def job(file: str, backend: str) -> None:
     """Measure all axes with a backend and store them as JSON."""
     known = init(backend)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    from wrf_mi.runs.timing import one_blas_thread
+    from wrf_mi.parallel.threads import one_blas_thread
 
     from .scaling import AXES, Axis, scale
 

@@ -24,13 +24,13 @@ from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_file import test_observations
 from wrf_mi.maps.locate_knn import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows
-from wrf_mi.runs.timing import bootstrap
+from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import data_folder, kept, line
+from .fit_key import fit_key, source_files
 from .table_plan import PARTS
 from .tables import scene_of
 
@@ -128,8 +128,8 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return np.array([found[key] for found in draws], float)
 
     error, near, best = of("error_m"), of("neighbours_error_m"), of("best_neighbours_error_m")
-    gain, over_best = (bootstrap(stretches(other - error), np.mean) for other in (near, best))
-    inside = bootstrap(stretches(of("inside")), np.mean)
+    gain, over_best = (bootstrap(stretches(other - error), statistic=np.mean) for other in (near, best))
+    inside = bootstrap(stretches(of("inside")), statistic=np.mean)
     figures = {
         "median_m": float(np.median(error)),
         "mean_m": float(error.mean()),

@@ -32,8 +32,9 @@ from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
+from wrf_mi.parallel.threads import one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.training.config import TrainConfig, calibration_config
 from wrf_mi.training.step import TrainingData, device_pose, grey
@@ -41,6 +42,7 @@ from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
 from .stock import StockRenderer, rgb_variant
+from .timing import Call, Within, interleaved, ratio
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..tasks import TASKS
+from ..tasks.scores import Interval, bootstrap
 from .repeat import known_config
 from .results import Results
-from .timing import Interval, bootstrap
 
 COLUMNS = {
     "run": "run",
@@ -137,7 +137,7 @@ def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
     """Difference from the differences of rows, in favour of the run where positive."""
     if len(rows) < FEWEST:
         return Difference(run.name, against, len(rows), None, FEW)
-    interval = bootstrap(rows, np.mean)
+    interval = bootstrap(rows, statistic=np.mean)
     verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
     return Difference(run.name, against, len(rows), interval, verdict)
 
