@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .options import DATASET, Arguments, add_command, add_n_train
-from .output import print_json, stages
+from .output import Watch, print_json
 
 
 def add_parser(commands: Any) -> None:
@@ -57,8 +57,8 @@ def correct_command(a: Arguments) -> int:
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
     warn_of_suspicions(record)
-    with stages("correct") as show:
-        found = correct_scene(a.scene, record, splits[0], options, a.material, show)
+    with Watch() as watch:
+        found = correct_scene(a.scene, record, splits[0], options, a.material, watch.on_progress)
         facts = write_page(found, a.out, a.replace)
     if a.json:
         print_json({"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}})

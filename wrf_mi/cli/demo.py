@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 def demo_command(a: Arguments) -> int:
     """Run the demonstration."""
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         run, index = demo(Path(a.out) if a.out else None, watch.on_progress, watch.stop)
     show_metrics(run.metrics, run.folder, a.json)
     print(f"pictures: {index}", file=sys.stderr if a.json else sys.stdout)

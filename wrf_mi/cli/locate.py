@@ -55,7 +55,7 @@ def locate_command(a: Arguments) -> int:
         test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
     )
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         found = locate(run, given.value_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
     picture = out.with_suffix(".png")
     write_positions_file(out, found, given.true_m)

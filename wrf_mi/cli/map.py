@@ -46,12 +46,6 @@ def map_command(a: Arguments) -> int:
     check_map_file(out)
     run = open_run(a.run)
     with Watch() as watch:
-
-        def on_progress(stage: str, fraction: float, progress: Any = None, /) -> None:
-            watch.on_progress(stage, fraction, progress)
-            if watch.stop():
-                raise KeyboardInterrupt
-
         dataset = radio_map(
             run,
             height_m=a.height,
@@ -62,7 +56,7 @@ def map_command(a: Arguments) -> int:
             transmit_dbm=a.transmit_power,
             heading_deg=a.heading,
             frequency_hz=a.frequency,
-            on_progress=on_progress,
+            on_progress=watch.on_progress,
         )
     write_map(dataset, out)
     picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))

@@ -7,8 +7,6 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -69,34 +67,16 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
         print(f"{one['stage']:<16}{score:>32}{seconds:>10}{'' if one['kept'] else '  not kept'}")
 
 
-@contextmanager
-def stages(command: str) -> Iterator[Callable[[str, float], None]]:
-    """Progress callback, stage and fraction done, shown on standard error: a bar on a terminal, else a line a stage.
+class Watch:
+    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
     Args:
-        command: name of the command, for the lines.
-    """
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0, visible=False)
-
-        def show(stage: str, share: float) -> None:
-            if stage != bar.tasks[0].description:
-                bar.reset(task, description=stage, visible=True)
-                if bar.disable:
-                    print(f"{command}: {stage}", file=sys.stderr, flush=True)
-            bar.update(task, completed=share)
-
-        yield show
-
-
-class Watch:
-    """Progress of a fit on standard error (plain lines where it is no terminal), and a stop on Ctrl-C.
-
-    The first Ctrl-C lets the current step finish and writes a checkpoint; a second one ends at once.
+        resumable: whether the work asks `stop` and can go on later: the first Ctrl-C then lets the current step finish
+            and writes a checkpoint, and a second one ends at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, resumable: bool = False) -> None:
+        self._resumable = resumable
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console
@@ -109,7 +89,9 @@ class Watch:
 
     def __enter__(self) -> Watch:
         """Handle Ctrl-C."""
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._before = signal.getsignal(signal.SIGINT)
+        if self._resumable:
+            signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:

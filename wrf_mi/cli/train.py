@@ -53,7 +53,7 @@ def run_training(a: Arguments, **more: Any) -> int:
     arguments = training_arguments(a)
     from ..runs.api import train
 
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         progress: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop}
         run = train(a.dataset, a.out, **arguments, **progress, **more, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
@@ -64,7 +64,7 @@ def _resume(a: Arguments) -> int:
         init("llvm", threads=1)
     from ..runs.api import resume
 
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .options import Arguments, add_command
-from .output import print_json, stages
+from .output import Watch, print_json
 
 
 def add_parser(commands: Any) -> None:
@@ -40,8 +40,10 @@ def view_command(a: Arguments) -> int:
         raise InputError(f"{out}: a folder; give the name of a file, such as {out / 'view.html'}")
     limits = {name: getattr(a, name) for name in ("transmitters", "gaussians", "paths")}
     limits = {name: value for name, value in limits.items() if value is not None}
-    with stages("view") as on_stage:
-        found = view(*a.sources, **limits, material=a.material, on_stage=on_stage, progress=sys.stderr.isatty())
+    with Watch() as watch:
+        found = view(
+            *a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty()
+        )
     size = found.write(out).stat().st_size
     if a.json:
         print_json({"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes})

@@ -95,14 +95,14 @@ class GaussiansContent:
 
     Attributes:
         position_m: centres [n, 3], metres.
-        scale_m: standard deviations [t or 1, n, 3], metres.
+        log_scale: natural logarithms of the standard deviations in metres [t or 1, n, 3].
         rotation_xyzw: quaternions [t or 1, n, 4].
         strength_db: opacity times magnitude of the signal [t, n], dB.
         total: number of Gaussians of the field.
     """
 
     position_m: FloatArray
-    scale_m: FloatArray
+    log_scale: FloatArray
     rotation_xyzw: FloatArray
     strength_db: FloatArray
     total: int

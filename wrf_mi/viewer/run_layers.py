@@ -30,7 +30,8 @@ IMAGE_BYTES = 4_000_000
 """Bytes of a page for observations that are images, at most."""
 PATH_NUMBERS = 1_000_000
 """Coordinates of all paths of a page, at most: 2.7 MB."""
-WEAKEST_GAIN = 1e-20
+WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9
+"""Limits before logarithms."""
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
 OnStage = Callable[[str, float], None]
@@ -132,6 +133,7 @@ def gaussians_content(
     )
     if (scale == scale[:1]).all() and (rotation == rotation[:1]).all():
         scale, rotation = scale[:1], rotation[:1]
+    log_scale = np.log(np.maximum(scale, SMALLEST_M))
     total = strength.shape[1]
     notes = []
     if len(order) < total:
@@ -139,7 +141,7 @@ def gaussians_content(
             f"Gaussians: the {len(order)} of {total} of the largest mean power over the stored transmitters "
             "(option --gaussians)."
         )
-    return GaussiansContent(clouds[0].position_m[order], scale, rotation, strength[:, order], total), notes
+    return GaussiansContent(clouds[0].position_m[order], log_scale, rotation, strength[:, order], total), notes
 
 
 def run_scene(run: Run, frequency_hz: float) -> Any | None:
