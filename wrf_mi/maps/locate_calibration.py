@@ -145,7 +145,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
             if stored.pop("key") == key:
                 return _restored(stored)
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
-    folds = folds_of(record, split) if len(run.problem.rows(split)) else []
+    folds = folds_of(record, split)
     if not folds:
         return Calibration(Likelihood())
     parts, headings, place = [], headings_of(run), run.folder / FOLDER

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import numpy as np
 
 from ..core import DataFault, InputError, Receiver
 from ..core.angles import FloatArray
-from ..core.files import one_line, write_atomically
+from ..core.files import one_line, write_csv
 from ..core.receivers import SHOWN
 from ..datasets.folder_files import CsvTable, read_csv
 from ..runs.folder import load_rows
@@ -121,12 +119,8 @@ def write_positions_file(out: Path, found: Positions, true_m: FloatArray | None 
     if true_m is not None:
         columns |= {"true_x": true_m[:, 0], "true_y": true_m[:, 1], "error_m": found.error_m(true_m)}
         columns["inside"] = found.covers(true_m).astype(int)
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([value if isinstance(value, np.integer) else round(float(value), 4) for value in row])
-    return write_atomically(out, text.getvalue())
+    rounded = [values if values.dtype.kind in "iu" else values.astype(float).round(4) for values in columns.values()]
+    return write_csv(out, columns, zip(*rounded, strict=True))
 
 
 def posterior_arrays(found: Positions) -> dict[str, Any]:

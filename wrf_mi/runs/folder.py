@@ -62,7 +62,7 @@ class RunConfig:
         dataset: name or folder of the data set.
         task: task of the data set.
         split: name of the split; that of a fold is, e.g., ``blocked:2``.
-        n_train: number or fraction of training rows; None: all; 0: none, the scene alone.
+        n_train: number or fraction of training rows; None: all.
         seed: seed of split and fit.
         scene: name, scene folder, Mitsuba XML or mesh; None: none.
         material: radio material of a bare mesh, or None.

@@ -27,7 +27,7 @@ from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
 from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
-from .prediction_file import CSV, PredictionSpool, check_prediction_file, write_prediction_file
+from .prediction_file import check_prediction_file, spooled, write_prediction_file
 
 PREDICTED_PER_CHUNK = 256
 """Positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver."""
@@ -78,9 +78,8 @@ class Run:
         """Data, scene and settings that the model was fitted to."""
         config = self.config
         scene = config.scene, config.material, config.antennas
-        rows = config.n_train != 0
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        return Problem(data, config.settings, config.seed, *scene, rows, self.operator, left_out)
+        return Problem(data, config.settings, config.seed, *scene, self.operator, left_out)
 
     @cached_property
     def fitted(self) -> Fitted:
@@ -285,36 +284,45 @@ def predict_to_file(
     check_prediction_file(Path(out), path)
     run.check_inputs(asked)
     receivers, count = run.receivers, len(asked)
-    with PredictionSpool(Path(out).parent, len(receivers), count) as spool:
-        if scheduler is None or not count:
-            total = len(receivers) * count
-            shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
-            with shown as bar:
-                for index in range(len(receivers)):
-                    for rows, found in run.predicted_parts(asked, index):
-                        spool.write(rows, index, found)
-                        if bar is not None:
-                            bar.add(rows.stop - rows.start, 1)
-        else:
-            parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
+    collected: dict[str, NDArray[Any]] = {}
 
-            def each(part: int, found: list[Prediction]) -> None:
-                for index, one in enumerate(found):
-                    spool.write(parts[part], index, one)
-                found.clear()  # the scheduler keeps results to the end
+    def collect(rows: slice, index: int, found: Prediction) -> None:
+        std = None if found.std is None else found.std.astype(np.float32)
+        for name, values in (("prediction", found.mean), ("std", std)):
+            if values is not None:
+                if name not in collected:
+                    shape = (len(receivers), count, *values.shape[1:])
+                    collected[name] = spooled(Path(out).parent, shape, values.dtype)
+                collected[name][index, rows] = values
 
-            opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
-            given = [asked.rows(rows) for rows in parts]
-            scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
-        arrays: dict[str, Any] = {
-            "row": np.arange(count),
-            "tx_pos": asked.tx_pos_m,
-            "receiver_name": np.asarray([receiver.name for receiver in receivers]),
-        }
-        if carriers_hz is not None:
-            arrays[FREQUENCY] = carriers_hz
-        arrays |= spool.arrays() if Path(out).suffix.lower() == CSV else spool.streams()
-        written = write_prediction_file(Path(out), arrays, tx_heading_rad)
+    if scheduler is None or not count:
+        total = len(receivers) * count
+        shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
+        with shown as bar:
+            for index in range(len(receivers)):
+                for rows, found in run.predicted_parts(asked, index):
+                    collect(rows, index, found)
+                    if bar is not None:
+                        bar.add(rows.stop - rows.start, 1)
+    else:
+        parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
+
+        def each(part: int, found: list[Prediction]) -> None:
+            for index, one in enumerate(found):
+                collect(parts[part], index, one)
+            found.clear()  # the scheduler keeps results to the end
+
+        opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
+        given = [asked.rows(rows) for rows in parts]
+        scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
+    arrays: dict[str, Any] = {
+        "row": np.arange(count),
+        "tx_pos": asked.tx_pos_m,
+        "receiver_name": np.asarray([receiver.name for receiver in receivers]),
+    }
+    if carriers_hz is not None:
+        arrays[FREQUENCY] = carriers_hz
+    written = write_prediction_file(Path(out), arrays | collected, tx_heading_rad)
     return {key: value.shape for key, value in written.items()}
 
 

@@ -27,7 +27,7 @@ from defusedxml.ElementTree import parse
 
 from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
-from ..core.files import one_line, write_atomically
+from ..core.files import one_line, write_atomically, write_csv
 from ..datasets.registry import locate
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
@@ -35,7 +35,6 @@ from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, is_finished, package_versions
-from .results import write_csv
 
 OPTIONS = (
     *(
@@ -188,7 +187,8 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
     def each(index: int, row: dict[str, Any]) -> None:
         finished[index] = row
         rows = [finished[k] for k in sorted(finished)]  # written after each run: a sweep may take days
-        write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
+        columns = ["run", *sweep.varied, *HEADINGS]
+        write_csv(sweep.folder / "scores.csv", columns, ([row[key] for key in columns] for row in rows))
         write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
         write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")
         headline = row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
