@@ -87,18 +87,17 @@ def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
         given: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
         train(FLAT, folder, cell.model, **given, **more)
     run = open_run(folder)
-    given_rows = test_observations(run)
-    assert given_rows.true_m is not None
-    found = locate(run, given_rows.value_dbm, on_progress=_show(cell.name))
+    strengths_dbm, true_m = test_observations(run)
+    found = locate(run, strengths_dbm, on_progress=_show(cell.name))
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
-    best = best_neighbours(record, rows, given_rows.value_dbm, given_rows.true_m)
-    near = found.neighbours_error_m(given_rows.true_m)
+    best = best_neighbours(record, rows, strengths_dbm, true_m)
+    near = found.neighbours_error_m(true_m)
     assert near is not None
     return {
-        "error_m": found.error_m(given_rows.true_m).tolist(),
+        "error_m": found.error_m(true_m).tolist(),
         "neighbours_error_m": near.tolist(),
         "best_neighbours_error_m": best.tolist(),
-        "inside": found.covers(given_rows.true_m).tolist(),
+        "inside": found.covers(true_m).tolist(),
         "area_m2": found.area_m2.tolist(),
         "radius_m": found.radius_m.tolist(),
         "calibration": asdict(found.calibration),

@@ -38,7 +38,6 @@ def locate_command(a: Arguments) -> int:
     from ..maps.locate import locate, located_run
     from ..maps.locate_figure import draw_positions
     from ..maps.locate_file import (
-        check_positions_file,
         figures_of,
         posterior_arrays,
         read_observations,
@@ -47,22 +46,23 @@ def locate_command(a: Arguments) -> int:
     )
 
     out = Path(a.out)
-    check_positions_file(out)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: positions are written as .csv; give such a name")
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    given = (
+    strengths_dbm, true_m = (
         test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
     )
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
-        found = locate(run, given.value_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
+        found = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
     picture = out.with_suffix(".png")
-    write_positions_file(out, found, given.true_m)
-    write_figure(picture, draw_positions(run, found, given.true_m))
+    write_positions_file(out, found, true_m)
+    write_figure(picture, draw_positions(run, found, true_m))
     if a.posterior is not None:
         write_arrays(Path(a.posterior), posterior_arrays(found), compressed=True)
-    figures = figures_of(found, given.true_m)
+    figures = figures_of(found, true_m)
     if a.json:
         print_json({"out": str(out), "picture": str(picture), **figures})
         return 0

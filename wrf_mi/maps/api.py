@@ -38,10 +38,17 @@ from ..core.receivers import receiver_index
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
-from .dataset import map_dataset
-from .grid import Grid, area_of, check_height, grid_over, usual_height, warn_of_points_outside
-from .packages import maps_package
-from .surface import SurfaceMesh, surface_of
+from .dataset import map_dataset, maps_package
+from .grid import (
+    Grid,
+    SurfaceMesh,
+    area_of,
+    check_height,
+    grid_over,
+    surface_of,
+    usual_height,
+    warn_of_points_outside,
+)
 from .values import HEADINGS, Conditions, map_values
 
 if TYPE_CHECKING:
@@ -63,7 +70,6 @@ def radio_map(
     heading_deg: float | None = None,
     frequency_hz: float | None = None,
     on_progress: OnProgress = quiet,
-    chunk_size: int | None = None,
 ) -> xarray.Dataset:
     """What the receivers of a run receive from a transmitter at the positions of a plane or a mesh.
 
@@ -81,7 +87,6 @@ def radio_map(
         heading_deg: yaw of the transmitter; None: models that know it are averaged over 8 headings.
         frequency_hz: carrier, where the data have several.
         on_progress: progress callback: stage and fraction done.
-        chunk_size: positions that are predicted together; None: at most 10,000, fewer of large observations.
 
     Returns:
         Dataset as `wrf_mi.maps.dataset.map_dataset` describes it; ``docs/maps.md`` defines the variables.
@@ -100,7 +105,7 @@ def radio_map(
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
     _check_carrier(opened, frequency_hz)
     places = _places(opened, height_m, step_m, surface)
-    values = map_values(opened, places.positions_m, numbers, conditions, on_progress, chunk_size)
+    values = map_values(opened, places.positions_m, numbers, conditions, on_progress)
     unit = "dB" if task.level_kind == "relative" else "dBm"
     attributes = _attributes(opened, task, conditions, heading_deg) | {"receiver_numbers": list(numbers)}
     return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)

@@ -1,16 +1,20 @@
-"""Regular horizontal grids of transmitter positions over the area of a run."""
+"""Positions of a map: a horizontal grid over the area of a run, or the centres of the faces of a mesh."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..runs.run import Run
+from ..scene.coordinates import require_near
+from ..scene.surfaces import mesh_parts
 
 logger = logging.getLogger(__name__)
 
@@ -18,6 +22,8 @@ LARGEST = 10_000_000
 """Largest number of positions of a grid: 240 MB of coordinates."""
 MARGIN_M = 0.5
 """Margin around transmitter positions where no scene states the area."""
+ROUNDS = 20
+"""Largest number of times that an edge is halved: a kilometre into millimetres."""
 MOUNTED_M = 0.02
 """Distance from a surface up to which a receiver is taken to lie before it."""
 
@@ -43,6 +49,22 @@ class Grid:
         return np.stack([x.ravel(), y.ravel(), np.full(x.size, self.height_m)], axis=-1)
 
 
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """Triangles at whose centres a map is computed.
+
+    Attributes:
+        triangles_m: corners of the triangles [m, 3, 3], metres.
+    """
+
+    triangles_m: FloatArray
+
+    @property
+    def positions_m(self) -> FloatArray:
+        """Centres of the triangles [m, 3], metres."""
+        return np.asarray(self.triangles_m.mean(axis=1))
+
+
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
     """Grid over a rectangle: square cells from its lower corner on, whose centres lie in it.
 
@@ -58,8 +80,7 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
     Raises:
         InputError: a step that is not positive and finite, or more than `LARGEST` positions.
     """
-    if not (np.isfinite(step_m) and step_m > 0):
-        raise InputError(f"step {step_m:g} m: give a positive number of metres")
+    _check_step(step_m)
     low = np.asarray(low_m, float)[:2]
     size = np.maximum(np.asarray(high_m, float)[:2] - low, 0.0)
     # The tolerance keeps a centre that rounding alone puts inside off the upper side, which is a wall.
@@ -72,6 +93,41 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
         for start, extent, count in zip(low, size, counts, strict=True)
     )
     return Grid(x, y, float(height_m))
+
+
+def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
+    """Triangles of a mesh file, halved until no edge is longer than a step.
+
+    Args:
+        mesh: a format of `wrf_mi.scene.surfaces.mesh_parts`, in metres and the frame of the data.
+        step_m: longest edge of a triangle, metres; None: the faces as they are.
+
+    Raises:
+        InputError: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
+    """
+    if not Path(mesh).is_file():
+        raise InputError(f"{mesh}: no such file; give a mesh (PLY, STL, OBJ, GLB)")
+    parts = [np.asarray(part.triangles, float) for part in mesh_parts(mesh)]
+    if not parts:
+        raise InputError(f"{mesh}: no faces; give a mesh with triangles")
+    triangles = np.concatenate(parts)
+    require_near(triangles.reshape(-1, 3), mesh)
+    if step_m is not None:
+        _check_step(step_m)
+        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(axis=1)
+        # Each halving makes four triangles of one.
+        count = (4.0 ** np.ceil(np.log2(np.maximum(edges / step_m, 1)))).sum()
+        if count > LARGEST:
+            raise InputError(f"step {step_m:g} m: {count:.3g} triangles, the limit is {LARGEST}; give a larger step")
+        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+        vertices, faces = trimesh.remesh.subdivide_to_size(triangles.reshape(-1, 3), faces, step_m, max_iter=ROUNDS)
+        triangles = vertices[faces]
+    return SurfaceMesh(triangles)
+
+
+def _check_step(step_m: float) -> None:
+    if not (np.isfinite(step_m) and step_m > 0):
+        raise InputError(f"step {step_m:g} m: give a positive number of metres")
 
 
 def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:

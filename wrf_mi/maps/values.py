@@ -55,7 +55,6 @@ def map_values(
     receivers: Sequence[int],
     conditions: Conditions,
     on_progress: OnProgress = quiet,
-    chunk_size: int | None = None,
 ) -> Arrays:
     """Values of all variables of a map that a run's model states.
 
@@ -65,15 +64,14 @@ def map_values(
         receivers: numbers of the receivers.
         conditions: threshold, transmit power, headings and carrier.
         on_progress: progress callback.
-        chunk_size: positions in a chunk; None: as memory permits.
 
     Returns:
-        Arrays [receivers, m] by the names of `wrf_mi.maps.variables.VARIABLES`; NaN inside solid objects of the scene.
+        Arrays [receivers, m] by the names of `wrf_mi.maps.dataset.VARIABLES`; NaN inside solid objects of the scene.
 
     Raises:
         InputError: inputs that the model does not predict from.
     """
-    size = chunk_size or _chunk_size(run, len(conditions.headings_rad))
+    size = _chunk_size(run, len(conditions.headings_rad))
     found: Arrays = {}
     outside = _outside_solids(run, positions_m)
     with _each_warning_once():

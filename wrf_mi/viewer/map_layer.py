@@ -14,7 +14,7 @@ import numpy as np
 
 from ..core import InputError
 from ..core.array_files import stored_arrays
-from ..maps.packages import require_packages
+from ..maps.dataset import require_packages
 from ..parallel import run_module
 from .content import MapContent
 
