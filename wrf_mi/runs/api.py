@@ -298,7 +298,7 @@ def resume(
     """Continue a stopped run; fitted parts are only scored again. Arguments as those of `train` and `open_run`.
 
     Raises:
-        InputError: not a run folder, one of version 0.1, or one that another process writes into.
+        InputError: not a run folder, or one that another process writes into.
         Interrupted: ``stop`` ended the run once more.
         BackendError: as `train`.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..tasks import TASKS
-from ..tasks.scores import Interval, bootstrap
+from ..tasks.scores import bootstrap
 from .repeat import known_config
 from .results import Results
 
@@ -59,7 +59,7 @@ class Difference:
         run: name of the run.
         against: name of the other run or of the reference.
         rows: number of common rows.
-        interval: mean difference of the score per row with its 95 % interval; None: too few rows.
+        difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows.
         verdict: `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`.
         seeds: number of seeds of which the verdict is.
     """
@@ -67,8 +67,10 @@ class Difference:
     run: str
     against: str
     rows: int
-    interval: Interval | None
     verdict: str
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
     seeds: int = 1
 
 
@@ -136,10 +138,10 @@ def _of_seeds(
 def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
     """Difference from the differences of rows, in favour of the run where positive."""
     if len(rows) < FEWEST:
-        return Difference(run.name, against, len(rows), None, FEW)
+        return Difference(run.name, against, len(rows), FEW)
     interval = bootstrap(rows, statistic=np.mean)
     verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
-    return Difference(run.name, against, len(rows), interval, verdict)
+    return Difference(run.name, against, len(rows), verdict, interval.value, interval.low, interval.high)
 
 
 def _paired(run: Results, other: Results) -> FloatArray:
@@ -199,16 +201,7 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
 def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
     """Rows of the table of differences."""
     return [
-        {
-            "run": one.run,
-            "against": one.against,
-            "rows": one.rows,
-            "difference": None if one.interval is None else one.interval.value,
-            "low": None if one.interval is None else one.interval.low,
-            "high": None if one.interval is None else one.interval.high,
-            "verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else ""),
-        }
-        for one in found
+        asdict(one) | {"verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else "")} for one in found
     ]
 
 

@@ -47,8 +47,6 @@ from ..training.trainer import check_rows
 FORMAT = 4
 """Version of ``config.yaml`` and ``model.npz``."""
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
-OLD = ("hybrid.npz", "fitted.npz")
-"""Files of version 0.1."""
 VERSION, SECONDS = "run/format", "run/train_seconds"
 """Keys of ``model.npz`` beside the model's arrays."""
 
@@ -148,17 +146,17 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def check_format(folder: Path) -> None:
-    """Refuse a run of version 0.1 or of another format by `InputError`; an unreadable configuration passes."""
+    """Refuse a run of another format by `InputError`; an unreadable configuration passes."""
     try:
         content = read_yaml(folder / CONFIG)
     except InputError:
         content = {}
     stated = content.get("format") if content else FORMAT
-    if stated is None or any((folder / name).exists() for name in OLD):
-        raise InputError(f"{folder}: a run of version 0.1; train it anew, or use version 0.1")
     if stated != FORMAT:
         path = folder / CONFIG
-        raise InputError(f"{path}: format {stated}, this version reads {FORMAT}; use the version that wrote it")
+        raise InputError(
+            f"{path}: format {stated or 'not stated'}, this version reads {FORMAT}; train it anew, or use the version that wrote it"
+        )
 
 
 def check_new(folder: Path) -> None:

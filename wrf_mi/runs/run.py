@@ -64,7 +64,7 @@ class Run:
         """Content of ``config.yaml``.
 
         Raises:
-            InputError: not a run folder, a damaged one, or one of version 0.1.
+            InputError: not a run folder, or a damaged one.
         """
         return read_config(self.folder)
 
@@ -235,7 +235,7 @@ def open_run(folder: str | Path, record: Record | None = None, operator: bool = 
         operator: learned fields predict by operator where they can.
 
     Raises:
-        InputError: not a run folder, or a run folder of version 0.1.
+        InputError: not a run folder.
     """
     run = Run(Path(folder), record, operator)
     _ = run.config
