@@ -153,10 +153,8 @@ def check_format(folder: Path) -> None:
         content = {}
     stated = content.get("format") if content else FORMAT
     if stated != FORMAT:
-        path = folder / CONFIG
-        raise InputError(
-            f"{path}: format {stated or 'not stated'}, this version reads {FORMAT}; train it anew, or use the version that wrote it"
-        )
+        text = f"format {stated or 'not stated'}, this version reads {FORMAT}"
+        raise InputError(f"{folder / CONFIG}: {text}; train it anew, or use the version that wrote it")
 
 
 def check_new(folder: Path) -> None:
