@@ -16,9 +16,7 @@ from ..core import BackendError, InputError
 from ..core.files import os_failure
 from .options import Parser
 
-COMMANDS = """
-doctor data mesh correct edit train trace sweep evaluate predict map locate compress compare view export bench demo
-"""
+MODULES = ("doctor", "data", "mesh", "correct", "edit", "train", "runs", "maps", "export", "bench", "demo")
 """Modules of the commands, in the order of the help."""
 
 
@@ -27,7 +25,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="wrf-mi", description="Learned wireless radiation fields and ray tracing.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name in COMMANDS.split():
+    for name in MODULES:
         import_module(f".{name}", __package__).add_parser(commands)
     return parser
 

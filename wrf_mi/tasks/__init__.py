@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from ..core import InputError, Record
 from ..core.registry import Registry
 from ..receivers.instruments import Instrument
-from . import csi, rssi, spectrum
+from .kinds import Csi, Rssi, Spectrum
 from .task import CARRIER, LAW, UPLINK, Task
 
 ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""
 
 
-_TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {t.name: t for t in (spectrum.TASK, rssi.TASK, csi.TASK)})
+_TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
 TASKS: Mapping[str, Task] = _TASKS
 """Every task by its name in `wrf_mi.core.Record.task`."""
 
