@@ -17,7 +17,7 @@ from ..models import Inputs
 from ..receivers.spreads import PathStatistics
 from ..runs.run import Run
 from ..tasks import task_of
-from ..training.session import OnProgress, quiet
+from ..training.session import OnProgress
 from .coverage import coverage_probability
 
 CHUNK_SIZE = 10_000
@@ -54,16 +54,9 @@ def map_values(
     positions_m: FloatArray,
     receivers: Sequence[int],
     conditions: Conditions,
-    on_progress: OnProgress = quiet,
+    on_progress: OnProgress,
 ) -> Arrays:
-    """Values of all variables of a map that a run's model states.
-
-    Args:
-        run: run of one split.
-        positions_m: positions of the transmitter [m, 3], metres.
-        receivers: numbers of the receivers.
-        conditions: threshold, transmit power, headings and carrier.
-        on_progress: progress callback.
+    """Values of all variables of a map that a run's model states at positions [m, 3] in metres.
 
     Returns:
         Arrays [receivers, m] by the names of `wrf_mi.maps.dataset.VARIABLES`; NaN inside solid objects of the scene.

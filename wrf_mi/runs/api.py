@@ -291,7 +291,6 @@ def resume(
     folder: str | Path,
     on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
-    scheduler: Scheduler | None = None,
     progress: bool = False,
     record: Record | None = None,
 ) -> Run:
@@ -305,7 +304,7 @@ def resume(
     run = open_run(folder, record)
     if run.config.deterministic:
         init("llvm", threads=1)
-    session = Session(run.folder, run.folder, on_progress, stop, scheduler, progress)
+    session = Session(run.folder, run.folder, on_progress, stop, progress=progress)
     with locked_folder(run.folder):
         _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)

@@ -53,20 +53,11 @@ VERSION, SECONDS = "run/format", "run/train_seconds"
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Content of ``config.yaml``.
+    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them.
 
     Attributes:
-        model: name of the model.
-        dataset: name or folder of the data set.
         task: task of the data set.
         split: name of the split; that of a fold is, e.g., ``blocked:2``.
-        n_train: number or fraction of training rows; None: all.
-        seed: seed of split and fit.
-        scene: name, scene folder, Mitsuba XML or mesh; None: none.
-        material: radio material of a bare mesh, or None.
-        antennas: antenna options that override the data set.
-        deterministic: fitted on one thread of the CPU, bit-identical from run to run.
-        intervals: standard deviations are calibrated on held-out training rows (`wrf_mi.models.calibrated`).
         settings: all settings of the model.
         left_out: training rows of the receivers that are left out for having too few, by name.
     """

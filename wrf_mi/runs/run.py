@@ -229,13 +229,7 @@ def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:
     """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
-    Args:
-        folder: run folder.
-        record: data that the model was fitted to; None: the data set that the folder names.
-        operator: learned fields predict by operator where they can.
-
-    Raises:
-        InputError: not a run folder.
+    Arguments are the attributes of `Run`; `InputError` where the folder is none of a run.
     """
     run = Run(Path(folder), record, operator)
     _ = run.config
@@ -263,12 +257,12 @@ def predict_to_file(
         out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and ``std`` of models
             that state it. ``.csv``: signal strengths (`wrf_mi.runs.prediction_file.write_prediction_file`).
-        tx_heading_rad: yaw of the transmitter's body [m], radians, for models that use it.
+        tx_heading_rad: as that of `Run.predict`, as are the next two.
         scheduler: computes chunks of the positions; None: this process. Its workers must see the run folder, data set
             and scene under the same names.
         operator: learned fields predict by operator where they can.
-        uplink: uplink channels [m, antennas, subcarriers], for models that predict from them.
-        carriers_hz: carrier of each position [m], Hz, where the data have several; stored as ``frequency_hz``.
+        uplink: uplink channels.
+        carriers_hz: carriers, stored as ``frequency_hz``.
         progress: show progress on standard error.
 
     Returns:
