@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core import InputError
-from ..core.carriers import FREQUENCY, carriers_text
+from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
@@ -103,7 +103,6 @@ def radio_map(
     if task.level_kind != "relative" and threshold_dbm is None:
         threshold_dbm = THRESHOLD_DBM
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
-    _check_carrier(opened, frequency_hz)
     places = _places(opened, height_m, step_m, surface)
     values = map_values(opened, places.positions_m, numbers, conditions, on_progress)
     unit = "dB" if task.level_kind == "relative" else "dBm"
@@ -130,16 +129,6 @@ def _check(
     if task.level_kind == "relative" and transmit_dbm:
         text = f"its {task.name} observations state no power in dBm"
         raise InputError(f"{run.folder}: {text}; omit the transmit power")
-
-
-def _check_carrier(run: Run, frequency_hz: float | None) -> None:
-    known = run.problem.record.carriers_hz
-    if frequency_hz is None and known is not None and run.model.several_carriers:
-        raise InputError(f"{run.folder}: its data have {carriers_text(known)}; give the frequency of the map")
-    if frequency_hz is not None and not (np.isfinite(frequency_hz) and frequency_hz > 0):
-        raise InputError(f"frequency {frequency_hz:g} Hz: give a positive number")
-    if frequency_hz is not None and known is None:
-        raise InputError(f"{run.folder}: its data have one carrier; omit the frequency")
 
 
 def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:

@@ -66,14 +66,6 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
         raise InputError(f"{path}, row {bad[0] + 1}: not a finite number; give x, y, z in metres")
     if len(positions) == 0:
         raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
-    for name, values, least, kind in (
-        (HEADING, inputs.tx_heading_rad, -np.inf, "finite number (rad)"),
-        (FREQUENCY, inputs.carriers_hz, 0.0, "positive number (Hz)"),
-    ):
-        if values is not None and not (
-            values.shape == positions.shape[:1] and (np.isfinite(values) & (values > least)).all()
-        ):
-            raise InputError(f"{path}: {name} must be one {kind} for each position; correct it")
     return inputs
 
 

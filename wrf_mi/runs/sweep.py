@@ -37,7 +37,7 @@ from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, is_finished, package_versions
 
 OPTIONS = (
-    *(
+    *[
         "dataset",
         "model",
         "scene",
@@ -49,8 +49,8 @@ OPTIONS = (
         "preset",
         "receiver",
         "stages",
-    ),
-    *("paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
+    ],
+    *["paths", "depth", "reflections", "phase-error", "rays", "calibrate"],
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""

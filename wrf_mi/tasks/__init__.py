@@ -14,18 +14,8 @@ ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""
 
 
-_TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
-TASKS: Mapping[str, Task] = _TASKS
+TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
 """Every task by its name in `wrf_mi.core.Record.task`."""
-
-
-def register(task: Task) -> None:
-    """Add a task for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
-
-    Raises:
-        InputError: the name is taken.
-    """
-    _TASKS.add(task.name, task)
 
 
 def task_of(record: Record) -> Task:
@@ -66,7 +56,6 @@ __all__ = [
     "UPLINK",
     "Task",
     "instrument_of",
-    "register",
     "require",
     "task_of",
 ]
