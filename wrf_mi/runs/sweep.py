@@ -37,20 +37,8 @@ from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, is_finished, package_versions
 
 OPTIONS = (
-    *[
-        "dataset",
-        "model",
-        "scene",
-        "material",
-        "evaluation",
-        "split",
-        "n-train",
-        "seed",
-        "preset",
-        "receiver",
-        "stages",
-    ],
-    *["paths", "depth", "reflections", "phase-error", "rays", "calibrate"],
+    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed"),
+    *("preset", "receiver", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
