@@ -86,21 +86,14 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
                 warnings.warn(f"Mitsuba's variant changes from {before} to {_active.variant}", stacklevel=2)
             mi.set_variant(_active.variant)
         if _active.name == "cuda":
-            _divide_exactly()
+            import drjit as dr
+
+            # IEEE 754 division and roots in this thread, where Dr.Jit's flags live: the approximate ones have 20 bits
+            # also in float64, where phases of hundreds of wavelengths and derivatives of a correction need more.
+            dr.set_flag(dr.JitFlag.FastMath, False)
         if threads is not None:
             set_threads(threads)
         return _active
-
-
-def _divide_exactly() -> None:
-    """Use IEEE 754 division and roots on a GPU, in this thread, where Dr.Jit's flags live.
-
-    The approximate ones of `dr.JitFlag.FastMath` have 20 bits also in float64, where phases of hundreds of wavelengths
-    and derivatives of a correction need more.
-    """
-    import drjit as dr
-
-    dr.set_flag(dr.JitFlag.FastMath, False)
 
 
 def set_threads(threads: int) -> None:

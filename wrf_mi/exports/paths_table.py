@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core import InputError, Paths, Receiver
@@ -114,8 +113,11 @@ def read_paths(file: str | Path) -> Paths:
         InputError: a file that is missing, or has a column or a field less or another kind of value.
     """
     table = read_csv(Path(file))
-    tx, rx = (_whole(table, name) for name in ("tx", "rx"))
-    lists = {name: [_parts(text) for text in table.texts(name)] for name in ("interactions", "vertices_m", "objects")}
+    tx, rx = (table.numbers(name).astype(np.int64) for name in ("tx", "rx"))
+    lists = {
+        name: [text.split(SEPARATOR) if text else [] for text in table.texts(name)]
+        for name in ("interactions", "vertices_m", "objects")
+    }
     depth = max((len(parts) for parts in lists["interactions"]), default=0)
     shape = len(tx), depth
     interactions, objects = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32)
@@ -145,14 +147,6 @@ def read_paths(file: str | Path) -> Paths:
         int(tx.max(initial=-1)) + 1,
         int(rx.max(initial=-1)) + 1,
     )
-
-
-def _parts(text: str) -> list[str]:
-    return text.split(SEPARATOR) if text else []
-
-
-def _whole(table: CsvTable, name: str) -> NDArray[np.int64]:
-    return table.numbers(name).astype(np.int64)
 
 
 def _directions(table: CsvTable, end: str) -> FloatArray:

@@ -133,28 +133,21 @@ def map_dataset(
             if name in LEVELS and level_unit != units:
                 described = {"units": level_unit, "long_name": f"{long_name}, relative to full scale"}
             data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), described
-    data[BEST] = dims, _best(values[POWER]).reshape(shape), _best_attributes(receivers)
+    power = values[POWER]
+    known = np.where(np.isfinite(power), power, -np.inf)
+    best = np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
+    described = {
+        "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
+        "flag_values": np.arange(-1, len(receivers), dtype=np.int32),
+        # Meanings are separated by spaces.
+        "flag_meanings": " ".join(["none", *("_".join(receiver.name.split()) for receiver in receivers)]),
+    }
+    data[BEST] = dims, best.reshape(shape), described
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
 
 
 def _metres(long_name: str) -> dict[str, str]:
     return {"units": "m", "long_name": f"{long_name} in the frame of the data"}
-
-
-def _best(power: NDArray[Any]) -> NDArray[np.int32]:
-    """Number of the receiver of the highest power [m], -1 where none has one."""
-    known = np.where(np.isfinite(power), power, -np.inf)
-    return np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
-
-
-def _best_attributes(receivers: Sequence[Receiver]) -> dict[str, Any]:
-    # Meanings are separated by spaces.
-    names = ["_".join(receiver.name.split()) for receiver in receivers]
-    return {
-        "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
-        "flag_values": np.arange(-1, len(names), dtype=np.int32),
-        "flag_meanings": " ".join(["none", *names]),
-    }
 
 
 def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -153,6 +154,14 @@ def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
         return float(np.median(heights))
     low, high = area_of(run, tx_pos_m)
     return float(low[2] + high[2]) / 2
+
+
+def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3], metres, that are not in a solid object of a ``sionna.rt.Scene``."""
+    from ..tracing.devices import solid_around  # the tracer is imported where there is a scene
+    from ..tracing.surfaces import scene_surfaces
+
+    return solid_around(scene_surfaces(scene), positions_m) < 0
 
 
 def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:

@@ -15,7 +15,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..runs.folder import load_rows
 from ..runs.run import Run
-from .grid import Grid, area_of, check_height, grid_over, usual_height
+from .grid import Grid, area_of, check_height, grid_over, outside_solids, usual_height
 
 STEP_M = 0.25
 """Least distance of neighbouring candidates by default."""
@@ -91,9 +91,6 @@ def inside_scene(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
     """Mask of positions [n, 3] with a surface below them, and not in a solid (``sionna.rt.Scene``)."""
     import mitsuba as mi
 
-    from ..tracing.devices import solid_around
-    from ..tracing.surfaces import scene_surfaces
-
     origin = to_vectors(positions_m, mi.Point3f)
     below = np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, mi.Vector3f(0, 0, -1))), bool)
-    return below & (solid_around(scene_surfaces(scene), positions_m) < 0)
+    return below & outside_solids(scene, positions_m)

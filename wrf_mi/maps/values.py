@@ -19,6 +19,7 @@ from ..runs.run import Run
 from ..tasks import task_of
 from ..training.session import OnProgress
 from .coverage import coverage_probability
+from .grid import outside_solids
 
 CHUNK_SIZE = 10_000
 """Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
@@ -66,7 +67,8 @@ def map_values(
     """
     size = _chunk_size(run, len(conditions.headings_rad))
     found: Arrays = {}
-    outside = _outside_solids(run, positions_m)
+    scene = run.problem.opened_scene
+    outside = np.ones(len(positions_m), bool) if scene is None else outside_solids(scene, positions_m)
     with _each_warning_once():
         for start in range(0, len(positions_m), size):
             rows = start + np.flatnonzero(outside[start : start + size])
@@ -87,17 +89,6 @@ def _chunk_size(run: Run, headings: int) -> int:
     size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * values))
     size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
     return max(1, size // max(headings, 1))
-
-
-def _outside_solids(run: Run, positions_m: FloatArray) -> NDArray[np.bool_]:
-    """Mask of positions that are not in a solid object of the scene."""
-    scene = run.problem.opened_scene
-    if scene is None:
-        return np.ones(len(positions_m), bool)
-    from ..tracing.devices import solid_around  # the tracer is imported where there is a scene
-    from ..tracing.surfaces import scene_surfaces
-
-    return solid_around(scene_surfaces(scene), positions_m) < 0
 
 
 def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:

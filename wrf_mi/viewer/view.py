@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from wrf_mi_scenes import scenes
 
-from ..core import InputError, Record
+from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import write_atomically
 from ..core.types import IntArray
@@ -141,7 +141,9 @@ class _Gathered:
             return
         stored = content.rows.stored
         numbers, positions = content.rows.row[stored], content.rows.tx_pos_m[stored]
-        if not first and not _has_rows(record, numbers, positions, content.receivers):
+        same = [receiver.name for receiver in record.receivers] == list(content.receivers)
+        same = same and numbers.max() < len(record) and np.array_equal(record.tx_pos_m[numbers], positions)
+        if not first and not same:
             content.notes.append(f"{results.name}: of other data than the first run; only its scene is shown.")
             return
         if content.gaussians is None:
@@ -160,12 +162,6 @@ class _Gathered:
             found, notes = None, [f"Paths: not traced, {error}"]
         self.content.paths = found
         self.content.notes += notes
-
-
-def _has_rows(record: Record, rows: IntArray, tx_pos_m: FloatArray, receivers: Sequence[str]) -> bool:
-    """Whether a record has rows of those numbers at those positions, and receivers of those names."""
-    same = [receiver.name for receiver in record.receivers] == list(receivers) and rows.max() < len(record)
-    return bool(same and np.array_equal(record.tx_pos_m[rows], tx_pos_m))
 
 
 def view(
