@@ -136,13 +136,13 @@ def map_dataset(
     power = values[POWER]
     known = np.where(np.isfinite(power), power, -np.inf)
     best = np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
-    described = {
+    flags: dict[str, Any] = {
         "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
         "flag_values": np.arange(-1, len(receivers), dtype=np.int32),
         # Meanings are separated by spaces.
         "flag_meanings": " ".join(["none", *("_".join(receiver.name.split()) for receiver in receivers)]),
     }
-    data[BEST] = dims, best.reshape(shape), described
+    data[BEST] = dims, best.reshape(shape), flags
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
 
 
