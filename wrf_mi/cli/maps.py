@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core import InputError
 from .options import Arguments, add_command
-from .output import Watch, print_json
+from .output import Watch, show, summary_table
 
 
 def add_parser(commands: Any) -> None:
@@ -69,13 +69,10 @@ def map_command(a: Arguments) -> int:
     if "power_std_db" not in dataset:
         print("no coverage: the model states no standard deviation; train with --intervals", file=sys.stderr)
     sizes = {str(name): int(dataset.sizes[name]) for name in ("receiver", "y", "x", "point") if name in dataset.sizes}
-    if a.json:
-        names = [str(name) for name in dataset.data_vars]
-        print_json({"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names})
-        return 0
+    names = [str(name) for name in dataset.data_vars]
     shape = " x ".join(str(count) for name, count in sizes.items() if name != "receiver")
-    print(f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}")
-    return 0
+    text = f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}"
+    return show(a.json, {"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names}, text)
 
 
 def _add_locate(commands: Any) -> None:
@@ -130,28 +127,22 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None:
         write_arrays(Path(a.posterior), posterior_arrays(found), compressed=True)
     figures = figures_of(found, true_m)
-    if a.json:
-        print_json({"out": str(out), "picture": str(picture), **figures})
-        return 0
-    _show(figures)
-    print(f"{len(found)} positions: {out}\npicture: {picture}")
-    return 0
+    text = f"{_summary(figures)}\n{len(found)} positions: {out}\npicture: {picture}"
+    return show(a.json, {"out": str(out), "picture": str(picture), **figures}, text)
 
 
-def _show(figures: dict[str, Any]) -> None:
+def _summary(figures: dict[str, Any]) -> str:
     form, held = figures["likelihood"], figures.get("held_out")
     shape = "normal" if form["degrees"] is None else f"Student-t of {form['degrees']:g} degrees of freedom"
     text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
     text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
     text += ", receivers that received nothing count" if form["silence"] else ""
     if held is None:
-        print(f"{text} (default: the run has too few training rows to hold any out)")
+        text += " (default: the run has too few training rows to hold any out)"
     else:
         share = f"{held['inside']:.0%} inside their 90 % regions"
         what = f"{held['rows']} predictions of held-out training rows"
-        print(f"{text}, chosen by {what}: {share}, mean error {held['error_m']:.2f} m")
-    title = f"{figures['n']} positions"
-    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
+        text += f", chosen by {what}: {share}, mean error {held['error_m']:.2f} m"
     known = {
         f"area of the {figures['level']:.0%} region (m2)": figures["area_m2"],
         f"radius of {figures['level']:.0%} (m)": figures["radius_m"],
@@ -159,11 +150,10 @@ def _show(figures: dict[str, Any]) -> None:
     }
     if "neighbours" in figures:
         known[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
-    for name, block in known.items():
-        if block is not None:
-            print(f"{name:<36}" + "".join(f"{block[key]:8.2f}" for key in ("median", "mean", "p10", "p90")))
+    text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
-        print(f"{figures['inside']:.0%} of the true positions lie inside the {figures['level']:.0%} regions")
+        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {figures['level']:.0%} regions"
+    return text
 
 
 def _add_view(commands: Any) -> None:
@@ -199,12 +189,7 @@ def view_command(a: Arguments) -> int:
             *a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty()
         )
     size = found.write(out).stat().st_size
-    if a.json:
-        print_json({"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes})
-        return 0
     names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in found.counts}
-    print(", ".join(f"{count} {names[name][: -1 if count == 1 else None]}" for name, count in found.counts.items()))
-    for note in found.content.notes:
-        print(note)
-    print(f"view: {out} ({size / 1e6:.1f} MB)")
-    return 0
+    counted = ", ".join(f"{n} {names[name][: -1 if n == 1 else None]}" for name, n in found.counts.items())
+    text = "\n".join([counted, *found.content.notes, f"view: {out} ({size / 1e6:.1f} MB)"])
+    return show(a.json, {"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes}, text)

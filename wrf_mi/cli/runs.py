@@ -7,7 +7,7 @@ from typing import Any
 
 from ..core import InputError
 from .options import Arguments, add_command, add_operator, add_scheduler, check_operator
-from .output import Watch, print_json, show_metrics
+from .output import Watch, show, show_metrics
 
 
 def add_parser(commands: Any) -> None:
@@ -84,11 +84,8 @@ def predict_command(a: Arguments) -> int:
         workers = scheduler if a.scheduler else None
         given: dict[str, Any] = {"uplink": inputs.uplink, "carriers_hz": inputs.carriers_hz}
         shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
-    if a.json:
-        print_json({"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}})
-    else:
-        print(f"{shapes['tx_pos'][0]} predictions: {a.out}")
-    return 0
+    value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
+    return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
 
 
 def _add_compress(commands: Any) -> None:
@@ -115,11 +112,7 @@ def compress_command(a: Arguments) -> int:
     how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
     with Watch() as watch:
         found = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
-    if a.json:
-        print_json(found)
-    else:
-        print(render(found), f"results: {a.out}", sep="\n")
-    return 0
+    return show(a.json, found, f"{render(found)}\nresults: {a.out}")
 
 
 def _add_compare(commands: Any) -> None:

@@ -22,7 +22,7 @@ from .options import (
     add_tracing,
     add_training,
 )
-from .output import Watch, print_json, show_metrics
+from .output import Watch, show, show_metrics
 
 HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
@@ -266,10 +266,6 @@ def sweep_command(a: Arguments) -> int:
         check_run(single.dataset, training_arguments(single))
     with open_scheduler(a.scheduler) as scheduler:
         rows = run_sweep(sweep, scheduler)
-    if a.json:
-        print_json(rows)
-    else:
-        print(sweep_table(rows, sweep.varied))
-        print(f"results: {a.out}")
+    show(a.json, rows, f"{sweep_table(rows, sweep.varied)}\nresults: {a.out}")
     check_failures(rows)
     return 0
