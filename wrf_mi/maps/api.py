@@ -19,6 +19,8 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     ({'receiver': 1, 'y': 8, 'x': 10}, 'dBm')
     >>> bool((dataset["coverage_probability"] <= 1).all())
     True
+    >>> int(wrf_mi.run_reliability(run.folder).count.sum())  # 10 test rows and 9 thresholds
+    90
     >>> wrf_mi.write_map(dataset, folder / "map.nc").name
     'map.nc'
     >>> shutil.rmtree(folder)
