@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from ..training.checkpoint import append_log
 from ..training.compress import Compression, compress
 from ..training.loop import Progress
 from ..training.predictor import Predictor
+from ..training.session import OnProgress, quiet
 from .api import evaluate_run, open_run
 from .evaluate import stored_metrics
 from .folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
@@ -31,8 +32,6 @@ REPEATS = 60
 """Number of interleaved pairs of spectra that are timed."""
 WARM_UP = 2
 """Pairs before them: the first call compiles, the second still fills caches."""
-
-OnProgress = Callable[[str, int, Progress], None]
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
@@ -63,7 +62,7 @@ def compress_run(
     out: str | Path,
     how: Compression,
     record: Record | None = None,
-    on_progress: OnProgress = lambda stage, steps, progress: None,
+    on_progress: OnProgress = quiet,
 ) -> dict[str, Any]:
     """Make a smaller run from a run and score it on the same held-out rows.
 
@@ -96,7 +95,7 @@ def compress_run(
     def log(stage: str, steps: int, progress: Progress) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         append_log(folder, progress)
-        on_progress(stage, steps, progress)
+        on_progress(stage, progress.step / steps, progress)
 
     settings, params = compress(field.config, field.params, data, split, how, log)
     seconds = time.perf_counter() - start
