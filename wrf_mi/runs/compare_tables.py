@@ -109,21 +109,22 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
     "Better" and "worse": the 95 % interval of the difference, resampled over test rows, excludes zero in all seeds; all
     else is a tie. Runs that differ in their seed alone are seeds of one method.
     """
-    best, methods = best_run(runs), [_method(run) for run in runs]
+    best, methods = best_run(runs), {run.name: _method(run) for run in runs}
+
+    def seeds_of(run: Results) -> list[Results]:
+        return [other for other in runs if methods[other.name] == methods[run.name]]
+
+    def to_best(run: Results) -> tuple[str, FloatArray]:
+        rival = next((other for other in seeds_of(best) if other.seed == run.seed), best)
+        return rival.name, _paired(run, rival)
+
     found: list[Difference] = []
-    for run, method in zip(runs, methods, strict=True):
-        seeds = [other for other, of in zip(runs, methods, strict=True) if of == method]
-        if run is not best:
-            rivals = [other for other, of in zip(runs, methods, strict=True) if of == methods[runs.index(best)]]
-
-            def rival_of(one: Results, rivals: list[Results] = rivals) -> Results:
-                return next((other for other in rivals if other.seed == one.seed), best)
-
-            if method == methods[runs.index(best)]:
-                found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
-            else:
-                found.append(_of_seeds(run, seeds, lambda one: (rival_of(one).name, _paired(one, rival_of(one)))))
-        found.append(_of_seeds(run, seeds, lambda one: (one.reference_name, _against_reference(one))))
+    for run in runs:
+        if run is not best and methods[run.name] == methods[best.name]:
+            found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
+        elif run is not best:
+            found.append(_of_seeds(run, seeds_of(run), to_best))
+        found.append(_of_seeds(run, seeds_of(run), _to_reference))
     return found
 
 
@@ -150,10 +151,10 @@ def _paired(run: Results, other: Results) -> FloatArray:
     return _per_row(run, [key[1] for key in keys], [run.score[ours[k]] - other.score[theirs[k]] for k in keys])
 
 
-def _against_reference(run: Results) -> FloatArray:
+def _to_reference(run: Results) -> tuple[str, FloatArray]:
     known = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
     change = [run.score[r, m] - run.reference_score[r, m] for r, m in known]
-    return _per_row(run, run.row[known[:, 1]].tolist(), change)
+    return run.reference_name, _per_row(run, run.row[known[:, 1]].tolist(), change)
 
 
 def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatArray:
@@ -181,21 +182,15 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     """Rows of the table for a data set: each run, and each reference once."""
     task = TASKS[runs[0].task]
     means = common_means(runs)
-    named = [
-        (
-            {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
-            | {"run": run.name, "seed": run.seed, "common_mean": means.get(run.name)},
-            run.metrics[task.block],
-        )
+    rows: list[dict[str, Any]] = [
+        run.metrics | run.metrics[task.block] | {"run": run.name, "seed": run.seed, "common_mean": means.get(run.name)}
         for run in runs
     ]
     for name, (run, key) in references(runs).items():
         kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
-        named.append((kept | {"run": name, "model": key}, run.metrics["reference"][key]))
+        rows.append(kept | run.metrics["reference"][key] | {"run": name, "model": key})
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
-    scores = ("median", "mean", "p10", "p90")
-    rows = [row | shared | {key: block.get(key) for key in scores} for row, block in named]
-    return [{key: row.get(key) for key in COLUMNS} for row in rows]
+    return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
 
 
 def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
