@@ -70,16 +70,17 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
     """
     if format not in FORMATS:
         raise InputError(f"format {format!r}: unknown; choose from {', '.join(FORMATS)}")
-    from .source import find_source  # imports tracer and models, which the list of formats does without
+    from .source import Source, kinds_of  # imports tracer and models, which the list of formats does without
 
     asked, given = FORMATS[format], options or ExportOptions()
     asked.check(Path(out), given)
-    found = find_source(source)
-    if not set(found.kinds) & set(asked.kinds):
-        others = [name for name, other in FORMATS.items() if set(other.kinds) & set(found.kinds)]
-        text = f"{source}: a {' and '.join(found.kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
+    kinds = kinds_of(source)
+    kind = next((kind for kind in kinds if kind in asked.kinds), None)
+    if kind is None:
+        others = [name for name, other in FORMATS.items() if set(other.kinds) & set(kinds)]
+        text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
         raise InputError(f"{text}; choose from {', '.join(others)}")
-    return asked.write(found.of(asked.kinds), Path(out), given)
+    return asked.write(Source(str(source), kind), Path(out), given)
 
 
 __all__ = ["BUILT_IN", "DATASET", "ENTRY_POINTS", "FORMATS", "RUN", "SCENE", "ExportOptions", "Format", "export"]
