@@ -12,6 +12,7 @@ from typing import Any
 from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
 from ..backend.probe import installed_version, try_cuda, try_llvm
 from ..backend.remedy import install_commands, package_manager
+from ..parallel.threads import processors
 from .options import Arguments, add_command
 from .output import show
 
@@ -58,7 +59,7 @@ def report() -> dict[str, Any]:
         "python": f"{platform.python_version()} ({sys.executable})",
         "system": platform.platform(),
         "versions": versions,
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "threads": processors(),
         "backend": backend,
         "llvm": llvm,
         "gpu": gpu,

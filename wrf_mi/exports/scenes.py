@@ -11,7 +11,7 @@ import trimesh
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, write_atomically
+from ..core.files import atomic_folder, one_line, write_atomically
 from ..core.types import IntArray
 from ..runs.scene_view import surfaces_of
 from ..scene.coordinates import Y_UP
@@ -21,11 +21,9 @@ from ..tracing.corrected_scene import ODD_IN_FILES, check_materials
 from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
 from ..tracing.scenes import load_scene
 from .format import ExportOptions
-from .ply import table, write_ply
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
-RGB = tuple(enumerate(("red", "green", "blue")))
 
 
 def _parts(scene: Any) -> list[tuple[Surface, str]]:
@@ -138,21 +136,20 @@ def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     first = np.cumsum([0, *(len(surface.vertices_m) for surface, _ in parts)])
     count = [len(surface.faces) for surface, _ in parts]
     number = np.array([names.index(material) for _, material in parts])
-    vertices = np.concatenate([surface.vertices_m for surface, _ in parts]).astype(np.float32)
-    faces = {
-        "vertex_indices": np.concatenate([surface.faces + at for (surface, _), at in zip(parts, first, strict=False)]),
-        **{
-            key: np.repeat([_colour_bytes(material)[k] for _, material in parts], count).astype(np.uint8)
-            for k, key in RGB
-        },
-        "material": np.repeat(number, count),
-        "surface": np.repeat(np.arange(len(parts)), count),
-    }
-    integers = {key: v.astype(np.int32) if v.dtype.kind == "i" else v for key, v in faces.items()}
+    mesh = trimesh.Trimesh(
+        np.concatenate([surface.vertices_m for surface, _ in parts]),
+        np.concatenate([surface.faces + at for (surface, _), at in zip(parts, first, strict=False)]),
+        face_colors=np.repeat([_colour_bytes(material) for _, material in parts], count, axis=0).astype(np.uint8),
+        process=False,
+    )
+    mesh.face_attributes["material"] = np.repeat(number, count).astype(np.int32)
+    mesh.face_attributes["surface"] = np.repeat(np.arange(len(parts)), count).astype(np.int32)
     comments = ["metres, z up"]
     comments += [f"material {k} {name}" for k, name in enumerate(names)]
     comments += [f"surface {k} {surface.name}" for k, (surface, _) in enumerate(parts)]
-    write_ply(out, {"vertex": table(dict(zip("xyz", vertices.T, strict=True))), "face": table(integers)}, comments)
+    header, end, content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False).partition(b"end_header")
+    lines = "".join(f"comment {one_line(comment)}\n" for comment in comments)
+    write_atomically(out, header + lines.encode() + end + content)
     return _counts(parts)
 
 
