@@ -66,11 +66,9 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
         if stated := [name for name, value in (given | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
         return source.trace()
-    if lacking := [name for name, value in given.items() if value is None]:
-        raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {', '.join(lacking)}")
-    assert options.tx_pos_m is not None
-    assert options.rx_pos_m is not None
-    assert options.frequency_hz is not None
+    if options.tx_pos_m is None or options.rx_pos_m is None or options.frequency_hz is None:
+        lacking = ", ".join(name for name, value in given.items() if value is None)
+        raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"max_depth": options.depth}
     trace_options = TraceOptions(**chosen)
