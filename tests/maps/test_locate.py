@@ -19,9 +19,8 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.maps.grid import grid_over
+from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_area import Candidates, candidates_of
 from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
 from wrf_mi.maps.locate_file import read_observations
 from wrf_mi.maps.locate_knn import Neighbours

@@ -22,7 +22,7 @@ from ..runs.folder import load_rows
 from ..runs.run import Run, open_run
 from ..tasks import task_of
 from ..training.session import Interrupted, OnProgress, quiet
-from .locate_area import Candidates, candidates_of
+from .grid import Candidates, candidates_of
 from .locate_calibration import LEVEL, Calibration, calibration_of, headings_of, predict_candidates
 from .locate_likelihood import region_of
 

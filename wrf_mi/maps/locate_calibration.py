@@ -34,7 +34,7 @@ from ..models.model import Inputs
 from ..parallel.threads import one_blas_thread
 from ..runs.folder import load_rows
 from ..runs.run import Run
-from .locate_area import Candidates
+from .grid import Candidates
 from .locate_knn import Neighbours, choose_neighbours
 from .locate_likelihood import Likelihood, Silence, region_of
 
