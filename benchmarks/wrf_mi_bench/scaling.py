@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.chunks import gaussians_in_parts
-from wrf_mi.parallel.threads import one_blas_thread
 from wrf_mi.receivers import antenna_csi, bartlett_spectrum
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
@@ -232,6 +232,6 @@ def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 def main() -> dict[str, Any]:
     """All axes, some ten minutes on two cores."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         results = [scale(axis) for axis in AXES]
     return {"rows": rows(results), "axes": results}

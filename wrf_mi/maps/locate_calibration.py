@@ -22,6 +22,7 @@ from scipy.special import softmax
 from scipy.stats import norm
 from scipy.stats import t as student_t
 from sklearn.linear_model import LogisticRegression
+from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
@@ -31,7 +32,6 @@ from ..core.types import IntArray
 from ..models import Fitted, Session
 from ..models.held_out import fit_fold, hold_out, labelled
 from ..models.model import Inputs
-from ..parallel.threads import one_blas_thread
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from .grid import Candidates
@@ -154,7 +154,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             inner = labelled(replace(session, folder=folder, run=folder), label)
-            with one_blas_thread():
+            with threadpool_limits(1, "blas"):
                 fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
                 found = predict_candidates(fitted, len(numbers), headings, candidates, report)
             shutil.rmtree(folder)

@@ -44,6 +44,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ..backend import init
 from ..checking import warn_of_suspicions
@@ -58,7 +59,6 @@ from ..models.calibrated import with_intervals
 from ..models.checks import check_held_receivers, check_record
 from ..models.model import default_settings
 from ..parallel import Scheduler
-from ..parallel.threads import one_blas_thread
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
@@ -323,7 +323,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     for part, rows in zip(folders, splits, strict=True):
         if not (part / FITTED).exists():
             before, start = checkpoint_seconds(part), time.perf_counter()
-            with one_blas_thread():
+            # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
+            with threadpool_limits(1, "blas"):
                 fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
