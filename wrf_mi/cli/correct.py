@@ -63,8 +63,8 @@ def correct_command(a: Arguments) -> int:
     what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
     lines = [f"{facts['score']} of {facts['held_out']} {what}   median    mean"]
     for stage, score in facts["held_out_scores"].items():
-        kept = "  kept" if stage == facts["kept"] else ""
-        lines.append(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{kept}")
+        mark = "  kept" if stage == facts["kept"] else ""
+        lines.append(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{mark}")
     lines.append(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
     lines.append(f"scene: {a.out}\npage: {a.out}/correction.md")
     shown = {"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}}

@@ -37,11 +37,10 @@ from ..runs.run import Run
 from .grid import Candidates
 from .locate_knn import Neighbours, choose_neighbours
 from .locate_likelihood import Likelihood, Silence, region_of
+from .values import HEADINGS
 
 logger = logging.getLogger(__name__)
 
-HEADINGS = 8
-"""Headings over which the likelihood is averaged."""
 DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
 """Forms of the likelihood to choose from."""
 WIDE = 0.95

@@ -28,20 +28,17 @@ CHUNK_BYTES = 1 << 28
 VALUE_BYTES = 32
 """Of each value of an observation: mean and standard deviation in float64, and a copy of each."""
 HEADINGS = 8
-"""Headings over which predictions are averaged where none is given, evenly over the circle."""
+"""Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
 
 Arrays = dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What holds at all positions of a map.
+    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`.
 
     Attributes:
-        threshold_db: level above which a position is covered; None: coverage is not computed.
-        transmit_dbm: transmit power, antenna gains excluded, dBm.
         headings_rad: headings of the transmitter that are averaged over; empty: the model does not know it.
-        frequency_hz: carrier, where the data have several; else None.
     """
 
     threshold_db: float | None
