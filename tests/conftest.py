@@ -112,8 +112,8 @@ def two() -> Iterator[Scheduler]:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Time [s] of `wrf_mi.runs.timing`, which calls advance."""
-    from wrf_mi.runs import timing
+    """Time [s] of `wrf_mi_bench.timing`, which calls advance."""
+    from wrf_mi_bench import timing
 
     now = [0.0]
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])

@@ -37,7 +37,7 @@ def made_view(observed: str = "image") -> ViewContent:
     turns = rng.normal(size=(STORED, GAUSSIANS, 4))
     fall = np.sort(rng.uniform(-60, -20, (STORED, GAUSSIANS)))[:, ::-1]
     places = rng.uniform([0, 0, 0], [4, 3, 2], (GAUSSIANS, 3))
-    gaussians = GaussiansContent(places, np.full((STORED, GAUSSIANS, 3), 0.2), turns, fall, 9)
+    gaussians = GaussiansContent(places, np.full((STORED, GAUSSIANS, 3), np.log(0.2)), turns, fall, 9)
     corners, tx, rx, order = [], [], [], []
     for t in range(STORED):
         for r in range(2):

@@ -64,37 +64,7 @@ _HOME = {
     "write_map": "maps.dataset",
 }
 
-__all__ = [
-    "BackendError",
-    "InputError",
-    "Receiver",
-    "Record",
-    "Run",
-    "Split",
-    "TraceOptions",
-    "TrainConfig",
-    "Trainer",
-    "check_data",
-    "compare",
-    "edit_scene",
-    "evaluate_run",
-    "fetch",
-    "load",
-    "locate",
-    "make_scene",
-    "make_splits",
-    "open_run",
-    "predict_to_file",
-    "radio_map",
-    "resume",
-    "run_reliability",
-    "scene_view",
-    "spectrum_table",
-    "train",
-    "view",
-    "with_settings",
-    "write_map",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

@@ -23,9 +23,10 @@ from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
 from wrf_mi.parallel import Scheduler, run_module, worker_threads
-from wrf_mi.runs.fit_key import dataset_files, fit_key
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
+from wrf_mi.runs.sweep import dataset_files
 
+from .fit_key import fit_key
 from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
@@ -208,7 +209,7 @@ def _case(runs: Path, name: str) -> dict[str, Any]:
 
 
 def case_folder(runs: Path, name: str) -> Path:
-    """Folder of a case or check: its name and a key of arguments, source, data and versions (`wrf_mi.runs.fit_key`)."""
+    """Folder of a case or check: its name and a `fit_key` of arguments, source, data and versions."""
     made: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
     what = made.function if isinstance(made, Check) else made.arguments
     # A check that goes on keys its parts itself.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from wrf_mi.cli.output import print_json
+from wrf_mi.cli.output import show
 from wrf_mi.core import InputError
 
 TABLES = "tables"
@@ -45,7 +45,7 @@ def bench_command(a: argparse.Namespace) -> int:
         from .stale import stale, stale_lines
 
         older, count = stale(Path(a.out))
-        print_json(older) if a.json else print(stale_lines(older, count))
+        show(a.json, older, stale_lines(older, count))
         return 0
     from wrf_mi.parallel import open_scheduler
 
@@ -54,12 +54,12 @@ def bench_command(a: argparse.Namespace) -> int:
     if a.quick and not tables_only:
         if a.names:
             found = quick_checks(a.names)
-            print_json(found) if a.json else print(check_table(found))
+            show(a.json, found, check_table(found))
             return 0
         from .quick import quick, ratio_table
 
         result = quick(Path(a.out), a.store)
-        print_json(result) if a.json else print(ratio_table(result["figures"]["ratios"]))
+        show(a.json, result, ratio_table(result["figures"]["ratios"]))
         return 0
     with open_scheduler(a.scheduler) as scheduler:
         given = scheduler if a.scheduler else None
@@ -77,7 +77,7 @@ def bench_command(a: argparse.Namespace) -> int:
                 if row["case"] in CHECKS:
                     print(own_table(row))
     if a.json:
-        print_json(rows)
+        show(a.json, rows, "")
     if failed := [f"bench {row['case']}: {why}" for row in rows if (why := row.get("figures", {}).get("failed"))]:
         raise BenchFailed("; ".join(failed))
     return 0

@@ -13,12 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part
+from .fit_key import fit_key, source_files
 from .stages import CHANNELS, HYBRID, INSIDE, JOINT, LAB, RUNS, Cell, data_of, run_alone, run_of_cell
 
 CELLS = tuple(

@@ -32,7 +32,7 @@ def job(file: str, backend: str) -> None:
     """Measure all axes with a backend and store them as JSON."""
     known = init(backend)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    from wrf_mi.runs.timing import one_blas_thread
+    from threadpoolctl import threadpool_limits
 
     from .scaling import AXES, Axis, scale
 
@@ -41,7 +41,7 @@ def job(file: str, backend: str) -> None:
         Axis(f"step-{model}", f"training step of {title}", "Gaussians", STEP_SIZES, partial(step, model))
         for model, title in STEPS_OF.items()
     ]
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         found = [scale(axis, most_s=MOST_S, call_s=CALL_S) for axis in axes]
     Path(file).write_text(json.dumps({"device": known.device, "axes": found}))
 

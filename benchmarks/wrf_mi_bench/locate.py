@@ -24,13 +24,13 @@ from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_file import test_observations
 from wrf_mi.maps.locate_knn import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows
-from wrf_mi.runs.timing import bootstrap
+from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import data_folder, kept, line
+from .fit_key import fit_key, source_files
 from .table_plan import PARTS
 from .tables import scene_of
 
@@ -87,18 +87,17 @@ def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
         given: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
         train(FLAT, folder, cell.model, **given, **more)
     run = open_run(folder)
-    given_rows = test_observations(run)
-    assert given_rows.true_m is not None
-    found = locate(run, given_rows.value_dbm, on_progress=_show(cell.name))
+    strengths_dbm, true_m = test_observations(run)
+    found = locate(run, strengths_dbm, on_progress=_show(cell.name))
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
-    best = best_neighbours(record, rows, given_rows.value_dbm, given_rows.true_m)
-    near = found.neighbours_error_m(given_rows.true_m)
+    best = best_neighbours(record, rows, strengths_dbm, true_m)
+    near = found.neighbours_error_m(true_m)
     assert near is not None
     return {
-        "error_m": found.error_m(given_rows.true_m).tolist(),
+        "error_m": found.error_m(true_m).tolist(),
         "neighbours_error_m": near.tolist(),
         "best_neighbours_error_m": best.tolist(),
-        "inside": found.covers(given_rows.true_m).tolist(),
+        "inside": found.covers(true_m).tolist(),
         "area_m2": found.area_m2.tolist(),
         "radius_m": found.radius_m.tolist(),
         "calibration": asdict(found.calibration),
@@ -128,8 +127,8 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return np.array([found[key] for found in draws], float)
 
     error, near, best = of("error_m"), of("neighbours_error_m"), of("best_neighbours_error_m")
-    gain, over_best = (bootstrap(stretches(other - error), np.mean) for other in (near, best))
-    inside = bootstrap(stretches(of("inside")), np.mean)
+    gain, over_best = (bootstrap(stretches(other - error), statistic=np.mean) for other in (near, best))
+    inside = bootstrap(stretches(of("inside")), statistic=np.mean)
     figures = {
         "median_m": float(np.median(error)),
         "mean_m": float(error.mean()),

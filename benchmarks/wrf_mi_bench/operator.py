@@ -19,13 +19,14 @@ from wrf_mi.gaussians.operator import PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.static_signals import static_signals
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.timing import Call, bootstrap, interleaved, memory_mb, ratio
 from wrf_mi.synthetic.laboratory import RECEIVER
+from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
 from .comparison import line
 from .stress_rows import relative
+from .timing import Call, interleaved, memory_mb, ratio
 from .workloads import HEIGHT, WIDTH, parameters
 
 GAUSSIANS, BATCH = 10_000, 64

@@ -19,13 +19,13 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers.instruments import SpectrumInstrument
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.tasks import TASKS
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import Survey, random_room_record
 
 from .comparison import kept, line
+from .fit_key import fit_key, source_files
 
 SEEDS = range(101, 105)
 CARRIERS_HZ = 0.92e9, 2.4e9, 5.0e9

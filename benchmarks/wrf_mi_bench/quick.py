@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
+from threadpoolctl import threadpool_limits
 
 from wrf_mi.backend import init
 from wrf_mi.backend.device import on_device, to_float, to_tensor
@@ -33,8 +34,8 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.graph import Batch
-from wrf_mi.runs.timing import Call, Interval, Within, interleaved, one_blas_thread, ratio
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.training.config import TrainConfig, calibration_config
 from wrf_mi.training.step import TrainingData, device_pose
@@ -42,6 +43,7 @@ from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
 from .stock import StockRenderer, rgb_variant
+from .timing import Call, Within, interleaved, ratio
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"
@@ -241,7 +243,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     file = file_of(out)
     stored = None if store else read_stored(file)
     start = time.perf_counter()
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         found = measure_pairs(pairs)
     result = {
         "case": "quick",

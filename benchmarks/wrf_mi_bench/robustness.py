@@ -9,12 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from wrf_mi.runs.fit_key import fit_key, source_files
-
 from . import endurance, faults
 from .bench import BenchFailed
 from .comparison import Row, kept, line
 from .fault_commands import COMMANDS
+from .fit_key import fit_key, source_files
 from .hostile_files import run_readers
 from .hostile_samples import READERS
 

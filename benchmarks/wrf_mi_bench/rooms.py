@@ -22,13 +22,13 @@ import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.correction import correct_scene, write_page
 from wrf_mi.datasets import make_splits
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
 
 from .comparison import kept, line
+from .fit_key import fit_key, source_files
 from .scene import match
 
 SEEDS = range(12)

@@ -17,13 +17,13 @@ from matplotlib.figure import Figure
 
 from wrf_mi.core.files import write_figure
 from wrf_mi.runs.api import train
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.task import Task
 
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line
+from .fit_key import fit_key, source_files
 from .stages import LAB, Cell, scene_of_cell
 from .table_plan import SEEDS
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
@@ -20,8 +21,8 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.receivers import antenna_csi, bartlett_spectrum
-from wrf_mi.runs.timing import Call, Interval, exponent, interleaved, larger_half, memory_mb, n_log_n, one_blas_thread
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.surfaces import scene_surfaces
 from wrf_mi.training.config import TrainConfig
@@ -29,6 +30,7 @@ from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line
+from .timing import Call, exponent, interleaved, larger_half, memory_mb, n_log_n
 from .workloads import HEIGHT, WIDTH, field, integrator, parameters, size_deg, splatting, tracer
 
 logger = logging.getLogger(__name__)
@@ -230,6 +232,6 @@ def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 def main() -> dict[str, Any]:
     """All axes, some ten minutes on two cores."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    with one_blas_thread():
+    with threadpool_limits(1, "blas"):
         results = [scale(axis) for axis in AXES]
     return {"rows": rows(results), "axes": results}

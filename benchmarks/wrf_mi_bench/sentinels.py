@@ -8,8 +8,8 @@ They take three quarters of an hour on two cores, the tables many hours. Each fi
 | paths that MATLAB's image method has, found again | 95 % Wilson interval of the stored share over these paths |
 | worst errors of `stress` and of the Mitsuba integrator, fewer of the same cases | up to the bound of that benchmark |
 
-Results are kept by the content of this package's files (`wrf_mi.runs.fit_key.source_files`): a stopped call is resumed,
-and changed code is measured again.
+Results are kept by the content of the packages' files (`wrf_mi_bench.fit_key.source_files`): a stopped call is
+resumed, and changed code is measured again.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from scipy.stats import binomtest, quantile_test
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
-from wrf_mi.runs.fit_key import dataset_files, fit_key, source_files
+from wrf_mi.runs.sweep import dataset_files
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
+from .fit_key import fit_key, source_files
 from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure

@@ -20,16 +20,16 @@ import numpy as np
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import resume, train
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
-from wrf_mi.runs.timing import bootstrap
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import bootstrap
 from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part
+from .fit_key import fit_key, source_files
 from .table_plan import PARTS
 from .tables import meshed_scan, scene_of
 
@@ -135,7 +135,7 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
         if name == HYBRID:
             one["stages"] = run.metrics["stages"]
         else:
-            gain = bootstrap(differences(hybrid, run), np.mean)
+            gain = bootstrap(differences(hybrid, run), statistic=np.mean)
             one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
         figures.append(one)
     return figures

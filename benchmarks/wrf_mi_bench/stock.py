@@ -34,7 +34,7 @@ DEGREE_0 = 0.28209479177387814
 def rgb_variant() -> Iterator[None]:
     """Context in Mitsuba's rgb variant of the present backend.
 
-    Entering takes a quarter of a second, so timed calls are in it already (`wrf_mi.runs.timing.Within`).
+    Entering takes a quarter of a second, so timed calls are in it already (`wrf_mi_bench.timing.Within`).
     """
     before: Any = mi.variant()
     rgb = before.replace("mono_polarized", "rgb")

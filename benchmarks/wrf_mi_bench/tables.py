@@ -3,7 +3,7 @@
 Each row of `wrf_mi_bench.table_plan` is stored as a JSON file when its run is done, so an interrupted measurement can
 be resumed, on another machine too. A row is measured again where its arguments or the content of its data set have
 changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a run folder has
-a key of command, source, data, scene and versions (`wrf_mi.runs.fit_key`).
+a key of command, source, data, scene and versions (`wrf_mi_bench.fit_key`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
 from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers, write_atomically
 from wrf_mi.parallel import Scheduler
-from wrf_mi.runs.fit_key import dataset_files, fit_key, scene_files, source_files
 from wrf_mi.runs.folder import CONFIG, is_finished, package_versions
 from wrf_mi.runs.results import read_run
+from wrf_mi.runs.sweep import dataset_files, scene_files
 from wrf_mi.scene.correction_data import FILE as CORRECTION
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
@@ -38,6 +38,7 @@ from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
+from .fit_key import fit_key, source_files
 from .sources import modules_of_command, source_digests
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan

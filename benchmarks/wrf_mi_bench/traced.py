@@ -18,11 +18,11 @@ from wrf_mi.core import Receiver, unit_vectors
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.runs.timing import Within, interleaved, ratio
 from wrf_mi.training.step import device_pose
 
 from .comparison import line
 from .stock import StockRenderer, rgb_variant
+from .timing import Within, interleaved, ratio
 
 HEIGHT, WIDTH = 90, 360
 BLENDINGS = ("alpha", "product")

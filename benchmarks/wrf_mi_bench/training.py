@@ -25,14 +25,15 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.tiles import TILE_COLUMNS, TILE_ROWS, build_lists, perception_plane
 from wrf_mi.runs.folder import METRICS
-from wrf_mi.runs.timing import Interval, bootstrap, interleaved, seconds
 from wrf_mi.synthetic import load_record
+from wrf_mi.tasks.scores import Interval, bootstrap
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import run_command
 from .comparison import line
+from .timing import interleaved, seconds
 
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "kriging": "kriging"}
@@ -210,8 +211,8 @@ def main() -> dict[str, Any]:
     steps = {name: some_steps(of) for name, of in trainers.items()}
     calls: dict[str, Callable[[], Any]] = {**steps, "product": product_call(), "stream": stream_call()}
     times = interleaved(calls, ROUNDS)
-    peak = 2e-6 * PRODUCT_SIZE**3 / bootstrap(times["product"], np.min).value
-    stream = 8e-6 * STREAM_FLOATS / bootstrap(times["stream"], np.min).value
+    peak = 2e-6 * PRODUCT_SIZE**3 / bootstrap(times["product"], statistic=np.min).value
+    stream = 8e-6 * STREAM_FLOATS / bootstrap(times["stream"], statistic=np.min).value
     found = {
         name: {
             "ms": asdict(bootstrap(times[name] / STEPS)),

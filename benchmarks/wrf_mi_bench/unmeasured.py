@@ -21,16 +21,16 @@ from wrf_mi.core import Record, Split
 from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import train
-from wrf_mi.runs.fit_key import fit_key, source_files
 from wrf_mi.runs.results import Observations, Results, read_run
-from wrf_mi.runs.timing import bootstrap
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
 from wrf_mi.synthetic.room_bands import NAME as BANDS
 from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import MEASURED, data_folder, line, measured_on, stored_part
+from .fit_key import fit_key, source_files
 from .stages import TRANSMISSION
 from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
@@ -185,7 +185,7 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
         name: (
             float(np.median(scores)),
             float(scores.mean()),
-            None if name == HYBRID else bootstrap(sign * (pooled[HYBRID] - scores), np.mean),
+            None if name == HYBRID else bootstrap(sign * (pooled[HYBRID] - scores), statistic=np.mean),
         )
         for name, scores in pooled.items()
     }

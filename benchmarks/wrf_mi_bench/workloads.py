@@ -16,12 +16,12 @@ from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.instruments import SpectrumInstrument
-from wrf_mi.runs.timing import Call
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.step import device_pose
 
+from .timing import Call
 from .traced import random_field, scene_of
 
 HEIGHT, WIDTH = 90, 360

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, tables
+from wrf_mi_bench import bench, fit_key, tables
 from wrf_mi_bench.table_plan import PARTS, Row
-
-from wrf_mi.runs import fit_key
 
 
 def other_versions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
-
-from wrf_mi.runs.timing import (
+from wrf_mi_bench.timing import (
     Interval,
     n_log_n,
 )

@@ -12,11 +12,11 @@ from calling import call
 from wrf_mi_bench import bench, check
 from wrf_mi_bench import sentinels as bench_sentinels
 from wrf_mi_bench.bench import CHECKS
+from wrf_mi_bench.fit_key import source_files
 from wrf_mi_bench.sentinels import STORED, TABLE_ROWS, Figure, Group, groups, main, median_interval
 from wrf_mi_bench.tables import FOLDER
 
 from wrf_mi.core import InputError
-from wrf_mi.runs.fit_key import source_files
 from wrf_mi.tasks import TASKS
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -131,7 +131,7 @@ def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPa
 
 def test_source_files_are_the_packages_without_compiled_files() -> None:
     found = source_files()
-    assert {"wrf_mi/runs/fit_key.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
+    assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
     assert not [name for name in found if name.endswith(".pyc")]
 
 

@@ -268,7 +268,7 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
 
 def test_watch_stops_at_the_first_and_ends_at_the_second_signal(capsys: pytest.CaptureFixture[str]) -> None:
     before = signal.getsignal(signal.SIGINT)
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         assert not watch.stop()
         signal.raise_signal(signal.SIGINT)
         assert watch.stop()

@@ -12,20 +12,19 @@ from calling import call, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.special import softmax
 from scipy.stats import norm
 from scipy.stats import t as student_t
 from sklearn.neighbors import KNeighborsRegressor
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.maps.grid import grid_over
+from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_area import Candidates, candidates_of
-from wrf_mi.maps.locate_calibration import FILE, Located, Predicted, choose, fit_silence, widest
+from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
 from wrf_mi.maps.locate_file import read_observations
 from wrf_mi.maps.locate_knn import Neighbours
-from wrf_mi.maps.locate_likelihood import Likelihood, Silence
-from wrf_mi.maps.locate_posterior import densest, probabilities, region_of
+from wrf_mi.maps.locate_likelihood import Likelihood, Silence, densest, region_of
 from wrf_mi.runs.api import train
 
 ROUNDING = 1e-9
@@ -52,9 +51,9 @@ def room() -> Candidates:
     return Candidates(grid, np.ones(len(grid.positions_m), bool))
 
 
-def law(candidates: Candidates, std_db: float) -> Predicted:
+def law(candidates: Candidates, std_db: float) -> np.ndarray:
     mean = strengths(candidates.positions_m)[None].astype(np.float32)
-    return Predicted(mean, np.full_like(mean, std_db))
+    return np.stack([mean, np.full_like(mean, std_db)])
 
 
 def record_of(tx_pos_m: np.ndarray, rssi_dbm: np.ndarray, train_rows: int) -> Record:
@@ -70,10 +69,10 @@ def test_three_receivers_of_known_path_loss_recover_the_position(column: int, ro
     candidates = room()
     truth = row * len(candidates.grid.x_m) + column
     predicted = law(candidates, 0.1)
-    log = Likelihood().log(strengths(candidates.positions_m[truth][None])[:, 0], predicted.mean_dbm, predicted.std_db)
-    found = region_of(probabilities(log), candidates.distance_m, candidates.positions_m, 0.9)
-    assert np.linalg.norm(found.estimate_m - candidates.positions_m[truth, :2]) < STEP_M
-    assert found.inside[truth]
+    log = Likelihood().log(strengths(candidates.positions_m[truth][None])[:, 0], *predicted)
+    best, _, inside = region_of(softmax(log), candidates.distance_m, 0.9)
+    assert candidates.distance_m[best, truth] < STEP_M
+    assert inside[truth]
 
 
 @pytest.mark.parametrize("form", [Likelihood(None), Likelihood(4.0, 1.3), Likelihood(None, offset_db=4.0)])
@@ -82,11 +81,10 @@ def test_region_covers_as_stated_under_the_noise_of_the_model(form: Likelihood) 
     predicted = law(candidates, 4.0)
     for truth in rng.integers(len(candidates.positions_m), size=DRAWS):
         noise = rng.standard_t(form.degrees, 3) if form.degrees else rng.normal(size=3)
-        value = predicted.mean_dbm[0, :, truth] + 4 * form.scale * noise + form.offset_db * rng.normal()
-        probability = probabilities(form.log(value, predicted.mean_dbm, predicted.std_db))
-        found = region_of(probability, candidates.distance_m, candidates.positions_m, 0.9)
-        inside.append(found.inside[truth])
-        near.append(np.linalg.norm(found.estimate_m - candidates.positions_m[truth, :2]) <= found.radius_m)
+        value = predicted[0, 0, :, truth] + 4 * form.scale * noise + form.offset_db * rng.normal()
+        best, radius_m, region = region_of(softmax(form.log(value, *predicted)), candidates.distance_m, 0.9)
+        inside.append(region[truth])
+        near.append(candidates.distance_m[best, truth] <= radius_m)
     # Cells are whole: regions hold a little more than stated.
     assert abs(np.mean(inside) - 0.9) < COVERED
     assert abs(np.mean(near) - 0.9) < COVERED
@@ -121,7 +119,7 @@ def test_receivers_that_received_nothing_count_where_strength_decides_reception(
     candidates, rng = room(), np.random.default_rng(3)
     predicted = law(candidates, 3.0)
     truth = rng.integers(len(candidates.positions_m), size=150)
-    value = predicted.mean_dbm[0][:, truth] + rng.normal(0, 3, (3, 150))
+    value = predicted[0, 0][:, truth] + rng.normal(0, 3, (3, 150))
     value[value < -54] = np.nan
     keep = np.isfinite(value).any(axis=0)
     places = candidates.positions_m[truth[keep]]
@@ -141,7 +139,7 @@ def test_receivers_that_received_nothing_count_where_strength_decides_reception(
 
 def test_probability_of_silence_is_one_half_in_the_middle() -> None:
     silence = Silence(-80.0, 0.5)
-    assert silence.received(np.array(-80.0)) == pytest.approx(0.5)
+    assert np.exp(silence.log_received(np.array(-80.0))) == pytest.approx(0.5)
     total = np.exp(silence.log_received(np.array([-90.0, -70]))) + np.exp(silence.log_silent(np.array([-90.0, -70])))
     np.testing.assert_allclose(total, 1, atol=ROUNDING)
     assert (
@@ -261,9 +259,9 @@ def test_bad_observations_are_refused_in_one_line(
 def test_empty_fields_are_receivers_without_a_value(fitted: tuple[Path, Record], tmp_path: Path) -> None:
     file = tmp_path / "in.csv"
     file.write_text("ts,rssi_2,rssi_0,rssi_1\n7,-50,,-60\n")
-    found = read_observations(file, fitted[1].receivers)
-    np.testing.assert_array_equal(found.value_dbm, [[np.nan], [-60], [-50]])
-    assert found.true_m is None
+    strengths_dbm, true_m = read_observations(file, fitted[1].receivers)
+    np.testing.assert_array_equal(strengths_dbm, [[np.nan], [-60], [-50]])
+    assert true_m is None
 
 
 def test_bad_arguments_are_refused(

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from wrf_mi.core import InputError
-from wrf_mi.maps.surface import surface_of
+from wrf_mi.maps.grid import surface_of
 from wrf_mi.scene.coordinates import Y_UP
 
 ROUNDING_M = 1e-5

@@ -231,7 +231,7 @@ def cut_truth(run):
             write("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
             "line 2 is no log entry",
         ),
-        (write("config.yaml", "seed: 1"), "a run of version 0.1; train it anew, or use version 0.1"),
+        (write("config.yaml", "seed: 1"), "format not stated, this version reads 4; train it anew"),
         (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw4"),

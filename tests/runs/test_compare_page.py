@@ -86,9 +86,10 @@ def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -
     assert {name: found[name, reference] for name in ("bad", "good")} == {"bad": "worse", "good": "better"}
     against = next(one for one in differences(runs) if (one.run, one.against) == ("bad", best))
     expected = np.mean(np.abs(best_run(runs).prediction - good.truth) - np.abs(bad.prediction - bad.truth))
-    assert against.interval is not None
-    assert against.interval.value == pytest.approx(expected)
-    assert against.interval.low < expected < against.interval.high < 0
+    assert against.low is not None
+    assert against.high is not None
+    assert against.difference == pytest.approx(expected)
+    assert against.low < expected < against.high < 0
 
 
 def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> None:
@@ -111,7 +112,7 @@ def test_receivers_of_a_row_count_as_one_observation() -> None:
     single = differences([strengths("a", error, reference_db=2.0)])[0]
     double = differences([strengths("a", np.stack([error, error]), reference_db=2.0, receivers=2)])[0]
     assert (single.rows, double.rows) == (40, 40)
-    assert single.interval == double.interval
+    assert (single.low, single.high) == (double.low, double.high)
 
 
 @pytest.fixture(scope="module")

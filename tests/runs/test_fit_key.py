@@ -11,7 +11,7 @@ import pytest
 
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
-from wrf_mi.runs.fit_key import scene_files
+from wrf_mi.runs.sweep import scene_files
 
 
 def test_digest_tells_values_apart() -> None:

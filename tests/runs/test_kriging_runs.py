@@ -199,7 +199,7 @@ def test_bad_headings_are_refused(name: str, run: Path, tmp_path: Path, capsys: 
     (tmp_path / name).write_text(content)
     refused(["predict", run, "--tx", tmp_path / name, "--out", tmp_path / "out.npz"], message, capsys)
     np.savez(tmp_path / "tx.npz", tx_pos=np.zeros((2, 3)), heading_rad=np.zeros(3))
-    refused(["predict", run, "--input", tmp_path / "tx.npz", "--out", tmp_path / "out.npz"], "heading_rad must", capsys)
+    refused(["predict", run, "--input", tmp_path / "tx.npz", "--out", tmp_path / "out.npz"], "omit heading_rad", capsys)
 
 
 # In Python

@@ -18,6 +18,7 @@ from wrf_mi.core.locks import LOCK, alone_in_process, locked_folder
 from wrf_mi.core.memory import require_memory
 from wrf_mi.models import MODELS
 from wrf_mi.runs import folder as folder_module
+from wrf_mi.runs import prediction_file
 from wrf_mi.runs import run as run_module
 from wrf_mi.runs.api import Interrupted, open_run, predict_to_file, resume, train
 from wrf_mi.runs.folder import is_finished, read_fitted, write_fitted
@@ -179,8 +180,11 @@ def test_chunks_give_the_predictions_of_all_at_once(
     monkeypatch.setattr(run_module, "PREDICTED_PER_CHUNK", 2)
     monkeypatch.setattr(run_module, "MOST_PER_CHUNK", largest)
     np.testing.assert_allclose(open_run(kriging).predict(positions, 1).mean, whole, rtol=1e-6)
-    predict_to_file(kriging, positions, tmp_path / "out.npz")
-    np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], whole, rtol=1e-6)
+    for spooled_bytes in (prediction_file.SPOOLED_BYTES, 0):  # in memory, and in a temporary file
+        monkeypatch.setattr(prediction_file, "SPOOLED_BYTES", spooled_bytes)
+        predict_to_file(kriging, positions, tmp_path / "out.npz")
+        np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], whole, rtol=1e-6)
+        assert [path.name for path in tmp_path.iterdir()] == ["out.npz"]
 
 
 @pytest.mark.parametrize("line", ["dataset: [1]", "seed: x", "task: 5", "n_train: {a: 1}", "model: [a]"])

@@ -19,8 +19,7 @@ import pytest
 from calling import SET, call, refused
 
 from wrf_mi.cli.main import build_parser, main
-from wrf_mi.cli.sweep import training_names
-from wrf_mi.cli.train import TRACING, training_arguments
+from wrf_mi.cli.train import TRACING, training_arguments, training_names
 from wrf_mi.core import InputError
 from wrf_mi.runs import sweep as module
 from wrf_mi.runs.results import read_run

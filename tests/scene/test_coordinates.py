@@ -15,7 +15,7 @@ from calling import call
 from made_rooms import closed_box, sampled
 
 from wrf_mi.core import InputError
-from wrf_mi.maps.surface import surface_of
+from wrf_mi.maps.grid import surface_of
 from wrf_mi.scene.coordinates import Y_UP, looks_y_up, require_fine, require_near, require_precise
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.points import read_points

@@ -134,7 +134,9 @@ def test_compressed_run_opens_as_a_run(
     out = tmp_path / "small"
     call = ["compress", str(run), "--out", str(out), "--budget", "6", "--precision", "8bit", "--fine-tune", "5"]
     assert main([*call, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    assert "fine-tune 5/5" in printed.err
+    found = json.loads(printed.out)
     assert found == json.loads((out / COMPRESSION).read_text())
     assert found["after"]["gaussians"] == 6
     assert found["after"]["bytes"] == (out / "model.npz").stat().st_size

@@ -258,7 +258,7 @@ def test_command_writes_one_file(traced: Path, room: Path, tmp_path: Path, capsy
     status, printed, err = call(["view", traced, "--out", out, "--transmitters", 2, "--paths", 1], capsys)
     assert status == 0
     assert printed.splitlines()[-1] == f"view: {out} ({out.stat().st_size / 1e6:.1f} MB)"
-    assert err.startswith("view: opening the scene\n")
+    assert err.startswith("opening the scene\n")
     status, printed, _ = call(["view", room, "--out", out, "--json"], capsys)
     found = json.loads(printed)
     assert (status, found["bytes"], found["notes"]) == (0, out.stat().st_size, [])

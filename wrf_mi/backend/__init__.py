@@ -86,21 +86,14 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
                 warnings.warn(f"Mitsuba's variant changes from {before} to {_active.variant}", stacklevel=2)
             mi.set_variant(_active.variant)
         if _active.name == "cuda":
-            _divide_exactly()
+            import drjit as dr
+
+            # IEEE 754 division and roots in this thread, where Dr.Jit's flags live: the approximate ones have 20 bits
+            # also in float64, where phases of hundreds of wavelengths and derivatives of a correction need more.
+            dr.set_flag(dr.JitFlag.FastMath, False)
         if threads is not None:
             set_threads(threads)
         return _active
-
-
-def _divide_exactly() -> None:
-    """Use IEEE 754 division and roots on a GPU, in this thread, where Dr.Jit's flags live.
-
-    The approximate ones of `dr.JitFlag.FastMath` have 20 bits also in float64, where phases of hundreds of wavelengths
-    and derivatives of a correction need more.
-    """
-    import drjit as dr
-
-    dr.set_flag(dr.JitFlag.FastMath, False)
 
 
 def set_threads(threads: int) -> None:
@@ -184,16 +177,15 @@ def _choose_llvm(fresh: bool) -> Backend:
     asked = os.environ.get(LLVM_VARIABLE)
     if asked:
         what = refused[0] if refused else f"{asked} is not a file"
-        other = _good_llvm(ignore_variable=True)
+        other = _good_llvm()
         remedy = f"unset it, {other} works" if other else f"unset it and install a newer one: {install_line()}"
         raise BackendError(f"{LLVM_VARIABLE} is set, but {what}: {remedy}")
     what = "; ".join(refused) or "none was found"
     raise BackendError(f"no usable LLVM ({what}): {install_line()}")
 
 
-def _good_llvm(*, ignore_variable: bool) -> LlvmLibrary | None:
-    libraries = find_llvm(ignore_variable=ignore_variable)
-    return next((library for library in libraries if try_llvm(library).usable), None)
+def _good_llvm() -> LlvmLibrary | None:
+    return next((library for library in find_llvm(ignore_variable=True) if try_llvm(library).usable), None)
 
 
 def _judge_loaded(backend: str) -> Backend:
@@ -238,7 +230,7 @@ def _loaded_llvm() -> Path | None:
 
 def _other_llvm() -> str:
     """Remedy for an LLVM that was loaded too early."""
-    other = _good_llvm(ignore_variable=True)
+    other = _good_llvm()
     if other is None:
         return install_line()
     return f"call wrf_mi.backend.init() first, or set {LLVM_VARIABLE}={other.path} before Python starts"

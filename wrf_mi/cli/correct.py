@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .options import DATASET, Arguments, add_command, add_n_train
-from .output import print_json, stages
+from .output import Watch, show
 
 
 def add_parser(commands: Any) -> None:
@@ -57,16 +57,15 @@ def correct_command(a: Arguments) -> int:
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
     warn_of_suspicions(record)
-    with stages("correct") as show:
-        found = correct_scene(a.scene, record, splits[0], options, a.material, show)
+    with Watch() as watch:
+        found = correct_scene(a.scene, record, splits[0], options, a.material, watch.on_progress)
         facts = write_page(found, a.out, a.replace)
-    if a.json:
-        print_json({"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}})
-        return 0
     what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
-    print(f"{facts['score']} of {facts['held_out']} {what}   median    mean")
+    lines = [f"{facts['score']} of {facts['held_out']} {what}   median    mean"]
     for stage, score in facts["held_out_scores"].items():
-        print(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{'  kept' if stage == facts['kept'] else ''}")
-    print(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
-    print(f"scene: {a.out}\npage: {a.out}/correction.md")
-    return 0
+        mark = "  kept" if stage == facts["kept"] else ""
+        lines.append(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{mark}")
+    lines.append(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
+    lines.append(f"scene: {a.out}\npage: {a.out}/correction.md")
+    shown = {"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}}
+    return show(a.json, shown, "\n".join(lines))

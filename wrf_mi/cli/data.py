@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core import Record
 from ..core.carriers import carriers_text
 from .options import DATASET, Arguments, add_command
-from .output import print_json
+from .output import show
 
 SHOWN_CARRIERS = 8
 
@@ -43,14 +43,13 @@ def list_command(a: Arguments) -> int:
         | {"location": str(entry.location) if entry.location else None}
         for entry in datasets()
     ]
-    if a.json:
-        print_json(rows)
-        return 0
     width = max(len(row["name"]) for row in rows) + 1
-    for row in rows:
-        print(f"{row['name']:<{width}}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}")
-        print(f"{'':<{width}}{row['origin']}")
-    return 0
+    lines = [
+        f"{row['name']:<{width}}{row['task']:<9}{row['licence']:<10}{row['location'] or 'not here yet'}\n"
+        f"{'':<{width}}{row['origin']}"
+        for row in rows
+    ]
+    return show(a.json, rows, "\n".join(lines))
 
 
 def fetch_command(a: Arguments) -> int:
@@ -72,11 +71,7 @@ def info_command(a: Arguments) -> int:
     from ..synthetic import load_record
 
     found = summary(load_record(a.dataset, progress=True))
-    if a.json:
-        print_json(found)
-    else:
-        print(render(found))
-    return 0
+    return show(a.json, found, render(found))
 
 
 def check_command(a: Arguments) -> int:
@@ -84,10 +79,7 @@ def check_command(a: Arguments) -> int:
     from ..checking import check_data
 
     found = check_data(a.dataset, a.ignore, progress=True)
-    if a.json:
-        print_json(found.as_dict())
-    else:
-        print("\n".join(found.lines()))
+    show(a.json, found.as_dict(), "\n".join(found.lines()))
     if not found.ok:
         return 2
     return 1 if a.strict and found.suspicions else 0

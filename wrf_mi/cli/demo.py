@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 def demo_command(a: Arguments) -> int:
     """Run the demonstration."""
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         run, index = demo(Path(a.out) if a.out else None, watch.on_progress, watch.stop)
     show_metrics(run.metrics, run.folder, a.json)
     print(f"pictures: {index}", file=sys.stderr if a.json else sys.stdout)
@@ -57,13 +57,9 @@ def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) ->
     Without measured spectra, those of the embedded room are used, traced in its true mesh; the ray tracer then gets
     the mesh made from a LiDAR scan of the room.
 
-    Args:
-        out: run folder; None: a new one in ``runs/``. The traced run is its subfolder ``traced``.
-        on_progress: progress callback.
-        stop: True stops at a checkpoint.
-
     Returns:
-        The run of the field, and ``index.html`` with all pictures.
+        The run of the field, in ``out`` (None: a new folder in ``runs/``) with the traced one in its subfolder
+        ``traced``, and ``index.html`` with all pictures.
     """
     from ..runs.api import train
     from ..runs.compare import compare

@@ -12,8 +12,9 @@ from typing import Any
 from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
 from ..backend.probe import installed_version, try_cuda, try_llvm
 from ..backend.remedy import install_commands, package_manager
+from ..parallel.threads import processors
 from .options import Arguments, add_command
-from .output import print_json
+from .output import show
 
 _PACKAGES = ("wrf-mi", "mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image")
 _DATA_VARIABLE = "WRF_MI_DATA"
@@ -58,7 +59,7 @@ def report() -> dict[str, Any]:
         "python": f"{platform.python_version()} ({sys.executable})",
         "system": platform.platform(),
         "versions": versions,
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "threads": processors(),
         "backend": backend,
         "llvm": llvm,
         "gpu": gpu,
@@ -125,10 +126,7 @@ def doctor_command(a: Arguments) -> int:
     if a.install_llvm:
         install_llvm()
     found = report()
-    if a.json:
-        print_json(found)
-    else:
-        print(render(found))
+    show(a.json, found, render(found))
     return 0 if found["ok"] else 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from .options import Arguments, add_command
-from .output import print_json
+from .output import show
 
 if TYPE_CHECKING:
     from ..scene.edit import Move
@@ -32,11 +32,7 @@ def edit_command(a: Arguments) -> int:
     if a.out is not None:
         removed = [name for names in a.remove for name in names]
         folder = edit_scene(a.scene, a.out, [_move(text) for text in a.move], removed, a.replace)
-        if a.json:
-            print_json({"scene": str(folder)})
-        else:
-            print(f"scene: {folder}\npicture: {folder / 'preview.png'}")
-        return 0
+        return show(a.json, {"scene": str(folder)}, f"scene: {folder}\npicture: {folder / 'preview.png'}")
     if a.move or a.remove or a.replace:
         raise InputError("edit: give the folder of the edited scene (--out)")
     surfaces, materials = read_surfaces(a.scene)
@@ -44,15 +40,12 @@ def edit_command(a: Arguments) -> int:
         {"part": one.name, "material": materials.of(one.name, one.kind), "box_m": box_of([one]).round(3).tolist()}
         for one in surfaces
     ]
-    if a.json:
-        print_json({"scene": a.scene, "parts": rows})
-        return 0
     width = max(len(row["part"]) for row in rows) + 2
-    print(f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to")
+    lines = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"]
     for row in rows:
         low, high = (" ".join(f"{value:7.2f}" for value in corner) for corner in row["box_m"])
-        print(f"{row['part']:<{width}}{row['material']:<24}{low:<24}{high}")
-    return 0
+        lines.append(f"{row['part']:<{width}}{row['material']:<24}{low:<24}{high}")
+    return show(a.json, {"scene": a.scene, "parts": rows}, "\n".join(lines))
 
 
 def _names(text: str) -> tuple[str, ...]:

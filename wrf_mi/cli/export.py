@@ -9,7 +9,7 @@ from typing import Any
 
 from ..core import InputError
 from .options import Arguments, add_command
-from .output import print_json
+from .output import show
 
 POSITION = "X,Y,Z"
 
@@ -52,11 +52,8 @@ def export_command(a: Arguments) -> int:
     ends = _positions(a.tx, "--tx"), _positions(a.rx, "--rx")
     options = (a.frequency, a.material, a.paths, a.depth, a.replace, sys.stderr.isatty())
     facts = export(a.source, a.format, a.out, ExportOptions(*ends, *options))
-    if a.json:
-        print_json({"out": a.out, "format": a.format, **facts})
-    else:
-        print(f"{', '.join(f'{name} {value}' for name, value in facts.items())}: {a.out}")
-    return 0
+    text = f"{', '.join(f'{name} {value}' for name, value in facts.items())}: {a.out}"
+    return show(a.json, {"out": a.out, "format": a.format, **facts}, text)
 
 
 def import_command(a: Arguments) -> int:

@@ -9,52 +9,15 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from .. import __version__
 from ..core import BackendError, InputError
 from ..core.files import os_failure
-from . import (
-    bench,
-    compare,
-    compress,
-    correct,
-    data,
-    demo,
-    doctor,
-    edit,
-    evaluate,
-    export,
-    locate,
-    map,
-    mesh,
-    predict,
-    sweep,
-    trace,
-    train,
-    view,
-)
 from .options import Parser
 
-COMMANDS = (
-    doctor,
-    data,
-    mesh,
-    correct,
-    edit,
-    train,
-    trace,
-    sweep,
-    evaluate,
-    predict,
-    map,
-    locate,
-    compress,
-    compare,
-    view,
-    export,
-    bench,
-    demo,
-)
+MODULES = ("doctor", "data", "mesh", "correct", "edit", "train", "runs", "maps", "export", "bench", "demo")
+"""Modules of the commands, in the order of the help."""
 
 
 def build_parser() -> Parser:
@@ -62,8 +25,8 @@ def build_parser() -> Parser:
     parser = Parser(prog="wrf-mi", description="Learned wireless radiation fields and ray tracing.")
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in COMMANDS:
-        module.add_parser(commands)
+    for name in MODULES:
+        import_module(f".{name}", __package__).add_parser(commands)
     return parser
 
 

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from .options import Arguments, add_command
-from .output import print_json
+from .output import show
 
 
 def add_parser(commands: Any) -> None:
@@ -57,16 +57,13 @@ def mesh_command(a: Arguments) -> int:
     )
     kinds = list(scene.materials.surfaces.values())
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
-    if a.json:
-        facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
-        print_json({**facts, "origin_m": a.origin})
-    else:
-        print(", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}")
-        if a.origin is not None:
-            point = ", ".join(f"{value:.12g}" for value in a.origin)
-            print(f"origin: {point}; subtract it from the positions of the measurements, too")
-        print(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
-    return 0
+    facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
+    lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
+    if a.origin is not None:
+        point = ", ".join(f"{value:.12g}" for value in a.origin)
+        lines.append(f"origin: {point}; subtract it from the positions of the measurements, too")
+    lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
+    return show(a.json, {**facts, "origin_m": a.origin}, "\n".join(lines))
 
 
 def _point(text: str) -> tuple[float, ...]:

@@ -7,8 +7,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -20,27 +19,35 @@ if TYPE_CHECKING:
     from ..training.loop import Progress as FitProgress
 
 
-def print_json(value: Any) -> None:
-    """Print figures for programs."""
-    print(json.dumps(value, indent=1, default=str))
+QUANTITIES = ("median", "mean", "p10", "p90")
+
+
+def show(as_json: bool, value: Any, text: str) -> int:
+    """Print figures as JSON for programs, or as text; the exit status 0."""
+    print(json.dumps(value, indent=1, default=str) if as_json else text)
+    return 0
+
+
+def summary_table(title: str, blocks: Mapping[str, Mapping[str, float] | None], digits: int) -> str:
+    """Table of the summaries of quantities by name; None leaves one out."""
+    lines = [f"{title:<36}" + "".join(f"{key:>8}" for key in QUANTITIES)]
+    for name, block in blocks.items():
+        if block is not None:
+            lines.append(f"{name:<36}" + "".join(f"{block[key]:8.{digits}f}" for key in QUANTITIES))
+    return "\n".join(lines)
 
 
 def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -> int:
     """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
     if as_json:
-        print_json(metrics)
-        return 0
+        return show(as_json, metrics, "")
     from ..runs.constant import unbeaten
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]
-    title = f"{task.label} on {metrics['n_test']} test rows"
-    print(f"{title:<36}{'median':>8}{'mean':>8}{'p10':>8}{'p90':>8}")
-    references = metrics["reference"]
-    named = [(metrics["model"], metrics[task.block])]
-    named += [(f"{words} ({key})", references[key]) for key, words in task.references.items() if key in references]
-    for name, block in named:
-        print(f"{name:<36}" + "".join(f"{block[key]:8.3f}" for key in ("median", "mean", "p10", "p90")))
+    references = {f"{words} ({key})": metrics["reference"].get(key) for key, words in task.references.items()}
+    blocks = {metrics["model"]: metrics[task.block], **references}
+    print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
     _show_stages(metrics.get("stages", []), task.label)
     if metrics.get("n_not_scored"):
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
@@ -70,34 +77,16 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
         print(f"{one['stage']:<24}" + "".join(f"{cell:>15}" for cell in cells) + ("" if one["kept"] else "  not kept"))
 
 
-@contextmanager
-def stages(command: str) -> Iterator[Callable[[str, float], None]]:
-    """Progress callback, stage and fraction done, shown on standard error: a bar on a terminal, else a line a stage.
+class Watch:
+    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
     Args:
-        command: name of the command, for the lines.
-    """
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0, visible=False)
-
-        def show(stage: str, share: float) -> None:
-            if stage != bar.tasks[0].description:
-                bar.reset(task, description=stage, visible=True)
-                if bar.disable:
-                    print(f"{command}: {stage}", file=sys.stderr, flush=True)
-            bar.update(task, completed=share)
-
-        yield show
-
-
-class Watch:
-    """Progress of a fit on standard error (plain lines where it is no terminal), and a stop on Ctrl-C.
-
-    The first Ctrl-C lets the current step finish and writes a checkpoint; a second one ends at once.
+        resumable: whether the work asks `stop` and can go on later: the first Ctrl-C then lets the current step finish
+            and writes a checkpoint, and a second one ends at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, resumable: bool = False) -> None:
+        self._resumable = resumable
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console
@@ -110,7 +99,9 @@ class Watch:
 
     def __enter__(self) -> Watch:
         """Handle Ctrl-C."""
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        self._before = signal.getsignal(signal.SIGINT)
+        if self._resumable:
+            signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -1,4 +1,4 @@
-"""``wrf-mi train``."""
+"""``wrf-mi train``, ``trace`` and ``sweep``."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from typing import Any
 from ..backend import init
 from ..core import AntennaOptions, InputError
 from ..core.yaml_files import read_yaml
-from .options import Arguments, add_command, add_training
-from .output import Watch, show_metrics
+from .options import (
+    DATASET,
+    Arguments,
+    Parser,
+    add_command,
+    add_n_train,
+    add_scheduler,
+    add_tracing,
+    add_training,
+)
+from .output import Watch, show, show_metrics
 
 HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
@@ -23,7 +32,12 @@ BESIDE_RESUME = ("resume", "json", "help_settings", "call")
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``train`` to the commands."""
+    """Add ``train``, ``trace`` and ``sweep`` to the commands."""
+    for add in (_add_train, _add_trace, _add_sweep):
+        add(commands)
+
+
+def _add_train(commands: Any) -> None:
     parser = add_command(commands, "train", train_command, "fit a model to measurements and score it")
     add_training(parser)
     parser.add_argument("--out", metavar="RUN", help="run folder to make")
@@ -53,7 +67,7 @@ def run_training(a: Arguments, **more: Any) -> int:
     arguments = training_arguments(a)
     from ..runs.api import train
 
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         progress: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop}
         run = train(a.dataset, a.out, **arguments, **progress, **more, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
@@ -64,7 +78,7 @@ def _resume(a: Arguments) -> int:
         init("llvm", threads=1)
     from ..runs.api import resume
 
-    with Watch() as watch:
+    with Watch(resumable=True) as watch:
         run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
@@ -166,3 +180,92 @@ def _settings_text() -> str:
         for data, kind in kinds.items():
             names.setdefault(kind, []).append(f"{name}, {data}" if data else name)
     return "\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items())
+
+
+def _add_trace(commands: Any) -> None:
+    text = "predict by ray tracing and score it like a learned field"
+    parser = add_command(commands, "trace", trace_command, text)
+    parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
+    parser.set_defaults(deterministic=False, intervals=False)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
+    add("dataset", metavar="DATASET", help=DATASET)
+    add("--out", metavar="RUN", required=True, help="run folder to make")
+    add_tracing(parser)
+    target = "choose depth, rays, diffraction and scattering until power and spectra are converged to DB decibels"
+    add("--target-error", type=float, metavar="DB", help=target)
+    text = "write the traced paths as a scenario of DeepMIMO, which deepmimo.load opens (docs/data.md)"
+    add("--deepmimo", metavar="FOLDER", help=text)
+    add("--split", help="as for train (default: official)")
+    add_n_train(parser)
+    add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
+    add_scheduler(parser)
+
+
+def trace_command(a: Arguments) -> int:
+    """Predict by ray tracing alone."""
+    from ..parallel import open_scheduler
+
+    training_arguments(a)  # refused before workers start
+    if a.calibrate is not None and a.scheduler is not None:
+        raise InputError("trace: --calibrate trains in one process; omit --scheduler")
+    if a.deepmimo is not None:
+        _check_deepmimo(a)
+    with open_scheduler(a.scheduler) as scheduler:
+        status = run_training(a, scheduler=scheduler if a.scheduler else None)
+    if a.deepmimo is not None:
+        from ..models.ray_tracing import PATHS
+        from ..tracing import load_trace, write_deepmimo
+
+        write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS))
+    return status
+
+
+def _check_deepmimo(a: Arguments) -> None:
+    from ..tracing.deepmimo import check_deepmimo_folder
+
+    if a.calibrate is not None:
+        raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
+    check_deepmimo_folder(a.deepmimo)
+
+
+def _add_sweep(commands: Any) -> None:
+    text = "train with every combination of settings, and tabulate the scores"
+    parser = add_command(commands, "sweep", sweep_command, text)
+    add_training(parser)
+    text = "setting or option of train and its values, e.g. seed=0,1,2; repeatable: every combination is run"
+    parser.add_argument("--vary", action="append", default=[], metavar="KEY=A,B,...", help=text)
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder of all runs and their table")
+    add_scheduler(parser)
+
+
+def training_names() -> list[str]:
+    """Names of the options that sweep shares with train, and ``dataset``."""
+    parser = Parser(add_help=False)
+    add_training(parser)
+    return [action.dest.replace("_", "-") for action in parser._actions]
+
+
+def sweep_command(a: Arguments) -> int:
+    """Run ``train`` for each combination."""
+    from ..parallel import open_scheduler
+    from ..runs.sweep import check_failures, check_run, plan_sweep, run_sweep, sweep_table
+
+    # Read off the parser, so that no option of train is left out.
+    given = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
+    settings = given.pop("set")
+    options = {name: str(value) for name, value in given.items() if value is not None and not isinstance(value, bool)}
+    flags = [f"--{name}" for name, value in given.items() if value is True]
+    sweep = plan_sweep(a.out, a.vary, options, settings, flags)
+    parser = Parser(prog="wrf-mi")
+    _add_train(parser.add_subparsers())
+    for run in sweep.runs:
+        single = parser.parse_args([*run.arguments, "--out", str(run.folder)])
+        if not single.dataset:
+            raise InputError("sweep needs DATASET")
+        check_run(single.dataset, training_arguments(single))
+    with open_scheduler(a.scheduler) as scheduler:
+        rows = run_sweep(sweep, scheduler)
+    show(a.json, rows, f"{sweep_table(rows, sweep.varied)}\nresults: {a.out}")
+    check_failures(rows)
+    return 0

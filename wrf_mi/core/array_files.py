@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,19 +28,10 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 REMEDY = "read it on a machine with more memory"
 
 
-@dataclass(frozen=True)
-class ArrayStream:
-    """An array that is written without being in memory: its shape, type and content in C order, in pieces."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    pieces: Iterable[bytes]
-
-
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
-    """Write an ``.npz`` file of plain arrays, or of `ArrayStream`, atomically.
+    """Write an ``.npz`` file of plain arrays atomically.
 
-    `stored_arrays` compares the checksum, which `ArrayStream` cannot have.
+    `stored_arrays` compares the checksum.
     """
     stored = dict(arrays)
     if checksum:
@@ -51,14 +41,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False
     with atomic_file(path) as part, zipfile.ZipFile(part, "w", how) as archive:
         for name, values in stored.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                if isinstance(values, ArrayStream):
-                    descr = np.lib.format.dtype_to_descr(values.dtype)
-                    header = {"descr": descr, "fortran_order": False, "shape": values.shape}
-                    np.lib.format.write_array_header_1_0(member, header)
-                    for piece in values.pieces:
-                        member.write(piece)
-                else:
-                    np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+                np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
     return path
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -193,6 +195,16 @@ def write_atomically(path: Path, content: bytes | str) -> Path:
     with atomic_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
+
+
+def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> Path:
+    """Write a table as CSV with a header, atomically: numbers to their last digit, None and NaN as empty fields."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    # Only NaN differs from itself.
+    writer.writerows(["" if value is None or value != value else value for value in row] for row in rows)
+    return write_atomically(path, text.getvalue())
 
 
 def append_line(path: Path, line: str) -> None:

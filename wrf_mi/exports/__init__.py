@@ -15,101 +15,39 @@ from .format import DATASET, RUN, SCENE, ExportOptions, Format
 ENTRY_POINTS = "wrf_mi.exports"
 SCENES = (SCENE, RUN)
 """A run stands for its corrected scene, or else for the scene that it was traced in."""
-_HERE = "wrf_mi.exports"
 _TRACED = ("tx_pos_m", "rx_pos_m", "frequency_hz", "material", "kinds", "depth")
-
-BUILT_IN = (
-    Format(
-        "3dgs",
-        (RUN,),
-        ".ply",
-        f"{_HERE}.gaussians:write_3dgs",
-        ("tx_pos_m", "frequency_hz"),
-        "Gaussians for the transmitter of --tx as PLY of 3D Gaussian splatting, which its viewers open",
-    ),
-    Format(
-        "field",
-        (RUN,),
-        ".npz",
-        f"{_HERE}.field_file:write_field",
-        (),
-        "all parameters of a field of Gaussians in one file, without loss; `wrf-mi import` makes a run of it",
-    ),
-    Format(
-        "paths",
-        (RUN, SCENE),
-        ".csv",
-        f"{_HERE}.paths_table:write_paths",
-        _TRACED,
-        "paths of a traced run, or of a scene from --tx to --rx at --frequency, one row each",
-    ),
-    Format(
-        "deepmimo",
-        (RUN,),
-        "",
-        f"{_HERE}.paths_table:write_scenario",
-        (),
-        "paths of a traced run as a scenario of DeepMIMO, a folder",
-    ),
-    Format(
-        "sionna",
-        SCENES,
-        "",
-        f"{_HERE}.scenes:write_sionna",
-        ("frequency_hz", "material"),
-        "scene as a folder that sionna.rt.load_scene opens with the same materials, and mi.load_file for pictures",
-    ),
-    Format(
-        "glb",
-        SCENES,
-        ".glb",
-        f"{_HERE}.scenes:write_glb",
-        ("material",),
-        "scene as one glTF file (y up) with a mesh for each surface and a coloured material for each radio material",
-    ),
-    Format(
-        "ply",
-        SCENES,
-        ".ply",
-        f"{_HERE}.scenes:write_mesh",
-        ("material",),
-        "scene as one mesh (z up) with colour, material and surface of each face; `wrf-mi mesh` reads it",
-    ),
-    Format(
-        "spectra",
-        (DATASET,),
-        "",
-        f"{_HERE}.measurements:write_spectra",
-        (),
-        "spectra in the layout of NeRF2, a folder of images of 16 bits (docs/data.md)",
-    ),
-    Format(
-        "ble",
-        (DATASET,),
-        "",
-        f"{_HERE}.measurements:write_strengths",
-        (),
-        "signal strengths in the layout of flat-ble, a folder of CSV files",
-    ),
-    Format(
-        "nerf2-csi",
-        (DATASET,),
-        "",
-        f"{_HERE}.measurements:write_channels",
-        (),
-        "uplink and downlink of a base station in the layout of NeRF2, a folder",
-    ),
-    Format(
-        "npz",
-        (DATASET,),
-        ".npz",
-        f"{_HERE}.measurements:write_npz",
-        (),
-        "any data set in one file, without loss",
-    ),
-)
-
-FORMATS = Registry[Format]("format", ENTRY_POINTS, {one.name: one for one in BUILT_IN})
+_WRITERS: dict[str, tuple[tuple[str, ...], str, str, tuple[str, ...]]] = {
+    "3dgs": ((RUN,), ".ply", "gaussians:write_3dgs", ("tx_pos_m", "frequency_hz")),
+    "field": ((RUN,), ".npz", "field_file:write_field", ()),
+    "paths": ((RUN, SCENE), ".csv", "paths_table:write_paths", _TRACED),
+    "deepmimo": ((RUN,), "", "paths_table:write_scenario", ()),
+    "sionna": (SCENES, "", "scenes:write_sionna", ("frequency_hz", "material")),
+    "glb": (SCENES, ".glb", "scenes:write_glb", ("material",)),
+    "ply": (SCENES, ".ply", "scenes:write_mesh", ("material",)),
+    "spectra": ((DATASET,), "", "measurements:write_spectra", ()),
+    "ble": ((DATASET,), "", "measurements:write_strengths", ()),
+    "nerf2-csi": ((DATASET,), "", "measurements:write_channels", ()),
+    "npz": ((DATASET,), ".npz", "measurements:write_npz", ()),
+}
+"""Kinds of sources, suffix, writer and options of each format, as the attributes of `Format`."""
+_TEXTS = {
+    "3dgs": "Gaussians for the transmitter of --tx as PLY of 3D Gaussian splatting, which its viewers open",
+    "field": "all parameters of a field of Gaussians in one file, without loss; `wrf-mi import` makes a run of it",
+    "paths": "paths of a traced run, or of a scene from --tx to --rx at --frequency, one row each",
+    "deepmimo": "paths of a traced run as a scenario of DeepMIMO, a folder",
+    "sionna": "scene as a folder that sionna.rt.load_scene opens with its materials, and mi.load_file for pictures",
+    "glb": "scene as one glTF file (y up) with a mesh for each surface and a coloured material for each radio material",
+    "ply": "scene as one mesh (z up) with colour, material and surface of each face; `wrf-mi mesh` reads it",
+    "spectra": "spectra in the layout of NeRF2, a folder of images of 16 bits (docs/data.md)",
+    "ble": "signal strengths in the layout of flat-ble, a folder of CSV files",
+    "nerf2-csi": "uplink and downlink of a base station in the layout of NeRF2, a folder",
+    "npz": "any data set in one file, without loss",
+}
+BUILT_IN = {
+    name: Format(name, kinds, suffix, f"{__name__}.{writer}", options, _TEXTS[name])
+    for name, (kinds, suffix, writer, options) in _WRITERS.items()
+}
+FORMATS = Registry[Format]("format", ENTRY_POINTS, BUILT_IN)
 """All formats by name."""
 
 
@@ -132,16 +70,17 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
     """
     if format not in FORMATS:
         raise InputError(f"format {format!r}: unknown; choose from {', '.join(FORMATS)}")
-    from .source import find_source  # imports tracer and models, which the list of formats does without
+    from .source import Source, kinds_of  # imports tracer and models, which the list of formats does without
 
     asked, given = FORMATS[format], options or ExportOptions()
     asked.check(Path(out), given)
-    found = find_source(source)
-    if not set(found.kinds) & set(asked.kinds):
-        others = [name for name, other in FORMATS.items() if set(other.kinds) & set(found.kinds)]
-        text = f"{source}: a {' and '.join(found.kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
+    kinds = kinds_of(source)
+    kind = next((kind for kind in kinds if kind in asked.kinds), None)
+    if kind is None:
+        others = [name for name, other in FORMATS.items() if set(other.kinds) & set(kinds)]
+        text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
         raise InputError(f"{text}; choose from {', '.join(others)}")
-    return asked.write(found.of(asked.kinds), Path(out), given)
+    return asked.write(Source(str(source), kind), Path(out), given)
 
 
 __all__ = ["BUILT_IN", "DATASET", "ENTRY_POINTS", "FORMATS", "RUN", "SCENE", "ExportOptions", "Format", "export"]

@@ -12,11 +12,11 @@ from matplotlib import colormaps
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
+from ..core.files import one_line, write_atomically
 from ..gaussians.parameters import Gaussians
 from ..models.gaussian.model import FittedField
 from ..runs.run import Run
 from .format import ExportOptions
-from .ply import table, write_ply
 from .source import Source
 
 DEGREE_0 = 0.28209479177387814
@@ -102,5 +102,9 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
         f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest",
         "signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)",
     ]
-    write_ply(out, {"vertex": table(columns)}, comments)
-    return {"Gaussians": len(columns["x"]), "properties": len(columns)}
+    # G. Turk, "The PLY polygon file format" (1994)
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {one_line(text)}" for text in comments)]
+    header += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header", ""]
+    rows = np.stack(list(columns.values()), axis=1).astype("<f4")
+    write_atomically(out, "\n".join(header).encode() + rows.tobytes())
+    return {"Gaussians": len(rows), "properties": len(columns)}

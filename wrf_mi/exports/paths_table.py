@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core import InputError, Paths, Receiver
@@ -67,11 +66,9 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
         if stated := [name for name, value in (given | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
         return source.trace()
-    if lacking := [name for name, value in given.items() if value is None]:
-        raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {', '.join(lacking)}")
-    assert options.tx_pos_m is not None
-    assert options.rx_pos_m is not None
-    assert options.frequency_hz is not None
+    if options.tx_pos_m is None or options.rx_pos_m is None or options.frequency_hz is None:
+        lacking = ", ".join(name for name, value in given.items() if value is None)
+        raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"max_depth": options.depth}
     trace_options = TraceOptions(**chosen)
@@ -114,8 +111,11 @@ def read_paths(file: str | Path) -> Paths:
         InputError: a file that is missing, or has a column or a field less or another kind of value.
     """
     table = read_csv(Path(file))
-    tx, rx = (_whole(table, name) for name in ("tx", "rx"))
-    lists = {name: [_parts(text) for text in table.texts(name)] for name in ("interactions", "vertices_m", "objects")}
+    tx, rx = (table.numbers(name).astype(np.int64) for name in ("tx", "rx"))
+    lists = {
+        name: [text.split(SEPARATOR) if text else [] for text in table.texts(name)]
+        for name in ("interactions", "vertices_m", "objects")
+    }
     depth = max((len(parts) for parts in lists["interactions"]), default=0)
     shape = len(tx), depth
     interactions, objects = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32)
@@ -145,14 +145,6 @@ def read_paths(file: str | Path) -> Paths:
         int(tx.max(initial=-1)) + 1,
         int(rx.max(initial=-1)) + 1,
     )
-
-
-def _parts(text: str) -> list[str]:
-    return text.split(SEPARATOR) if text else []
-
-
-def _whole(table: CsvTable, name: str) -> NDArray[np.int64]:
-    return table.numbers(name).astype(np.int64)
 
 
 def _directions(table: CsvTable, end: str) -> FloatArray:

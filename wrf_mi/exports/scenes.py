@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +11,24 @@ import trimesh
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_atomically
+from ..core.files import atomic_folder, one_line, write_atomically
 from ..core.types import IntArray
+from ..runs.scene_view import surfaces_of
 from ..scene.coordinates import Y_UP
 from ..scene.folder import plain_name
+from ..scene.surfaces import Surface
 from ..tracing.corrected_scene import ODD_IN_FILES, check_materials
 from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
 from ..tracing.scenes import load_scene
-from ..tracing.surfaces import scene_surfaces
 from .format import ExportOptions
-from .ply import table, write_ply
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
-RGB = tuple(enumerate(("red", "green", "blue")))
 
 
-@dataclass(frozen=True)
-class Part:
-    """A surface of a scene: its name, its radio material, and its mesh."""
-
-    name: str
-    material: str
-    vertices_m: FloatArray
-    faces: IntArray
-
-
-def _parts(scene: Any) -> list[Part]:
-    """Surfaces of a ``sionna.rt.Scene``; corners that coincide are one vertex."""
-    surfaces, parts = scene_surfaces(scene), []
-    for index, name in enumerate(surfaces.names):
-        triangles = surfaces.triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]]
-        vertices, faces = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-        parts.append(Part(name, scene.objects[name].radio_material.name, vertices, faces.reshape(-1, 3)))
-    return parts
+def _parts(scene: Any) -> list[tuple[Surface, str]]:
+    """Surfaces of a ``sionna.rt.Scene``, each with its radio material."""
+    return [(surface, scene.objects[surface.name].radio_material.name) for surface in surfaces_of(scene)]
 
 
 def _loaded(source: Source, options: ExportOptions) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
@@ -81,7 +63,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     constants: dict[str, dict[str, float]] = {}
     slabs: dict[str, tuple[str, float]] = {}
     listed: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys(part.material for part in parts):
+    for name in dict.fromkeys(material for _, material in parts):
         material = scene.radio_materials[name]
         if absorbs(material):
             renamed[name], listed[ABSORBER] = ABSORBER, {"absorbs": True}
@@ -101,14 +83,14 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
             "conductivity_exponent": conductivity_exponent(material, frequency_hz),
             "follows_frequency": renamed[name] in slabs,
         }
-    files = dict[str, Part]()
-    for part in parts:
-        files[plain_name(part.name, ODD_IN_FILES, files)] = part
-    materials = {name: renamed[part.material] for name, part in files.items()}
+    files = dict[str, tuple[Surface, str]]()
+    for surface, material in parts:
+        files[plain_name(surface.name, ODD_IN_FILES, files)] = surface, material
+    materials = {name: renamed[material] for name, (_, material) in files.items()}
     with atomic_folder(out, options.replace) as folder:
         (folder / "meshes").mkdir()
-        for name, part in files.items():
-            mesh = trimesh.Trimesh(part.vertices_m, part.faces, process=False)
+        for name, (surface, _) in files.items():
+            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
             mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
         write_atomically(folder / XML, scene_xml(materials, constants, slabs))
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
@@ -133,13 +115,13 @@ def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, An
             roughnessFactor=1.0,
             doubleSided=True,
         )
-        for name in dict.fromkeys(part.material for part in parts)
+        for name in dict.fromkeys(material for _, material in parts)
     }
     scene = trimesh.Scene()
-    for part in parts:
-        mesh = trimesh.Trimesh(trimesh.transform_points(part.vertices_m, Y_UP), part.faces, process=False)
-        mesh.visual = trimesh.visual.TextureVisuals(material=materials[part.material])
-        scene.add_geometry(mesh, node_name=part.name, geom_name=part.name)
+    for surface, material in parts:
+        mesh = trimesh.Trimesh(trimesh.transform_points(surface.vertices_m, Y_UP), surface.faces, process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(material=materials[material])
+        scene.add_geometry(mesh, node_name=surface.name, geom_name=surface.name)
     write_atomically(out, bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=False)))
     return _counts(parts)
 
@@ -150,31 +132,30 @@ def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     Faces have colours, and the numbers of their ``material`` and ``surface``, whose names are in the header's comments.
     """
     parts = _parts(_loaded(source, options)[0])
-    names = list(dict.fromkeys(part.material for part in parts))
-    first = np.cumsum([0, *(len(part.vertices_m) for part in parts)])
-    count = [len(part.faces) for part in parts]
-    number = np.array([names.index(part.material) for part in parts])
-    vertices = np.concatenate([part.vertices_m for part in parts]).astype(np.float32)
-    faces = {
-        "vertex_indices": np.concatenate([part.faces + at for part, at in zip(parts, first, strict=False)]),
-        **{
-            key: np.repeat([_colour_bytes(part.material)[k] for part in parts], count).astype(np.uint8)
-            for k, key in RGB
-        },
-        "material": np.repeat(number, count),
-        "surface": np.repeat(np.arange(len(parts)), count),
-    }
-    integers = {key: v.astype(np.int32) if v.dtype.kind == "i" else v for key, v in faces.items()}
+    names = list(dict.fromkeys(material for _, material in parts))
+    first = np.cumsum([0, *(len(surface.vertices_m) for surface, _ in parts)])
+    count = [len(surface.faces) for surface, _ in parts]
+    number = np.array([names.index(material) for _, material in parts])
+    mesh = trimesh.Trimesh(
+        np.concatenate([surface.vertices_m for surface, _ in parts]),
+        np.concatenate([surface.faces + at for (surface, _), at in zip(parts, first, strict=False)]),
+        face_colors=np.repeat([_colour_bytes(material) for _, material in parts], count, axis=0).astype(np.uint8),
+        process=False,
+    )
+    mesh.face_attributes["material"] = np.repeat(number, count).astype(np.int32)
+    mesh.face_attributes["surface"] = np.repeat(np.arange(len(parts)), count).astype(np.int32)
     comments = ["metres, z up"]
     comments += [f"material {k} {name}" for k, name in enumerate(names)]
-    comments += [f"surface {k} {part.name}" for k, part in enumerate(parts)]
-    write_ply(out, {"vertex": table(dict(zip("xyz", vertices.T, strict=True))), "face": table(integers)}, comments)
+    comments += [f"surface {k} {surface.name}" for k, (surface, _) in enumerate(parts)]
+    header, end, content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False).partition(b"end_header")
+    lines = "".join(f"comment {one_line(comment)}\n" for comment in comments)
+    write_atomically(out, header + lines.encode() + end + content)
     return _counts(parts)
 
 
-def _counts(parts: list[Part]) -> dict[str, Any]:
+def _counts(parts: list[tuple[Surface, str]]) -> dict[str, Any]:
     return {
         "surfaces": len(parts),
-        "faces": sum(len(part.faces) for part in parts),
-        "materials": len({part.material for part in parts}),
+        "faces": sum(len(surface.faces) for surface, _ in parts),
+        "materials": len({material for _, material in parts}),
     }

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,20 +29,16 @@ class Source:
 
     Attributes:
         name: as given: a path or a name.
-        kinds: kinds that it may be, in the order of preference.
+        kind: what it is exported as: a run, a scene or a data set.
     """
 
     name: str
-    kinds: tuple[str, ...]
-
-    def of(self, kinds: Collection[str]) -> Source:
-        """The source as one of some kinds."""
-        return replace(self, kinds=tuple(kind for kind in self.kinds if kind in kinds)[:1])
+    kind: str
 
     @property
     def is_run(self) -> bool:
         """Whether it is a run folder."""
-        return self.kinds == (RUN,)
+        return self.kind == RUN
 
     @property
     def run(self) -> Run:
@@ -90,8 +85,8 @@ class Source:
         return scene_carrier(self.run.problem.record) if self.is_run else None
 
 
-def find_source(name: str | Path) -> Source:
-    """Recognise a source.
+def kinds_of(name: str | Path) -> tuple[str, ...]:
+    """Kinds that a source may be of, in the order of preference.
 
     A folder is a run if it holds ``config.yaml``, else a scene if it holds ``scene.yml``, else a data set. A file is a
     scene or a data set by its ending.
@@ -102,7 +97,7 @@ def find_source(name: str | Path) -> Source:
     path, text = Path(name), str(name)
     if path.is_dir():
         kind = RUN if (path / CONFIG).exists() else SCENE if (path / FACTS_FILE).exists() else DATASET
-        return Source(text, (kind,))
+        return (kind,)
     if path.is_file():
         kinds = {SCENE: path.suffix.lower() in (".xml", *MESHES), DATASET: is_data(path)}
     else:
@@ -113,4 +108,4 @@ def find_source(name: str | Path) -> Source:
         raise InputError(
             f"{name}: {'a file of another kind' if path.exists() else 'no such file or name'}; give {ways}"
         )
-    return Source(text, tuple(kind for kind, fits in kinds.items() if fits))
+    return tuple(kind for kind, fits in kinds.items() if fits)

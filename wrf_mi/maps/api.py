@@ -19,6 +19,8 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     ({'receiver': 1, 'y': 8, 'x': 10}, 'dBm')
     >>> bool((dataset["coverage_probability"] <= 1).all())
     True
+    >>> int(wrf_mi.run_reliability(run.folder).count.sum())  # 10 test rows and 9 thresholds
+    90
     >>> wrf_mi.write_map(dataset, folder / "map.nc").name
     'map.nc'
     >>> shutil.rmtree(folder)
@@ -33,15 +35,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core import InputError
-from ..core.carriers import FREQUENCY, carriers_text
+from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
-from .dataset import map_dataset
-from .grid import Grid, area_of, check_height, grid_over, usual_height, warn_of_points_outside
-from .packages import maps_package
-from .surface import SurfaceMesh, surface_of
+from .dataset import map_dataset, maps_package
+from .grid import (
+    Grid,
+    SurfaceMesh,
+    area_of,
+    check_height,
+    grid_over,
+    surface_of,
+    usual_height,
+    warn_of_points_outside,
+)
 from .values import HEADINGS, Conditions, map_values
 
 if TYPE_CHECKING:
@@ -63,7 +72,6 @@ def radio_map(
     heading_deg: float | None = None,
     frequency_hz: float | None = None,
     on_progress: OnProgress = quiet,
-    chunk_size: int | None = None,
 ) -> xarray.Dataset:
     """What the receivers of a run receive from a transmitter at the positions of a plane or a mesh.
 
@@ -81,7 +89,6 @@ def radio_map(
         heading_deg: yaw of the transmitter; None: models that know it are averaged over 8 headings.
         frequency_hz: carrier, where the data have several.
         on_progress: progress callback: stage and fraction done.
-        chunk_size: positions that are predicted together; None: at most 10,000, fewer of large observations.
 
     Returns:
         Dataset as `wrf_mi.maps.dataset.map_dataset` describes it; ``docs/maps.md`` defines the variables.
@@ -98,9 +105,8 @@ def radio_map(
     if task.level_kind != "relative" and threshold_dbm is None:
         threshold_dbm = THRESHOLD_DBM
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
-    _check_carrier(opened, frequency_hz)
     places = _places(opened, height_m, step_m, surface)
-    values = map_values(opened, places.positions_m, numbers, conditions, on_progress, chunk_size)
+    values = map_values(opened, places.positions_m, numbers, conditions, on_progress)
     unit = "dB" if task.level_kind == "relative" else "dBm"
     attributes = _attributes(opened, task, conditions, heading_deg) | {"receiver_numbers": list(numbers)}
     return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
@@ -125,16 +131,6 @@ def _check(
     if task.level_kind == "relative" and transmit_dbm:
         text = f"its {task.name} observations state no power in dBm"
         raise InputError(f"{run.folder}: {text}; omit the transmit power")
-
-
-def _check_carrier(run: Run, frequency_hz: float | None) -> None:
-    known = run.problem.record.carriers_hz
-    if frequency_hz is None and known is not None and run.model.several_carriers:
-        raise InputError(f"{run.folder}: its data have {carriers_text(known)}; give the frequency of the map")
-    if frequency_hz is not None and not (np.isfinite(frequency_hz) and frequency_hz > 0):
-        raise InputError(f"frequency {frequency_hz:g} Hz: give a positive number")
-    if frequency_hz is not None and known is None:
-        raise InputError(f"{run.folder}: its data have one carrier; omit the frequency")
 
 
 def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:

@@ -97,22 +97,6 @@ def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) 
 
     Raises:
         InputError: not a finished run, or its model states no standard deviation.
-
-    Kriging of noise of 3 dB states nearly calibrated probabilities:
-
-    >>> import shutil, tempfile
-    >>> import wrf_mi
-    >>> rng = np.random.default_rng(0)
-    >>> receiver = wrf_mi.Receiver("anchor1", np.zeros(3), np.array([0.0, 0, 0, 1]))
-    >>> positions_m, rows = rng.uniform(1, 5, (150, 3)), np.arange(150)
-    >>> strengths = -40 - 20 * np.log10(np.linalg.norm(positions_m, axis=1))[None] + rng.normal(0, 3, (1, 150))
-    >>> known = {"frequencies_hz": np.array([2.44e9]), "official": (rows[:80], rows[80:])}
-    >>> record = wrf_mi.Record("made-up", "rssi", positions_m, (receiver,), strengths, **known)
-    >>> folder = tempfile.mkdtemp()
-    >>> run = wrf_mi.train(record, f"{folder}/run", "kriging", intervals=True)
-    >>> bool(run_reliability(run.folder).error < 0.1)
-    True
-    >>> shutil.rmtree(folder)
     """
     results = read_run(folder)
     if results.std is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,16 +12,57 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver
 from ..core.files import atomic_file, atomic_folder, os_failure
-from .grid import Grid
-from .packages import CSV, NETCDF, PACKAGES, ZARR, maps_package, require_packages
-from .surface import SurfaceMesh
-from .variables import BEST, LEVELS, POWER, VARIABLES
+from .grid import Grid, SurfaceMesh
 
 if TYPE_CHECKING:
     import xarray
 
+POWER, BEST = "power_dbm", "best_receiver"
+VARIABLES = {
+    POWER: ("dBm", "expected received power"),
+    "power_std_db": ("dB", "standard deviation of the received power"),
+    "coverage_probability": ("1", "probability that the received power exceeds the threshold"),
+    "path_gain_db": ("dB", "path gain, gains of both antennas included"),
+    "traced_share": ("dBm", "received power that the traced side of the model states alone"),
+    "learned_share": ("dBm", "received power that the learned side of the model states alone"),
+    "share_difference_db": ("dB", "traced share less learned share"),
+    "delay_spread_s": ("s", "root mean square delay spread of the traced paths"),
+    "azimuth_spread_deg": ("degree", "circular standard deviation of the azimuth of arrival of the paths"),
+    "k_factor_db": ("dB", "power of the strongest traced path over that of all others"),
+}
+"""Variables of each receiver and position, in the order of a file: unit in the notation of UDUNITS, but for powers in
+decibels, which name theirs as CF does, and description. A map has those that its model states.
+"""
+LEVELS = (POWER, "traced_share", "learned_share")
+"""Variables in the unit of the task's level."""
+NETCDF, ZARR, CSV = ".nc", ".zarr", ".csv"
+# h5netcdf is imported without the h5py that it needs to open a file.
+PACKAGES = {NETCDF: ("xarray", "h5netcdf", "h5py"), ZARR: ("xarray", "zarr"), CSV: ("xarray", "pandas")}
+"""Suffixes of files, and the packages that write each."""
 CONVENTIONS = "CF-1.11"
 COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
+
+
+def maps_package(name: str, extra: str = "maps") -> Any:
+    """A package that maps need, installed by an extra of this one.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        raise InputError(f"radio maps need {name}: pip install 'wrf-mi[{extra}]'") from None
+
+
+def require_packages(path: Path, extra: str = "maps") -> None:
+    """Refuse a map file whose packages are not installed; any suffix but ``.zarr`` and ``.csv`` is NetCDF.
+
+    Raises:
+        InputError: naming the first package that is missing.
+    """
+    for name in PACKAGES.get(path.suffix.lower(), PACKAGES[NETCDF]):
+        maps_package(name, extra)
 
 
 def check_map_file(out: Path) -> None:
@@ -85,34 +127,27 @@ def map_dataset(
         coordinates["axis"] = "axis", list("xyz")
         corners = places.triangles_m.astype(np.float32)
         data["triangle"] = ("point", "corner", "axis"), corners, _metres("corners of the triangle around each point")
-    for name, variable in VARIABLES.items():
+    for name, (units, long_name) in VARIABLES.items():
         if name in values:
-            described = {"units": variable.units, "long_name": variable.long_name}
-            if name in LEVELS and level_unit != variable.units:
-                described = {"units": level_unit, "long_name": f"{variable.long_name}, relative to full scale"}
+            described = {"units": units, "long_name": long_name}
+            if name in LEVELS and level_unit != units:
+                described = {"units": level_unit, "long_name": f"{long_name}, relative to full scale"}
             data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), described
-    data[BEST] = dims, _best(values[POWER]).reshape(shape), _best_attributes(receivers)
+    power = values[POWER]
+    known = np.where(np.isfinite(power), power, -np.inf)
+    best = np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
+    flags: dict[str, Any] = {
+        "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
+        "flag_values": np.arange(-1, len(receivers), dtype=np.int32),
+        # Meanings are separated by spaces.
+        "flag_meanings": " ".join(["none", *("_".join(receiver.name.split()) for receiver in receivers)]),
+    }
+    data[BEST] = dims, best.reshape(shape), flags
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
 
 
 def _metres(long_name: str) -> dict[str, str]:
     return {"units": "m", "long_name": f"{long_name} in the frame of the data"}
-
-
-def _best(power: NDArray[Any]) -> NDArray[np.int32]:
-    """Number of the receiver of the highest power [m], -1 where none has one."""
-    known = np.where(np.isfinite(power), power, -np.inf)
-    return np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
-
-
-def _best_attributes(receivers: Sequence[Receiver]) -> dict[str, Any]:
-    # Meanings are separated by spaces.
-    names = ["_".join(receiver.name.split()) for receiver in receivers]
-    return {
-        "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
-        "flag_values": np.arange(-1, len(names), dtype=np.int32),
-        "flag_meanings": " ".join(["none", *names]),
-    }
 
 
 def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:

@@ -1,16 +1,25 @@
-"""Regular horizontal grids of transmitter positions over the area of a run."""
+"""Positions of transmitters: a grid over the area of a run, candidates on it, or the centres of the faces of a mesh."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
+from ..backend.device import to_vectors
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..runs.folder import load_rows
 from ..runs.run import Run
+from ..scene.coordinates import require_near
+from ..scene.surfaces import mesh_parts
 
 logger = logging.getLogger(__name__)
 
@@ -18,8 +27,17 @@ LARGEST = 10_000_000
 """Largest number of positions of a grid: 240 MB of coordinates."""
 MARGIN_M = 0.5
 """Margin around transmitter positions where no scene states the area."""
+ROUNDS = 20
+"""Largest number of times that an edge is halved: a kilometre into millimetres."""
 MOUNTED_M = 0.02
 """Distance from a surface up to which a receiver is taken to lie before it."""
+
+CANDIDATE_STEP_M = 0.25
+"""Least distance of neighbouring candidates by default."""
+USUAL_CANDIDATES, MOST_CANDIDATES = 4000, 10_000
+"""Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between
+all of them take 0.8 GB.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,6 +61,22 @@ class Grid:
         return np.stack([x.ravel(), y.ravel(), np.full(x.size, self.height_m)], axis=-1)
 
 
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """Triangles at whose centres a map is computed.
+
+    Attributes:
+        triangles_m: corners of the triangles [m, 3, 3], metres.
+    """
+
+    triangles_m: FloatArray
+
+    @property
+    def positions_m(self) -> FloatArray:
+        """Centres of the triangles [m, 3], metres."""
+        return np.asarray(self.triangles_m.mean(axis=1))
+
+
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
     """Grid over a rectangle: square cells from its lower corner on, whose centres lie in it.
 
@@ -58,8 +92,7 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
     Raises:
         InputError: a step that is not positive and finite, or more than `LARGEST` positions.
     """
-    if not (np.isfinite(step_m) and step_m > 0):
-        raise InputError(f"step {step_m:g} m: give a positive number of metres")
+    _check_step(step_m)
     low = np.asarray(low_m, float)[:2]
     size = np.maximum(np.asarray(high_m, float)[:2] - low, 0.0)
     # The tolerance keeps a centre that rounding alone puts inside off the upper side, which is a wall.
@@ -72,6 +105,41 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
         for start, extent, count in zip(low, size, counts, strict=True)
     )
     return Grid(x, y, float(height_m))
+
+
+def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
+    """Triangles of a mesh file, halved until no edge is longer than a step.
+
+    Args:
+        mesh: a format of `wrf_mi.scene.surfaces.mesh_parts`, in metres and the frame of the data.
+        step_m: longest edge of a triangle, metres; None: the faces as they are.
+
+    Raises:
+        InputError: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
+    """
+    if not Path(mesh).is_file():
+        raise InputError(f"{mesh}: no such file; give a mesh (PLY, STL, OBJ, GLB)")
+    parts = [np.asarray(part.triangles, float) for part in mesh_parts(mesh)]
+    if not parts:
+        raise InputError(f"{mesh}: no faces; give a mesh with triangles")
+    triangles = np.concatenate(parts)
+    require_near(triangles.reshape(-1, 3), mesh)
+    if step_m is not None:
+        _check_step(step_m)
+        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(axis=1)
+        # Each halving makes four triangles of one.
+        count = (4.0 ** np.ceil(np.log2(np.maximum(edges / step_m, 1)))).sum()
+        if count > LARGEST:
+            raise InputError(f"step {step_m:g} m: {count:.3g} triangles, the limit is {LARGEST}; give a larger step")
+        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+        vertices, faces = trimesh.remesh.subdivide_to_size(triangles.reshape(-1, 3), faces, step_m, max_iter=ROUNDS)
+        triangles = vertices[faces]
+    return SurfaceMesh(triangles)
+
+
+def _check_step(step_m: float) -> None:
+    if not (np.isfinite(step_m) and step_m > 0):
+        raise InputError(f"step {step_m:g} m: give a positive number of metres")
 
 
 def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,6 +165,14 @@ def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
         return float(np.median(heights))
     low, high = area_of(run, tx_pos_m)
     return float(low[2] + high[2]) / 2
+
+
+def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3], metres, that are not in a solid object of a ``sionna.rt.Scene``."""
+    from ..tracing.devices import solid_around  # the tracer is imported where there is a scene
+    from ..tracing.surfaces import scene_surfaces
+
+    return solid_around(scene_surfaces(scene), positions_m) < 0
 
 
 def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
@@ -138,10 +214,79 @@ def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
     """Whether a surface lies above, or below, every one of some positions [3], metres."""
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
-
     up = 1 if above else -1
     # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.devices.before_walls`).
     start = np.stack(positions_m) - np.array([0.0, 0.0, up * MOUNTED_M])
     ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
     return bool(np.all(np.array(scene.mi_scene.ray_test(ray), bool)))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Positions that a transmitter may have.
+
+    Attributes:
+        grid: grid over the area's rectangle.
+        inside: positions of the grid that are candidates [ny * nx].
+    """
+
+    grid: Grid
+    inside: NDArray[np.bool_]
+
+    @cached_property
+    def positions_m(self) -> FloatArray:
+        """Positions of the candidates [p, 3], metres."""
+        return self.grid.positions_m[self.inside]
+
+    @cached_property
+    def distance_m(self) -> FloatArray:
+        """Distances between all candidates [p, p], metres."""
+        return np.asarray(cdist(self.positions_m, self.positions_m))
+
+    @property
+    def cell_m2(self) -> float:
+        """Area of a candidate's cell, square metres."""
+        steps = [axis[1] - axis[0] for axis in (self.grid.x_m, self.grid.y_m) if len(axis) > 1]
+        return float(steps[0] ** 2) if steps else 0.0
+
+    def nearest(self, positions_m: FloatArray) -> NDArray[np.intp]:
+        """Index of the candidate that is nearest in the plan to each position [m, 2 or more]."""
+        return np.argmin(cdist(positions_m[:, :2], self.positions_m[:, :2]), axis=1)
+
+
+def candidates_of(run: Run, step_m: float | None = None, height_m: float | None = None) -> Candidates:
+    """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
+
+    Args:
+        run: a finished run.
+        step_m: distance between neighbours; None: `CANDIDATE_STEP_M`, more for large areas.
+        height_m: their height; None: the median of the training rows.
+
+    Raises:
+        InputError: a step that is not positive or too small, no candidate, or neither scene nor known positions.
+    """
+    scene, record = run.problem.opened_scene, run.problem.record
+    known = record.tx_pos_m[load_rows(run.folder, record).all_train]
+    low, high = area_of(run, known)
+    if step_m is None:
+        step_m = max(CANDIDATE_STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL_CANDIDATES)))
+    height = usual_height(run, known) if height_m is None else height_m
+    check_height(run, height, known)
+    grid = grid_over(low, high, step_m, height)
+    inside = np.ones(len(grid.x_m) * len(grid.y_m), bool) if scene is None else inside_scene(scene, grid.positions_m)
+    if not inside.any():
+        remedy = "give another --height" if height_m is not None else "give --height"
+        raise InputError(f"{run.folder}: no position {grid.height_m:g} m high is over a floor of the scene; {remedy}")
+    if inside.sum() > MOST_CANDIDATES:
+        text = f"{inside.sum()} candidate positions, the limit is {MOST_CANDIDATES}"
+        raise InputError(f"step {step_m:g} m: {text}; give a larger step")
+    return Candidates(grid, inside)
+
+
+def inside_scene(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3] with a surface below them, and not in a solid (``sionna.rt.Scene``)."""
+    import mitsuba as mi
+
+    origin = to_vectors(positions_m, mi.Point3f)
+    below = np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, mi.Vector3f(0, 0, -1))), bool)
+    return below & outside_solids(scene, positions_m)

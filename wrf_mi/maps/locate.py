@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import softmax
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -21,9 +22,9 @@ from ..runs.folder import load_rows
 from ..runs.run import Run, open_run
 from ..tasks import task_of
 from ..training.session import Interrupted, OnProgress, quiet
-from .locate_area import Candidates, candidates_of
+from .grid import Candidates, candidates_of
 from .locate_calibration import LEVEL, Calibration, calibration_of, headings_of, predict_candidates
-from .locate_posterior import probabilities, region_of
+from .locate_likelihood import region_of
 
 
 @dataclass(frozen=True)
@@ -173,17 +174,16 @@ def locate(
     likelihood = calibration.likelihood
     if offset_db is not None:
         likelihood = replace(likelihood, offset_db=offset_db)
-    count, (m, p) = observed.shape[1], (observed.shape[1], len(candidates.positions_m))
+    m, p = observed.shape[1], len(candidates.positions_m)
     estimate, radius = np.full((m, 3), candidates.grid.height_m), np.empty(m)
     probability, inside = np.empty((m, p), np.float32), np.empty((m, p), bool)
     for number, strengths in enumerate(observed.T):
         if stop():
-            raise Interrupted(f"stopped after {number} of {count} positions; nothing is written")
-        found = probabilities(likelihood.log(strengths, predicted.mean_dbm, predicted.std_db))
-        region = region_of(found, candidates.distance_m, candidates.positions_m, level)
-        estimate[number, :2], radius[number] = region.estimate_m, region.radius_m
-        probability[number], inside[number] = found, region.inside
-        session.report("locating", (number + 1) / count)
+            raise Interrupted(f"stopped after {number} of {m} positions; nothing is written")
+        probability[number] = found = softmax(likelihood.log(strengths, *predicted))
+        best, radius[number], inside[number] = region_of(found, candidates.distance_m, level)
+        estimate[number, :2] = candidates.positions_m[best, :2]
+        session.report("locating", (number + 1) / m)
     area = inside.sum(axis=1) * candidates.cell_m2
     near = None
     if calibration.neighbours is not None:

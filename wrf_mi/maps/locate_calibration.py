@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 from scipy.stats import norm
 from scipy.stats import t as student_t
 from sklearn.linear_model import LogisticRegression
@@ -33,15 +34,13 @@ from ..models.held_out import fit_fold, hold_out, labelled
 from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
-from .locate_area import Candidates
+from .grid import Candidates
 from .locate_knn import Neighbours, choose_neighbours
-from .locate_likelihood import Likelihood, Silence
-from .locate_posterior import densest, probabilities, region_of
+from .locate_likelihood import Likelihood, Silence, region_of
+from .values import HEADINGS
 
 logger = logging.getLogger(__name__)
 
-HEADINGS = 8
-"""Headings over which the likelihood is averaged."""
 DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
 """Forms of the likelihood to choose from."""
 WIDE = 0.95
@@ -79,33 +78,28 @@ class Calibration:
     scores: dict[str, float] | None = None
 
 
-@dataclass(frozen=True)
-class Predicted:
-    """Predictions at all candidates: means and standard deviations [headings, n_rx, p], dBm and dB."""
-
-    mean_dbm: NDArray[np.float32]
-    std_db: NDArray[np.float32]
-
-
 def predict_candidates(
     fitted: Fitted, count: int, headings: int, candidates: Candidates, report: Callable[[float], None]
-) -> Predicted:
+) -> NDArray[np.float32]:
     """Predictions of a fitted model for all its receivers, ``count``, at equally spaced headings where it uses them.
+
+    Returns:
+        Means in dBm and standard deviations in dB [2, headings, n_rx, p].
 
     Raises:
         InputError: the model states no standard deviation.
     """
     positions = candidates.positions_m
-    mean, std = np.empty((2, headings, count, len(positions)), np.float32)
+    predicted = np.empty((2, headings, count, len(positions)), np.float32)
     for number in range(headings):
         turned = np.full(len(positions), 2 * np.pi * number / headings) if headings > 1 else None
         for receiver in range(count):
             found = fitted.predict(Inputs(positions, turned), receiver)
             if found.std is None:
                 raise InputError("its model states no standard deviation; train it with --intervals")
-            mean[number, receiver], std[number, receiver] = found.mean, found.std
+            predicted[:, number, receiver] = found.mean, found.std
             report((number * count + receiver + 1) / (headings * count))
-    return Predicted(mean, std)
+    return predicted
 
 
 def headings_of(run: Run) -> int:
@@ -118,10 +112,10 @@ def headings_of(run: Run) -> int:
 @dataclass(frozen=True)
 class Located:
     """Held-out rows of a fold: predictions at the receivers of the given numbers, which have enough training rows in
-    the fold; rows of the record [m], and the candidate nearest to each [m].
+    the fold (`predict_candidates`); rows of the record [m], and the candidate nearest to each [m].
     """
 
-    predicted: Predicted
+    predicted: NDArray[np.float32]
     receivers: IntArray
     rows: IntArray
     truth: IntArray
@@ -145,7 +139,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
             if stored.pop("key") == key:
                 return _restored(stored)
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
-    folds = folds_of(record, split) if len(run.problem.rows(split)) else []
+    folds = folds_of(record, split)
     if not folds:
         return Calibration(Likelihood())
     parts, headings, place = [], headings_of(run), run.folder / FOLDER
@@ -154,7 +148,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
         label = f"calibrating, fold {number + 1} of {len(folds)}"
         report = partial(session.report, f"{label}: map")
         arrays = stored_arrays(kept) if kept.exists() else {}
-        if "receivers" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
+        if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
             folder = place / f"fold{number}"
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -163,15 +157,13 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
                 fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
                 found = predict_candidates(fitted, len(numbers), headings, candidates, report)
             shutil.rmtree(folder)
-            arrays = {"mean": found.mean_dbm, "std": found.std_db, "positions_m": candidates.positions_m}
-            arrays["receivers"] = numbers
+            arrays = {"predicted": found, "positions_m": candidates.positions_m, "receivers": numbers}
             write_arrays(kept, arrays)
         receivers = arrays["receivers"]
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         most = max(1, MOST_ROWS // len(folds))
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
-        predicted, nearest = Predicted(arrays["mean"], arrays["std"]), candidates.nearest(record.tx_pos_m[test])
-        parts.append(Located(predicted, receivers, test, nearest))
+        parts.append(Located(arrays["predicted"], receivers, test, candidates.nearest(record.tx_pos_m[test])))
     neighbours, error_m = choose_neighbours(record, folds)
     chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
     chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
@@ -234,11 +226,10 @@ def choose(
     errors, inside = [], []
     for part in parts:
         for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
-            log = best.log(_strengths(record, part, row), part.predicted.mean_dbm, part.predicted.std_db)
-            found = probabilities(log)
-            region = region_of(found, candidates.distance_m, candidates.positions_m, LEVEL)
-            errors.append(np.linalg.norm(region.estimate_m - place[:2]))
-            inside.append(densest(found, LEVEL)[truth])
+            found = softmax(best.log(_strengths(record, part, row), *part.predicted))
+            estimate, _, region = region_of(found, candidates.distance_m, LEVEL)
+            errors.append(np.linalg.norm((candidates.positions_m[estimate] - place)[:2]))
+            inside.append(region[truth])
     report(1.0)
     return Calibration(best, None, len(errors), float(np.mean(errors)), float(np.mean(inside)), scores=scores)
 
@@ -278,14 +269,14 @@ def _scores(record: Record, part: Located, form: Likelihood, candidates: Candida
     """Log posterior density [m] at the true positions of held-out rows, per square metre."""
     found = []
     for row, truth in zip(part.rows, part.truth, strict=True):
-        log = form.log(_strengths(record, part, row), part.predicted.mean_dbm, part.predicted.std_db)
+        log = form.log(_strengths(record, part, row), *part.predicted)
         found.append(log[truth] - np.logaddexp.reduce(log))
     return np.asarray(found) - np.log(candidates.cell_m2 or 1.0)
 
 
 def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
     """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
-    mean = np.concatenate([part.predicted.mean_dbm[:, :, part.truth].mean(axis=0).ravel() for part in parts])
+    mean = np.concatenate([part.predicted[0][:, :, part.truth].mean(axis=0).ravel() for part in parts])
     heard = [np.isfinite(record.observation[part.receivers][:, part.rows]).ravel() for part in parts]
     received = np.concatenate(heard)
     if received.all() or not received.any():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import trimesh
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -16,6 +15,7 @@ from ..core.angles import FloatArray
 from ..runs.run import Run
 from .locate import Positions
 from .locate_file import posterior_arrays
+from .picture import scene_cuts
 
 SHOWN, COLUMNS = 6, 3
 """Number of rows that are drawn, and panels side by side."""
@@ -35,15 +35,15 @@ def draw_positions(run: Run, found: Positions, true_m: FloatArray | None = None)
     rows = np.unique(np.linspace(0, len(found) - 1, min(SHOWN, len(found))).round().astype(int))
     columns = min(COLUMNS, len(rows))
     lines = -(-len(rows) // columns)
-    arrays, walls = posterior_arrays(found), _plan(run, found.candidates.grid.height_m)
+    arrays, walls = posterior_arrays(found), scene_cuts(run, found.candidates.grid.height_m)
     size = np.array([np.ptp(arrays["x_m"]), np.ptp(arrays["y_m"])]) + 1.0
     height = 3.6 * float(np.clip(size[1] / size[0], 0.4, 2.0)) + 0.6
     figure = Figure(figsize=(3.6 * columns + 0.3, height * lines + 0.5), layout="constrained", facecolor="white")
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes, row in zip(panels, rows, strict=False):
         _draw_row(axes, arrays, found, int(row), true_m)
-        if walls is not None:
-            axes.add_collection(LineCollection(list(walls), colors="0.35", linewidths=1.2))
+        for lines_m in walls:
+            axes.add_collection(LineCollection(list(lines_m), colors="0.35", linewidths=1.2))
         place = np.stack([receiver.position_m[:2] for receiver in run.receivers])
         axes.plot(*place.T, "^", color="tab:blue", markersize=6, markeredgecolor="white")
         for grid_m, set_limits in ((arrays["x_m"], axes.set_xlim), (arrays["y_m"], axes.set_ylim)):
@@ -97,16 +97,3 @@ def _legend(found: Positions, with_truth: bool) -> list[Any]:
         handles.append(Line2D([], [], marker="+", color=TRUTH, markeredgewidth=2, label="true position", **dot))
     handles.append(Line2D([], [], marker="^", color="tab:blue", label="receiver", **dot))
     return handles
-
-
-def _plan(run: Run, height_m: float) -> FloatArray | None:
-    """Walls of the scene cut at a height, end points [n, 2, 2]; None without a scene."""
-    scene = run.problem.opened_scene
-    if scene is None:
-        return None
-    from ..tracing.surfaces import scene_surfaces
-
-    corners = scene_surfaces(scene).triangles.reshape(-1, 3)
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height_m])
-    return np.asarray(cut[..., :2]) if len(cut) else None

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
-from io import StringIO
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core import DataFault, InputError, Receiver
+from ..core import DataFault, Receiver
 from ..core.angles import FloatArray
-from ..core.files import one_line, write_atomically
+from ..core.files import one_line, write_csv
 from ..core.receivers import SHOWN
 from ..datasets.folder_files import CsvTable, read_csv
 from ..runs.folder import load_rows
@@ -25,20 +23,9 @@ DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
 """Columns are ``<receiver>_dbm``, or ``rssi_<receiver>``, where the name of ``anchor<number>`` is its number."""
 
 
-@dataclass(frozen=True)
-class Observations:
-    """Signal strengths of m transmitters.
-
-    Attributes:
-        value_dbm: [n_rx, m], NaN where nothing was received.
-        true_m: true positions [m, 2], metres; None where unknown.
-    """
-
-    value_dbm: FloatArray
-    true_m: FloatArray | None = None
-
-
-def read_observations(path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = ()) -> Observations:
+def read_observations(
+    path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = ()
+) -> tuple[FloatArray, FloatArray | None]:
     """Read the signal strengths of each receiver from a CSV file with a header.
 
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
@@ -49,6 +36,9 @@ def read_observations(path: str | Path, receivers: Sequence[Receiver], left_out:
         path: the file.
         receivers: receivers of the run.
         left_out: names of receivers whose columns are ignored.
+
+    Returns:
+        Signal strengths [n_rx, m], NaN where nothing was received, and true positions [m, 2], metres, or None.
 
     Raises:
         InputError: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver,
@@ -71,7 +61,7 @@ def read_observations(path: str | Path, receivers: Sequence[Receiver], left_out:
     stated = [axis for axis in "xy" if axis in table.header]
     if len(stated) == 1:
         raise DataFault(table.path, f"column {stated[0]} alone is no position; give x and y, or neither", line=1)
-    return Observations(values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None)
+    return values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None
 
 
 def _able(name: str) -> list[str]:
@@ -93,18 +83,12 @@ def _column(table: CsvTable, name: str) -> str:
     return found[0]
 
 
-def test_observations(run: Run) -> Observations:
-    """The test rows of a run that were received, with their true positions."""
+def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Signal strengths of the test rows of a run that were received, and true positions, as `read_observations`."""
     record = run.problem.record
     rows = load_rows(run.folder, record).test
     rows = rows[np.isfinite(record.observation[:, rows]).any(axis=0)]
-    return Observations(np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float))
-
-
-def check_positions_file(out: Path) -> None:
-    """Refuse a file name that does not end in ``.csv``."""
-    if out.suffix.lower() != ".csv":
-        raise InputError(f"{out}: positions are written as .csv; give such a name")
+    return np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float)
 
 
 def write_positions_file(out: Path, found: Positions, true_m: FloatArray | None = None) -> Path:
@@ -121,12 +105,8 @@ def write_positions_file(out: Path, found: Positions, true_m: FloatArray | None 
     if true_m is not None:
         columns |= {"true_x": true_m[:, 0], "true_y": true_m[:, 1], "error_m": found.error_m(true_m)}
         columns["inside"] = found.covers(true_m).astype(int)
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([value if isinstance(value, np.integer) else round(float(value), 4) for value in row])
-    return write_atomically(out, text.getvalue())
+    rounded = [values if values.dtype.kind in "iu" else values.astype(float).round(4) for values in columns.values()]
+    return write_csv(out, columns, zip(*rounded, strict=True))
 
 
 def posterior_arrays(found: Positions) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Likelihood of received signal strengths at candidate positions of the transmitter.
+"""Likelihood of received signal strengths at candidate positions of the transmitter, and regions that hold it.
 
 The residual of receiver r, observation minus predicted mean, has the scale a s_r, where s_r is the standard deviation
 that the model states at the candidate position, and a Student-t distribution, whose tails are heavier than those of the
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, gammaln, log_expit, logsumexp
+from scipy.special import gammaln, log_expit, logsumexp
 
 from ..core.angles import FloatArray
 
@@ -44,10 +44,6 @@ class Silence:
     def log_silent(self, mean_dbm: NDArray[np.floating]) -> NDArray[np.floating]:
         """Logarithm of the probability that nothing is received, likewise."""
         return np.asarray(log_expit(-self.slope_per_db * (mean_dbm - self.middle_dbm)))
-
-    def received(self, mean_dbm: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Probability of reception, likewise."""
-        return np.asarray(expit(self.slope_per_db * (mean_dbm - self.middle_dbm)))
 
 
 @dataclass(frozen=True)
@@ -110,3 +106,34 @@ class Likelihood:
         n = self.degrees
         constant = gammaln((n + 1) / 2) - gammaln(n / 2) - np.log(n * np.pi) / 2
         return np.asarray((constant - (n + 1) / 2 * np.log1p(square / n) - np.log(scale)).sum(axis=1))
+
+
+def region_of(probability: FloatArray, distance_m: FloatArray, level: float) -> tuple[int, float, NDArray[np.bool_]]:
+    """Estimate and regions of a transmitter.
+
+    Args:
+        probability: probabilities of the candidates [p], of sum 1.
+        distance_m: distances between all candidates [p, p], metres.
+        level: probability that the regions hold.
+
+    Returns:
+        The candidate of the least expected distance from the transmitter (geometric median), the radius in metres of
+        the circle around it that holds the probability, and a mask [p] of the highest-density region.
+    """
+    best = int(np.argmin(distance_m @ probability))
+    order = np.argsort(distance_m[best], kind="stable")
+    return best, float(distance_m[best][order][_last(probability[order], level)]), densest(probability, level)
+
+
+def densest(probability: FloatArray, level: float) -> NDArray[np.bool_]:
+    """Mask of the fewest candidates [p] that hold a probability together."""
+    order = np.argsort(-probability, kind="stable")
+    inside = np.zeros(len(probability), bool)
+    inside[order[: _last(probability[order], level) + 1]] = True
+    return inside
+
+
+def _last(probability: FloatArray, level: float) -> int:
+    """Index of the first of ordered candidates at which a probability is reached."""
+    reached = np.cumsum(probability) >= level * (1 - 1e-12)
+    return int(np.argmax(reached)) if reached.any() else len(probability) - 1

@@ -26,7 +26,7 @@ from ..runs.scene_view import surfaces_of
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
 from ..scene.surfaces import cut_lines
 from ..tasks import task_of
-from .variables import POWER
+from .dataset import POWER
 
 if TYPE_CHECKING:
     import xarray
@@ -80,7 +80,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
-    walls = _walls(run, float(dataset["height"])) if flat else []
+    walls = scene_cuts(run, float(dataset["height"])) if flat else []
     strongest = np.fmax.reduce(power, axis=0)
     for place, (axes, (name, number)) in enumerate(zip(grid.flat, panels, strict=False)):
         values = strongest if number is None else power[number]
@@ -137,8 +137,8 @@ def _aspect(dataset: xarray.Dataset) -> float:
     return float(np.clip(y / x, 0.3, 1.6))
 
 
-def _walls(run: Run, height_m: float) -> Sequence[FloatArray]:
-    """Cuts [n, 2, 2] of the surfaces of a run's scene at a height."""
+def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
+    """Lines [n, 2, 2] in which a height cuts each surface of a run's scene, metres; empty without a scene."""
     scene = run.problem.opened_scene
     return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
 

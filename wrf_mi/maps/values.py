@@ -17,8 +17,9 @@ from ..models import Inputs
 from ..receivers.spreads import PathStatistics
 from ..runs.run import Run
 from ..tasks import task_of
-from ..training.session import OnProgress, quiet
+from ..training.session import OnProgress
 from .coverage import coverage_probability
+from .grid import outside_solids
 
 CHUNK_SIZE = 10_000
 """Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
@@ -27,20 +28,17 @@ CHUNK_BYTES = 1 << 28
 VALUE_BYTES = 32
 """Of each value of an observation: mean and standard deviation in float64, and a copy of each."""
 HEADINGS = 8
-"""Headings over which predictions are averaged where none is given, evenly over the circle."""
+"""Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
 
 Arrays = dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What holds at all positions of a map.
+    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`.
 
     Attributes:
-        threshold_db: level above which a position is covered; None: coverage is not computed.
-        transmit_dbm: transmit power, antenna gains excluded, dBm.
         headings_rad: headings of the transmitter that are averaged over; empty: the model does not know it.
-        frequency_hz: carrier, where the data have several; else None.
     """
 
     threshold_db: float | None
@@ -54,28 +52,20 @@ def map_values(
     positions_m: FloatArray,
     receivers: Sequence[int],
     conditions: Conditions,
-    on_progress: OnProgress = quiet,
-    chunk_size: int | None = None,
+    on_progress: OnProgress,
 ) -> Arrays:
-    """Values of all variables of a map that a run's model states.
-
-    Args:
-        run: run of one split.
-        positions_m: positions of the transmitter [m, 3], metres.
-        receivers: numbers of the receivers.
-        conditions: threshold, transmit power, headings and carrier.
-        on_progress: progress callback.
-        chunk_size: positions in a chunk; None: as memory permits.
+    """Values of all variables of a map that a run's model states at positions [m, 3] in metres.
 
     Returns:
-        Arrays [receivers, m] by the names of `wrf_mi.maps.variables.VARIABLES`; NaN inside solid objects of the scene.
+        Arrays [receivers, m] by the names of `wrf_mi.maps.dataset.VARIABLES`; NaN inside solid objects of the scene.
 
     Raises:
         InputError: inputs that the model does not predict from.
     """
-    size = chunk_size or _chunk_size(run, len(conditions.headings_rad))
+    size = _chunk_size(run, len(conditions.headings_rad))
     found: Arrays = {}
-    outside = _outside_solids(run, positions_m)
+    scene = run.problem.opened_scene
+    outside = np.ones(len(positions_m), bool) if scene is None else outside_solids(scene, positions_m)
     with _each_warning_once():
         for start in range(0, len(positions_m), size):
             rows = start + np.flatnonzero(outside[start : start + size])
@@ -96,17 +86,6 @@ def _chunk_size(run: Run, headings: int) -> int:
     size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * values))
     size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
     return max(1, size // max(headings, 1))
-
-
-def _outside_solids(run: Run, positions_m: FloatArray) -> NDArray[np.bool_]:
-    """Mask of positions that are not in a solid object of the scene."""
-    scene = run.problem.opened_scene
-    if scene is None:
-        return np.ones(len(positions_m), bool)
-    from ..tracing.devices import solid_around  # the tracer is imported where there is a scene
-    from ..tracing.surfaces import scene_surfaces
-
-    return solid_around(scene_surfaces(scene), positions_m) < 0
 
 
 def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:

@@ -79,7 +79,6 @@ class Problem:
         scene: name, scene folder, Mitsuba XML or mesh, or None.
         material: material of a bare mesh, or None.
         antennas: patterns and polarisations in place of those of the data.
-        use_rows: whether training rows are used; False: the scene alone predicts.
         operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
         left_out: names of receivers that are left out of the data, as if they had not been there.
     """
@@ -90,7 +89,6 @@ class Problem:
     scene: str | None = None
     material: str | None = None
     antennas: AntennaOptions = AS_STATED
-    use_rows: bool = True
     operator: bool = True
     left_out: tuple[str, ...] = ()
 
@@ -138,7 +136,7 @@ class Problem:
 
     def rows(self, split: Split) -> IntArray:
         """Rows that a fit may use."""
-        return split.all_train if self.use_rows else np.zeros(0, np.int64)
+        return split.all_train
 
 
 @dataclass(frozen=True)
@@ -248,7 +246,6 @@ class Model:
         source: publication.
         scene: whether it takes a scene.
         uses_antennas: whether patterns and polarisations of antennas count in that scene.
-        scene_alone: whether a scene predicts without training rows.
         several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
         uplink: whether it predicts from the uplink.
         headings: whether it may predict from the transmitter's heading.
@@ -275,7 +272,6 @@ class Model:
     source: str
     scene: Literal["none", "optional", "required"] = "none"
     uses_antennas: bool = True
-    scene_alone: bool = False
     several_carriers: bool = False
     uplink: Literal["none", "optional", "required"] = "none"
     headings: bool = False

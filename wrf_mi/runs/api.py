@@ -130,15 +130,11 @@ def plan_run(
     found = _settings_of(chosen, settings, given)
     if "seed" in chosen.given:
         seed, deterministic = found.seed, found.deterministic
-    scene_only = n_train == 0 and chosen.scene_alone
-    if scene_only and scene is None:
-        raise InputError("--n-train 0: nothing to predict from; give training rows or a scene")
-    # Without training rows the split keeps them for the references, which need some.
-    record, splits, left_out = _split_rows(record, split, seed, None if scene_only else n_train)
+    record, splits, left_out = _split_rows(record, split, seed, n_train)
     for rows in splits:
         check_held_receivers(record, rows, chosen, MODELS.values())
         check_observations(record, rows, complete=chosen.complete)
-    problem = Problem(record, found, seed, scene_name, material, antennas, not scene_only)
+    problem = Problem(record, found, seed, scene_name, material, antennas)
     checked = with_intervals(chosen) if intervals else chosen
     if checked.check is not None:
         checked.check(problem, splits)
@@ -219,7 +215,7 @@ def train(
         receiver: ``"pixel"``, ``"array"`` or ``"auto"``, for models that have a choice.
         evaluation: evaluation of Gaussians, ``"splatted"`` or ``"traced"`` (`wrf_mi.graph.evaluations`).
         split: name of a split (``blocked`` fits every fold in turn and pools the scores), or the rows themselves.
-        n_train: number or fraction of the training rows to use; None: all; 0: none, where a scene alone predicts.
+        n_train: number or fraction of the training rows to use; None: all.
         seed: seed of split and fit.
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
@@ -243,11 +239,22 @@ def train(
     check_new(folder)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
-    traced: dict[str, Any] = {"scene": scene, "material": material, "antennas": antennas, "receiver": receiver}
-    rows: dict[str, Any] = {"split": split, "n_train": n_train, "seed": seed, "evaluation": evaluation}
-    fit: dict[str, Any] = {"settings": settings, "deterministic": deterministic, "progress": progress}
-    fit["intervals"] = intervals
-    problem, config, splits = plan_run(dataset, model, **traced, **rows, **fit)
+    problem, config, splits = plan_run(
+        dataset,
+        model,
+        scene=scene,
+        material=material,
+        antennas=antennas,
+        receiver=receiver,
+        evaluation=evaluation,
+        split=split,
+        n_train=n_train,
+        seed=seed,
+        settings=settings,
+        deterministic=deterministic,
+        intervals=intervals,
+        progress=progress,
+    )
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out)
     _warn_of_known_rows(problem, splits)
@@ -284,21 +291,20 @@ def resume(
     folder: str | Path,
     on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
-    scheduler: Scheduler | None = None,
     progress: bool = False,
     record: Record | None = None,
 ) -> Run:
     """Continue a stopped run; fitted parts are only scored again. Arguments as those of `train` and `open_run`.
 
     Raises:
-        InputError: not a run folder, one of version 0.1, or one that another process writes into.
+        InputError: not a run folder, or one that another process writes into.
         Interrupted: ``stop`` ended the run once more.
         BackendError: as `train`.
     """
     run = open_run(folder, record)
     if run.config.deterministic:
         init("llvm", threads=1)
-    session = Session(run.folder, run.folder, on_progress, stop, scheduler, progress)
+    session = Session(run.folder, run.folder, on_progress, stop, progress=progress)
     with locked_folder(run.folder):
         _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)

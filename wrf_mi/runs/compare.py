@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core import InputError
-from ..core.files import atomic_folder, write_atomically, write_figure
+from ..core.files import atomic_folder, write_atomically, write_csv, write_figure
 from ..training.session import OnProgress, quiet
 from . import figures
 from .compare_page import Section, page
 from .compare_pictures import pictures
 from .compare_tables import COLUMNS, DIFFERENCES, difference_rows, differences, score_rows
-from .results import Results, read_runs, write_csv
+from .results import Results, read_runs
 
 INDEX = "index.html"
 
@@ -51,9 +51,10 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             drawn += shown
             files = [(folder / name, title) for name, title, _ in shown]
             sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
-        write_csv(folder / "compare.csv", [row for section in sections for row in section.scores], list(COLUMNS))
-        found = [row for section in sections for row in difference_rows(section.differences)]
-        write_csv(folder / "differences.csv", found, list(DIFFERENCES))
+        tables = {"compare": (COLUMNS, [row for section in sections for row in section.scores])}
+        changes = [row for section in sections for row in difference_rows(section.differences)]
+        for name, (columns, rows) in (tables | {"differences": (DIFFERENCES, changes)}).items():
+            write_csv(folder / f"{name}.csv", columns, ([row[key] for key in columns] for row in rows))
         for done, (name, _, figure) in enumerate(drawn):
             on_progress("drawing", done / len(drawn))
             write_figure(folder / name, figures.without_formulas(figure))

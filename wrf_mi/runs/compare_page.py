@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -35,53 +36,6 @@ CONSTANT = ("dataset", "metric")
 """Columns that are equal in a section, whose heading states them."""
 FIRST = ("run", "median", "mean", "common_mean")
 """Columns that narrow screens show without scrolling."""
-
-STYLE = """
-:root { color-scheme: light; --line: #d5d9de; --soft: #f4f6f8; --ink: #1c2430; }
-* { box-sizing: border-box; }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 76rem; margin: 0 auto; padding: 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.3rem; margin-top: 2.5rem; border-top: 2px solid var(--line);
-  padding-top: 1rem; } h3 { font-size: 1.05rem; margin: 1.8rem 0 0.4rem; }
-.scroll { overflow-x: auto; -webkit-overflow-scrolling: touch; }
-table { border-collapse: collapse; font-size: 0.875rem; }
-th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.6rem; text-align: left; vertical-align: top; }
-th { background: var(--soft); vertical-align: bottom; }
-th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer;
-  text-align: inherit; color: inherit; }
-th button::after { content: " \\2195"; color: #98a2b0; }
-th[aria-sort=ascending] button::after { content: " \\2191"; color: inherit; }
-th[aria-sort=descending] button::after { content: " \\2193"; color: inherit; }
-.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-td:first-child { position: sticky; left: 0; background: #fff; min-width: 7rem; overflow-wrap: anywhere; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.2rem 1rem; margin: 0; }
-dt { font-weight: 600; } dd { margin: 0; overflow-wrap: anywhere; }
-.better { color: #0a6b2d; font-weight: 600; } .worse { color: #a11212; font-weight: 600; }
-pre { background: var(--soft); padding: 0.6rem; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 0.8rem; }
-img { max-width: 100%; height: auto; display: block; }
-.note { color: #4a5563; font-size: 0.9rem; margin: 0.3rem 0; }
-@media (max-width: 40rem) {
-  body { padding: 0.6rem; } dl { grid-template-columns: 1fr; gap: 0; } dd { margin-bottom: 0.4rem; }
-  img { max-width: none; width: var(--least); min-width: 100%; }
-}
-"""
-SCRIPT = """
-for (const table of document.querySelectorAll('table.sorts')) {
-  const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
-  heads.forEach((head, k) => head.firstElementChild.addEventListener('click', () => {
-    const down = head.getAttribute('aria-sort') === 'ascending', sign = down ? -1 : 1;
-    heads.forEach(other => other.removeAttribute('aria-sort'));
-    head.setAttribute('aria-sort', down ? 'descending' : 'ascending');
-    const of = row => row.cells[k].dataset.value ?? row.cells[k].textContent;
-    const number = head.classList.contains('n');
-    const order = (a, b) => {
-      const [x, y] = [of(a), of(b)];
-      if (x === '' || y === '') return (x === '') - (y === '');
-      return sign * (number ? x - y : x.localeCompare(y));
-    };
-    body.append(...[...body.rows].sort(order));
-  }));
-}
-"""
 
 
 @dataclass(frozen=True)
@@ -116,19 +70,22 @@ def page(sections: Sequence[Section], folder: Path) -> str:
     contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
     made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     again = shlex.join(["wrf-mi", "compare", *(str(run.path) for run in runs), "--out", str(folder)])
+    style, script = (files(__package__).joinpath(f"compare_page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     return f"""<!DOCTYPE html>
 <html lang="en">
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Comparison of runs</title>
-<style>{STYLE}</style>
+<style>
+{style}</style>
 <h1>Comparison of {count}</h1>
 <p class="note">Made {made} by <code>{_text(again)}</code></p>
 {contents}
 {"".join(map(_section, sections))}
 <h2>Versions and machines</h2>
 {_versions(runs)}
-<script>{SCRIPT}</script>
+<script>
+{script}</script>
 </html>
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..tasks import TASKS
+from ..tasks.scores import bootstrap
 from .repeat import known_config
 from .results import Results
-from .timing import Interval, bootstrap
 
 COLUMNS = {
     "run": "run",
@@ -59,7 +59,7 @@ class Difference:
         run: name of the run.
         against: name of the other run or of the reference.
         rows: number of common rows.
-        interval: mean difference of the score per row with its 95 % interval; None: too few rows.
+        difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows.
         verdict: `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`.
         seeds: number of seeds of which the verdict is.
     """
@@ -67,8 +67,10 @@ class Difference:
     run: str
     against: str
     rows: int
-    interval: Interval | None
     verdict: str
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
     seeds: int = 1
 
 
@@ -107,21 +109,22 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
     "Better" and "worse": the 95 % interval of the difference, resampled over test rows, excludes zero in all seeds; all
     else is a tie. Runs that differ in their seed alone are seeds of one method.
     """
-    best, methods = best_run(runs), [_method(run) for run in runs]
+    best, methods = best_run(runs), {run.name: _method(run) for run in runs}
+
+    def seeds_of(run: Results) -> list[Results]:
+        return [other for other in runs if methods[other.name] == methods[run.name]]
+
+    def to_best(run: Results) -> tuple[str, FloatArray]:
+        rival = next((other for other in seeds_of(best) if other.seed == run.seed), best)
+        return rival.name, _paired(run, rival)
+
     found: list[Difference] = []
-    for run, method in zip(runs, methods, strict=True):
-        seeds = [other for other, of in zip(runs, methods, strict=True) if of == method]
-        if run is not best:
-            rivals = [other for other, of in zip(runs, methods, strict=True) if of == methods[runs.index(best)]]
-
-            def rival_of(one: Results, rivals: list[Results] = rivals) -> Results:
-                return next((other for other in rivals if other.seed == one.seed), best)
-
-            if method == methods[runs.index(best)]:
-                found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
-            else:
-                found.append(_of_seeds(run, seeds, lambda one: (rival_of(one).name, _paired(one, rival_of(one)))))
-        found.append(_of_seeds(run, seeds, lambda one: (one.reference_name, _against_reference(one))))
+    for run in runs:
+        if run is not best and methods[run.name] == methods[best.name]:
+            found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
+        elif run is not best:
+            found.append(_of_seeds(run, seeds_of(run), to_best))
+        found.append(_of_seeds(run, seeds_of(run), _to_reference))
     return found
 
 
@@ -136,10 +139,10 @@ def _of_seeds(
 def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
     """Difference from the differences of rows, in favour of the run where positive."""
     if len(rows) < FEWEST:
-        return Difference(run.name, against, len(rows), None, FEW)
-    interval = bootstrap(rows, np.mean)
+        return Difference(run.name, against, len(rows), FEW)
+    interval = bootstrap(rows, statistic=np.mean)
     verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
-    return Difference(run.name, against, len(rows), interval, verdict)
+    return Difference(run.name, against, len(rows), verdict, interval.value, interval.low, interval.high)
 
 
 def _paired(run: Results, other: Results) -> FloatArray:
@@ -148,10 +151,10 @@ def _paired(run: Results, other: Results) -> FloatArray:
     return _per_row(run, [key[1] for key in keys], [run.score[ours[k]] - other.score[theirs[k]] for k in keys])
 
 
-def _against_reference(run: Results) -> FloatArray:
+def _to_reference(run: Results) -> tuple[str, FloatArray]:
     known = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
     change = [run.score[r, m] - run.reference_score[r, m] for r, m in known]
-    return _per_row(run, run.row[known[:, 1]].tolist(), change)
+    return run.reference_name, _per_row(run, run.row[known[:, 1]].tolist(), change)
 
 
 def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatArray:
@@ -179,36 +182,21 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     """Rows of the table for a data set: each run, and each reference once."""
     task = TASKS[runs[0].task]
     means = common_means(runs)
-    named = [
-        (
-            {key: run.metrics[key] for key in COLUMNS if key in run.metrics}
-            | {"run": run.name, "seed": run.seed, "common_mean": means.get(run.name)},
-            run.metrics[task.block],
-        )
+    rows: list[dict[str, Any]] = [
+        run.metrics | run.metrics[task.block] | {"run": run.name, "seed": run.seed, "common_mean": means.get(run.name)}
         for run in runs
     ]
     for name, (run, key) in references(runs).items():
         kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
-        named.append((kept | {"run": name, "model": key}, run.metrics["reference"][key]))
+        rows.append(kept | run.metrics["reference"][key] | {"run": name, "model": key})
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
-    scores = ("median", "mean", "p10", "p90")
-    rows = [row | shared | {key: block.get(key) for key in scores} for row, block in named]
-    return [{key: row.get(key) for key in COLUMNS} for row in rows]
+    return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
 
 
 def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
     """Rows of the table of differences."""
     return [
-        {
-            "run": one.run,
-            "against": one.against,
-            "rows": one.rows,
-            "difference": None if one.interval is None else one.interval.value,
-            "low": None if one.interval is None else one.interval.low,
-            "high": None if one.interval is None else one.interval.high,
-            "verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else ""),
-        }
-        for one in found
+        asdict(one) | {"verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else "")} for one in found
     ]
 
 

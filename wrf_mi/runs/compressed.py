@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,21 +16,22 @@ from ..core import InputError, Record
 from ..core.files import write_atomically
 from ..datasets import save_split
 from ..graph.settings import TRACED
+from ..tasks.scores import bootstrap
 from ..training.checkpoint import append_log
 from ..training.compress import Compression, compress
 from ..training.loop import Progress
 from ..training.predictor import Predictor
+from ..training.session import OnProgress, quiet
 from .api import evaluate_run, open_run
 from .evaluate import stored_metrics
 from .folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
-from .timing import interleaved, ratio
 
 COMPRESSION = "compression.json"
 """File of settings, source and results of a compression."""
 REPEATS = 60
 """Number of interleaved pairs of spectra that are timed."""
-
-OnProgress = Callable[[str, int, Progress], None]
+WARM_UP = 2
+"""Pairs before them: the first call compiles, the second still fills caches."""
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
@@ -40,17 +41,17 @@ def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: 
         By name: ``ms`` (median), ``ms_least``, and ``times_faster`` than the first: median of the rounds' ratios and
         its 95 % interval.
     """
-    positions = np.asarray(tx_pos_m, float)
-
-    def call(predictor: Predictor) -> Callable[[], Any]:
-        turn = itertools.cycle(positions[:, None])
-        return lambda: predictor(next(turn))
-
-    taken = interleaved({name: call(predictor) for name, predictor in predictors.items()}, repeats)
-    first = next(iter(taken.values()))
+    turns = itertools.islice(itertools.cycle(np.asarray(tx_pos_m, float)[:, None]), WARM_UP + repeats)
+    ms = np.empty((WARM_UP + repeats, len(predictors)))
+    for times, position in zip(ms, turns, strict=True):
+        for number, predictor in enumerate(predictors.values()):
+            start = time.perf_counter()
+            predictor(position)
+            times[number] = 1e3 * (time.perf_counter() - start)
     result: dict[str, Any] = {}
-    for name, times in taken.items():
-        faster = ratio(first, times)
+    for name, times in zip(predictors, ms[WARM_UP:].T, strict=True):
+        # A changing load affects both predictors of a round alike, so that its ratio varies less than either time.
+        faster = bootstrap(ms[WARM_UP:, 0] / times)
         interval = [faster.value, faster.low, faster.high]
         result[name] = {"ms": float(np.median(times)), "ms_least": float(times.min()), "times_faster": interval}
     return result
@@ -61,7 +62,7 @@ def compress_run(
     out: str | Path,
     how: Compression,
     record: Record | None = None,
-    on_progress: OnProgress = lambda stage, steps, progress: None,
+    on_progress: OnProgress = quiet,
 ) -> dict[str, Any]:
     """Make a smaller run from a run and score it on the same held-out rows.
 
@@ -94,7 +95,7 @@ def compress_run(
     def log(stage: str, steps: int, progress: Progress) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         append_log(folder, progress)
-        on_progress(stage, steps, progress)
+        on_progress(stage, progress.step / steps, progress)
 
     settings, params = compress(field.config, field.params, data, split, how, log)
     seconds = time.perf_counter() - start

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
-from ..core.array_files import ArrayStream, write_arrays
+from ..core.array_files import write_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import write_atomically
 from ..core.memory import peak_memory_mb
@@ -192,7 +192,7 @@ def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Seque
 def score_other(config: RunConfig, problem: Problem, part: Part, split: str) -> dict[str, Any]:
     """Metrics on the test rows of another split that were not used in training; `InputError` if there are none."""
     asked = np.unique(np.concatenate([s.test for s in make_splits(problem.record, split, config.seed)]))
-    unseen = np.setdiff1d(asked, problem.rows(part.split))
+    unseen = np.setdiff1d(asked, part.split.all_train)
     if not len(unseen):
         raise InputError(f"{part.folder}: trained on all test rows of split {split}; nothing is left to score")
     metrics, _ = _evaluate_part(problem, part._replace(split=replace(part.split, test=unseen)))
@@ -210,8 +210,6 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
         return fitted.predict_rows(rows, receiver) or single(rows, receiver)
 
     metrics, arrays = evaluate(record, part.split, predict, single)
-    if not problem.use_rows:
-        metrics["n_train"] = 0  # those of the references
     return metrics | _stage_scores(record, part, metrics, arrays), arrays
 
 
@@ -275,14 +273,9 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
         The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
-    written = {k: _of_first(v) if single and k not in SHARED else v for k, v in arrays.items()}
+    written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}
     write_arrays(path, written, compressed=True)
     return written
-
-
-def _of_first(values: Any) -> Any:
-    """Values of the first receiver."""
-    return replace(values, shape=values.shape[1:]) if isinstance(values, ArrayStream) else values[0]
 
 
 def stored_metrics(folder: Path) -> dict[str, Any]:

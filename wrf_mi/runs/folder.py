@@ -47,28 +47,17 @@ from ..training.fit_plan import check_rows
 FORMAT = 4
 """Version of ``config.yaml`` and ``model.npz``."""
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
-OLD = ("hybrid.npz", "fitted.npz")
-"""Files of version 0.1."""
 VERSION, SECONDS = "run/format", "run/train_seconds"
 """Keys of ``model.npz`` beside the model's arrays."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Content of ``config.yaml``.
+    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them.
 
     Attributes:
-        model: name of the model.
-        dataset: name or folder of the data set.
         task: task of the data set.
         split: name of the split; that of a fold is, e.g., ``blocked:2``.
-        n_train: number or fraction of training rows; None: all; 0: none, the scene alone.
-        seed: seed of split and fit.
-        scene: name, scene folder, Mitsuba XML or mesh; None: none.
-        material: radio material of a bare mesh, or None.
-        antennas: antenna options that override the data set.
-        deterministic: fitted on one thread of the CPU, bit-identical from run to run.
-        intervals: standard deviations are calibrated on held-out training rows (`wrf_mi.models.calibrated`).
         settings: all settings of the model.
         left_out: training rows of the receivers that are left out for having too few, by name.
     """
@@ -148,17 +137,15 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def check_format(folder: Path) -> None:
-    """Refuse a run of version 0.1 or of another format by `InputError`; an unreadable configuration passes."""
+    """Refuse a run of another format by `InputError`; an unreadable configuration passes."""
     try:
         content = read_yaml(folder / CONFIG)
     except InputError:
         content = {}
     stated = content.get("format") if content else FORMAT
-    if stated is None or any((folder / name).exists() for name in OLD):
-        raise InputError(f"{folder}: a run of version 0.1; train it anew, or use version 0.1")
     if stated != FORMAT:
-        path = folder / CONFIG
-        raise InputError(f"{path}: format {stated}, this version reads {FORMAT}; use the version that wrote it")
+        text = f"format {stated or 'not stated'}, this version reads {FORMAT}"
+        raise InputError(f"{folder / CONFIG}: {text}; train it anew, or use the version that wrote it")
 
 
 def check_new(folder: Path) -> None:

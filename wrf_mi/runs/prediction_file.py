@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import csv
 import math
+import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Prediction
+from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.array_files import ArrayStream, stored_arrays
+from ..core.array_files import stored_arrays
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, write_atomically
+from ..core.files import one_line, write_csv
 from ..datasets.folder_files import read_csv
 from ..models.model import Inputs
 from ..tasks import TASKS
@@ -31,8 +30,8 @@ HEADING = "heading_rad"
 """Column or array of headings."""
 POSITIONS, UPLINK = "tx_pos", "uplink"
 """Arrays of positions and of uplink channels."""
-SPOOLED_BYTES, PIECE_BYTES = 1 << 26, 1 << 22
-"""Size from which predictions are collected on the disk, and size of the pieces that are read from there."""
+SPOOLED_BYTES = 1 << 26
+"""Size from which predictions are collected on the disk."""
 
 
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
@@ -67,14 +66,6 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
         raise InputError(f"{path}, row {bad[0] + 1}: not a finite number; give x, y, z in metres")
     if len(positions) == 0:
         raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
-    for name, values, least, kind in (
-        (HEADING, inputs.tx_heading_rad, -np.inf, "finite number (rad)"),
-        (FREQUENCY, inputs.carriers_hz, 0.0, "positive number (Hz)"),
-    ):
-        if values is not None and not (
-            values.shape == positions.shape[:1] and (np.isfinite(values) & (values > least)).all()
-        ):
-            raise InputError(f"{path}: {name} must be one {kind} for each position; correct it")
     return inputs
 
 
@@ -124,70 +115,28 @@ def check_prediction_file(out: Path, run: Path) -> None:
             raise InputError(f"{out}: {CSV} holds signal strengths (rssi), but {run} predicts {task}; {remedy}")
 
 
-class PredictionSpool:
-    """Predictions of all receivers, collected part by part: in memory while small, else in a temporary file.
-
-    The file has no name: nothing is left of it, however the process ends.
+def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Array to be filled, in memory while small, else in a temporary file, which has no name: nothing is left of it.
 
     Args:
-        folder: folder of the temporary file.
-        receivers: number of receivers.
-        count: number of positions.
+        folder: folder of the temporary file, which is made if need be.
+        shape: shape of the array.
+        kind: type of its numbers.
+
+    Raises:
+        InputError: the disk has no room for it.
     """
-
-    def __init__(self, folder: Path, receivers: int, count: int) -> None:
-        self._folder, self._lead = folder, (receivers, count)
-        self._files: dict[str, tuple[Any, NDArray[Any]]] = {}
-
-    def __enter__(self) -> Self:
-        """The spool."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Free memory and file."""
-        for file, _ in self._files.values():
-            file.close()
-
-    def write(self, rows: slice, receiver: int, found: Prediction) -> None:
-        """Add the predictions [rows, ...] of some rows at a receiver."""
-        std = None if found.std is None else found.std.astype(np.float32)
-        for name, values in (("prediction", found.mean), ("std", std)):
-            if values is None:
-                continue
-            if name not in self._files:
-                self._files[name] = self._file(values), values[:0]
-            file, like = self._files[name]
-            size = like.dtype.itemsize * math.prod(like.shape[1:])
-            file.seek(size * (receiver * self._lead[1] + rows.start))
-            file.write(np.ascontiguousarray(values, like.dtype).tobytes())
-
-    def _file(self, like: NDArray[Any]) -> Any:
-        """A temporary file for observations like [n, ...]; `InputError` if the disk has no room for it."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        needed = math.prod(self._lead) * like.dtype.itemsize * math.prod(like.shape[1:])
-        if needed > SPOOLED_BYTES and needed > (free := shutil.disk_usage(self._folder).free):
-            text = f"predictions take {needed / 2**30:.3g} GiB, and {free / 2**30:.3g} GiB of the disk are free"
-            raise InputError(f"{self._folder}: {text}; predict fewer positions at a time, or choose another disk")
-        return tempfile.SpooledTemporaryFile(SPOOLED_BYTES, dir=str(self._folder))
-
-    def streams(self) -> dict[str, ArrayStream]:
-        """``prediction`` and, if stated, ``std`` [receivers, positions, ...], for `wrf_mi.core.files.write_arrays`."""
-        return {
-            name: ArrayStream((*self._lead, *like.shape[1:]), like.dtype, self._pieces(file))
-            for name, (file, like) in self._files.items()
-        }
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The same in memory."""
-        return {
-            name: np.frombuffer(b"".join(stream.pieces), stream.dtype).reshape(stream.shape)
-            for name, stream in self.streams().items()
-        }
-
-    def _pieces(self, file: Any) -> Iterator[bytes]:
-        file.seek(0)
-        while piece := file.read(PIECE_BYTES):
-            yield piece
+    needed = math.prod(shape) * kind.itemsize
+    if needed <= SPOOLED_BYTES:
+        return np.empty(shape, kind)
+    folder.mkdir(parents=True, exist_ok=True)
+    if needed > (free := shutil.disk_usage(folder).free):
+        text = f"predictions take {needed / 2**30:.3g} GiB, and {free / 2**30:.3g} GiB of the disk are free"
+        raise InputError(f"{folder}: {text}; predict fewer positions at a time, or choose another disk")
+    with tempfile.TemporaryFile(dir=folder) as file:
+        if sys.platform == "linux":
+            os.posix_fallocate(file.fileno(), 0, needed)  # a disk that others fill later would end the process
+        return np.memmap(file, kind, "w+", shape=shape)
 
 
 def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: FloatArray | None) -> dict[str, Any]:
@@ -214,11 +163,7 @@ def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: Flo
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in arrays:
             columns += [(f"{name}_{suffix}", v) for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)]
-    # str gives the shortest number that reads back as the same number.
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([name for name, _ in columns])
-    writer.writerows(["" if np.isnan(x) else str(x) for x in row] for row in zip(*(v for _, v in columns), strict=True))
-    write_atomically(out, text.getvalue())
+    names, values = zip(*columns, strict=True)
+    write_csv(out, names, zip(*values, strict=True))
     single = len(arrays["receiver_name"]) == 1
     return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}

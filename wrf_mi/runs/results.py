@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
-from ..core.files import readable, write_atomically
+from ..core.files import readable
 from ..core.types import IntArray
 from ..tasks import TASKS, Task
 from ..training.checkpoint import LOG
@@ -211,12 +209,3 @@ def _read_log(path: Path) -> list[tuple[float, float]]:
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
     return points
-
-
-def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> None:
-    """Write columns of a table as CSV with a header, atomically; None is an empty field."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())

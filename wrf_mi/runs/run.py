@@ -27,7 +27,7 @@ from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
 from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
-from .prediction_file import CSV, PredictionSpool, check_prediction_file, write_prediction_file
+from .prediction_file import check_prediction_file, spooled, write_prediction_file
 
 PREDICTED_PER_CHUNK = 256
 """Positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver."""
@@ -64,7 +64,7 @@ class Run:
         """Content of ``config.yaml``.
 
         Raises:
-            InputError: not a run folder, a damaged one, or one of version 0.1.
+            InputError: not a run folder, or a damaged one.
         """
         return read_config(self.folder)
 
@@ -78,9 +78,8 @@ class Run:
         """Data, scene and settings that the model was fitted to."""
         config = self.config
         scene = config.scene, config.material, config.antennas
-        rows = config.n_train != 0
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        return Problem(data, config.settings, config.seed, *scene, rows, self.operator, left_out)
+        return Problem(data, config.settings, config.seed, *scene, self.operator, left_out)
 
     @cached_property
     def fitted(self) -> Fitted:
@@ -230,13 +229,7 @@ def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:
     """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
-    Args:
-        folder: run folder.
-        record: data that the model was fitted to; None: the data set that the folder names.
-        operator: learned fields predict by operator where they can.
-
-    Raises:
-        InputError: not a run folder, or a run folder of version 0.1.
+    Arguments are the attributes of `Run`; `InputError` where the folder is none of a run.
     """
     run = Run(Path(folder), record, operator)
     _ = run.config
@@ -264,12 +257,12 @@ def predict_to_file(
         out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
             [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and ``std`` of models
             that state it. ``.csv``: signal strengths (`wrf_mi.runs.prediction_file.write_prediction_file`).
-        tx_heading_rad: yaw of the transmitter's body [m], radians, for models that use it.
+        tx_heading_rad: as that of `Run.predict`, as are the next two.
         scheduler: computes chunks of the positions; None: this process. Its workers must see the run folder, data set
             and scene under the same names.
         operator: learned fields predict by operator where they can.
-        uplink: uplink channels [m, antennas, subcarriers], for models that predict from them.
-        carriers_hz: carrier of each position [m], Hz, where the data have several; stored as ``frequency_hz``.
+        uplink: uplink channels.
+        carriers_hz: carriers, stored as ``frequency_hz``.
         progress: show progress on standard error.
 
     Returns:
@@ -285,36 +278,45 @@ def predict_to_file(
     check_prediction_file(Path(out), path)
     run.check_inputs(asked)
     receivers, count = run.receivers, len(asked)
-    with PredictionSpool(Path(out).parent, len(receivers), count) as spool:
-        if scheduler is None or not count:
-            total = len(receivers) * count
-            shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
-            with shown as bar:
-                for index in range(len(receivers)):
-                    for rows, found in run.predicted_parts(asked, index):
-                        spool.write(rows, index, found)
-                        if bar is not None:
-                            bar.add(rows.stop - rows.start, 1)
-        else:
-            parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
+    collected: dict[str, NDArray[Any]] = {}
 
-            def each(part: int, found: list[Prediction]) -> None:
-                for index, one in enumerate(found):
-                    spool.write(parts[part], index, one)
-                found.clear()  # the scheduler keeps results to the end
+    def collect(rows: slice, index: int, found: Prediction) -> None:
+        std = None if found.std is None else found.std.astype(np.float32)
+        for name, values in (("prediction", found.mean), ("std", std)):
+            if values is not None:
+                if name not in collected:
+                    shape = (len(receivers), count, *values.shape[1:])
+                    collected[name] = spooled(Path(out).parent, shape, values.dtype)
+                collected[name][index, rows] = values
 
-            opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
-            given = [asked.rows(rows) for rows in parts]
-            scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
-        arrays: dict[str, Any] = {
-            "row": np.arange(count),
-            "tx_pos": asked.tx_pos_m,
-            "receiver_name": np.asarray([receiver.name for receiver in receivers]),
-        }
-        if carriers_hz is not None:
-            arrays[FREQUENCY] = carriers_hz
-        arrays |= spool.arrays() if Path(out).suffix.lower() == CSV else spool.streams()
-        written = write_prediction_file(Path(out), arrays, tx_heading_rad)
+    if scheduler is None or not count:
+        total = len(receivers) * count
+        shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
+        with shown as bar:
+            for index in range(len(receivers)):
+                for rows, found in run.predicted_parts(asked, index):
+                    collect(rows, index, found)
+                    if bar is not None:
+                        bar.add(rows.stop - rows.start, 1)
+    else:
+        parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
+
+        def each(part: int, found: list[Prediction]) -> None:
+            for index, one in enumerate(found):
+                collect(parts[part], index, one)
+            found.clear()  # the scheduler keeps results to the end
+
+        opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
+        given = [asked.rows(rows) for rows in parts]
+        scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
+    arrays: dict[str, Any] = {
+        "row": np.arange(count),
+        "tx_pos": asked.tx_pos_m,
+        "receiver_name": np.asarray([receiver.name for receiver in receivers]),
+    }
+    if carriers_hz is not None:
+        arrays[FREQUENCY] = carriers_hz
+    written = write_prediction_file(Path(out), arrays | collected, tx_heading_rad)
     return {key: value.shape for key, value in written.items()}
 
 

@@ -20,34 +20,25 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
 
 from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
-from ..core.files import one_line, write_atomically
+from ..core.files import one_line, write_atomically, write_csv
+from ..datasets.registry import locate
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
-from .fit_key import dataset_files, scene_files
 from .folder import CONFIG, METRICS, is_finished, package_versions
-from .results import write_csv
 
 OPTIONS = (
-    *(
-        "dataset",
-        "model",
-        "scene",
-        "material",
-        "evaluation",
-        "split",
-        "n-train",
-        "seed",
-        "preset",
-        "receiver",
-        "stages",
-    ),
-    *("paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
+    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed"),
+    *("preset", "receiver", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
@@ -184,7 +175,8 @@ def run_sweep(sweep: Sweep, scheduler: Scheduler | None = None) -> list[dict[str
     def each(index: int, row: dict[str, Any]) -> None:
         finished[index] = row
         rows = [finished[k] for k in sorted(finished)]  # written after each run: a sweep may take days
-        write_csv(sweep.folder / "scores.csv", rows, ["run", *sweep.varied, *HEADINGS])
+        columns = ["run", *sweep.varied, *HEADINGS]
+        write_csv(sweep.folder / "scores.csv", columns, ([row[key] for key in columns] for row in rows))
         write_atomically(sweep.folder / "scores.md", sweep_table(rows, sweep.varied) + "\n")
         write_atomically(sweep.folder / "scores.json", json.dumps(rows, indent=1) + "\n")
         headline = row["status"] if row["median"] is None else f"{row['score']} median {row['median']:.3f}"
@@ -232,6 +224,35 @@ def _files(sweep: Sweep) -> dict[str, list[Path]]:
             elif key in FILES:
                 found[value] = scene_files(value)
     return {name: paths for name, paths in found.items() if paths}
+
+
+def dataset_files(name_or_folder: str) -> list[Path]:
+    """Folder or file of a data set; empty where it is not on this machine.
+
+    Raises:
+        InputError: no such data set.
+    """
+    path = Path(name_or_folder)
+    found = path if path.exists() else locate(name_or_folder)
+    return [] if found is None else [found]
+
+
+def scene_files(scene: str | Path) -> list[Path]:
+    """Folder or file of a scene, with the files that a Mitsuba XML names; empty for the name of an embedded scene.
+
+    Raises:
+        InputError: an XML that cannot be read.
+    """
+    path = Path(scene)
+    if not path.exists():
+        return []
+    if path.suffix.lower() != ".xml":
+        return [path]
+    try:
+        stated = [node.get("value", "") for node in parse(path, forbid_dtd=True).iter("string")]
+    except (ElementTree.ParseError, DefusedXmlException, OSError) as error:
+        raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
+    return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]
 
 
 def _run(run: SweepRun) -> dict[str, Any]:

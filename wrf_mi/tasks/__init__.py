@@ -7,25 +7,15 @@ from collections.abc import Mapping
 from ..core import InputError, Record
 from ..core.registry import Registry
 from ..receivers.instruments import Instrument
-from . import csi, rssi, spectrum
+from .kinds import Csi, Rssi, Spectrum
 from .task import CARRIER, LAW, UPLINK, Task
 
 ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""
 
 
-_TASKS: Registry[Task] = Registry("task", ENTRY_POINTS, {t.name: t for t in (spectrum.TASK, rssi.TASK, csi.TASK)})
-TASKS: Mapping[str, Task] = _TASKS
+TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
 """Every task by its name in `wrf_mi.core.Record.task`."""
-
-
-def register(task: Task) -> None:
-    """Add a task for this process; an installed package names it by an entry point of the group `ENTRY_POINTS`.
-
-    Raises:
-        InputError: the name is taken.
-    """
-    _TASKS.add(task.name, task)
 
 
 def task_of(record: Record) -> Task:
@@ -66,7 +56,6 @@ __all__ = [
     "UPLINK",
     "Task",
     "instrument_of",
-    "register",
     "require",
     "task_of",
 ]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
+from scipy.stats import bootstrap as resampled
 from skimage.metrics import structural_similarity
 
 from ..core import InputError
@@ -20,6 +23,8 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Stabilising constants of Wang et al. (2004) for a data range of one."""
 SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)
 """Sample variance of a window over its variance."""
+RESAMPLES = 2000
+"""Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
 
@@ -146,3 +151,35 @@ def summary(values: ArrayLike) -> dict[str, float]:
         raise InputError("no test rows to score: the split has none")
     p10, median, p90 = np.percentile(v, [10, 50, 90])
     return {"median": float(median), "mean": float(v.mean()), "p10": float(p10), "p90": float(p90)}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A statistic with the limits of its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+
+def bootstrap(*samples: ArrayLike, statistic: Callable[..., Any] = np.median, seed: int = 0) -> Interval:
+    """Statistic of independent samples with its 95 % percentile interval.
+
+    Args:
+        samples: sets of samples [n] each, which are resampled independently; one sample at least in each.
+        statistic: function of an array for each set and ``axis``.
+        seed: seed of the resamples.
+
+    Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), section 13.3; `scipy.stats.bootstrap`.
+    """
+    sets = [np.asarray(values, float) for values in samples]
+    if wrong := [values.shape for values in sets if values.ndim != 1 or not len(values)]:
+        raise ValueError(f"bootstrap: samples of shape {wrong[0]}; give [n], one at least")
+    # SciPy asks for two samples; a single one twice has the same quantiles.
+    sets = [np.resize(values, max(2, len(values))) for values in sets]
+    draws: dict[str, Any] = {"n_resamples": RESAMPLES, "confidence_level": 0.95, "rng": seed}
+    low, high = resampled(sets, statistic, method="percentile", vectorized=True, **draws).confidence_interval
+    return Interval(float(statistic(*sets, axis=-1)), float(low), float(high))

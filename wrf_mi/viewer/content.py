@@ -13,21 +13,12 @@ from ..core.angles import FloatArray
 from ..core.settings import CheckedSettings, Count
 from ..core.types import IntArray
 
-STORED_TRANSMITTERS = 40
-SHOWN_GAUSSIANS = 1000
-SHOWN_PATHS = 200
-"""Paths of each transmitter to each receiver, the strongest."""
+STORED_TRANSMITTERS, SHOWN_GAUSSIANS, SHOWN_PATHS = 40, 1000, 200
 
 
 @dataclass(frozen=True)
 class ViewOptions(CheckedSettings):
-    """Limits of a view.
-
-    Attributes:
-        transmitters: number of held-out rows whose observations, Gaussians' signals and paths are stored.
-        gaussians: number of Gaussians, the strongest.
-        paths: number of paths of each stored transmitter to each receiver, the strongest.
-    """
+    """Limits of a view, as the arguments of `wrf_mi.view`."""
 
     transmitters: Count = STORED_TRANSMITTERS
     gaussians: Count = SHOWN_GAUSSIANS
@@ -95,14 +86,14 @@ class GaussiansContent:
 
     Attributes:
         position_m: centres [n, 3], metres.
-        scale_m: standard deviations [t or 1, n, 3], metres.
+        log_scale: natural logarithms of the standard deviations in metres [t or 1, n, 3].
         rotation_xyzw: quaternions [t or 1, n, 4].
         strength_db: opacity times magnitude of the signal [t, n], dB.
         total: number of Gaussians of the field.
     """
 
     position_m: FloatArray
-    scale_m: FloatArray
+    log_scale: FloatArray
     rotation_xyzw: FloatArray
     strength_db: FloatArray
     total: int

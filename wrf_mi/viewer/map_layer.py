@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ import numpy as np
 
 from ..core import InputError
 from ..core.array_files import stored_arrays
-from ..maps.packages import require_packages
+from ..maps.dataset import require_packages
 from ..parallel import run_module
 from .content import MapContent
 
@@ -93,26 +92,19 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
 
 def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[MapContent], list[str]]:
     """Maps with at most ``most`` values in all, of every k-th position along each axis, and a note where k > 1."""
-    step = 1
-    while sum(_size(one, step) for one in maps) > most:
+    step, found = 1, list(maps)
+    while sum(values.size for one in found for values in one.values.values()) > most:
         step += 1
+        found = [_every(one, step) for one in maps]
     if step == 1:
-        return list(maps), []
-    every = slice(None, None, step)
-    found = []
-    for one in maps:
-        if one.z_m is None:
-            values = {name: v[:, every, every] for name, v in one.values.items()}
-            found.append(replace(one, x_m=one.x_m[every], y_m=one.y_m[every], values=values))
-        else:
-            part = slice(None, None, step * step)
-            values = {name: v[:, part] for name, v in one.values.items()}
-            found.append(replace(one, x_m=one.x_m[part], y_m=one.y_m[part], z_m=one.z_m[part], values=values))
+        return found, []
     return found, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
 
 
-def _size(one: MapContent, step: int) -> int:
-    """Number of values of a thinned map."""
-    thinner = step if one.z_m is None else step * step
-    shapes = [values.shape for values in one.values.values()]
-    return sum(math.prod((shape[0], *(-(-size // thinner) for size in shape[1:]))) for shape in shapes)
+def _every(one: MapContent, step: int) -> MapContent:
+    """A map of every ``step``-th position along each axis, and of as small a share of the points of a surface."""
+    part = slice(None, None, step if one.z_m is None else step * step)
+    index = (..., part, part) if one.z_m is None else (..., part)
+    values = {name: array[index] for name, array in one.values.items()}
+    z_m = None if one.z_m is None else one.z_m[part]
+    return replace(one, x_m=one.x_m[part], y_m=one.y_m[part], z_m=z_m, values=values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,17 @@ MISSING = 65535
 """Code of a value that is not finite."""
 SMALLEST_RANGE = 1e-300
 """Range below which numbers are packed as equal: the steps of a smaller one have few digits or underflow."""
+
+
+def plain(value: Any) -> Any:
+    """Values for JSON: dataclasses as dictionaries of their fields, arrays as of `packed`."""
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return packed(value) if isinstance(value, np.ndarray) else value
 
 
 def packed(values: ArrayLike) -> dict[str, Any]:

@@ -7,7 +7,7 @@
   const plotlyScale = (name) => data.scales[name].map((colour, i, all) => [i / (all.length - 1), colour]);
   const state = { receiver: 0, chosen: 0, mesh: 0.35 };
   const layers = [];
-  const receivers = { names: data.receivers.names, position: unpack(data.receivers.position).values };
+  const receivers = { names: data.receivers, position: unpack(data.receivers_m).values };
 
   // A layer: its name, whether it is on, a swatch or a colour scale, options below its name, and its traces.
   function addLayer(layer) {
@@ -17,7 +17,7 @@
   // --- held-out rows and the chosen transmitter --------------------------------------------------------------------------
   const rows = data.rows && {
     row: unpack(data.rows.row).values,
-    position: unpack(data.rows.position).values,
+    position: unpack(data.rows.tx_pos_m).values,
     score: unpack(data.rows.score).values,
     stored: unpack(data.rows.stored).values,
   };
@@ -93,13 +93,13 @@
 
   // --- paths ----------------------------------------------------------------------------------------------------------
   const paths = data.paths && Object.fromEntries(
-    ["tx", "rx", "order", "kind", "gain", "length", "corners"].map((name) => [name, unpack(data.paths[name]).values]));
+    ["tx", "rx", "order", "kind", "gain_db", "length_m", "corners_m"].map((name) => [name, unpack(data.paths[name]).values]));
   if (paths && paths.tx.length) {
     const first = [0];
     for (const order of paths.order) first.push(first[first.length - 1] + order + 2);
     const orders = [...new Set(paths.order)].sort((a, b) => a - b);
-    const top = paths.gain.reduce((a, b) => Math.max(a, b));
-    const bottom = paths.gain.reduce((a, b) => Math.min(a, b));
+    const top = paths.gain_db.reduce((a, b) => Math.max(a, b));
+    const bottom = paths.gain_db.reduce((a, b) => Math.min(a, b));
     const range = [Math.max(bottom, top - data.span_db), top];
     state.orders = new Set(orders);
     const least = Math.max(Math.floor(bottom), Math.ceil(top) - 3 * data.span_db);
@@ -117,16 +117,16 @@
         const texts = [];
         for (let p = 0; p < paths.tx.length; p++) {
           const shown = paths.tx[p] === state.chosen && paths.rx[p] === state.receiver;
-          if (!shown || !state.orders.has(paths.order[p]) || (state.weakest > least && paths.gain[p] < state.weakest)) continue;
+          if (!shown || !state.orders.has(paths.order[p]) || (state.weakest > least && paths.gain_db[p] < state.weakest)) continue;
           const kind = data.paths.kinds[paths.kind[p]];
-          const text = plain(`${kind}: ${number(paths.gain[p])} dB, ${number(paths.length[p], 2)} m`);
+          const text = plain(`${kind}: ${number(paths.gain_db[p])} dB, ${number(paths.length_m[p], 2)} m`);
           for (let v = first[p]; v < first[p + 1]; v++) {
-            points.push(...at(paths.corners, v));
-            colours.push(paths.gain[p]);
+            points.push(...at(paths.corners_m, v));
+            colours.push(paths.gain_db[p]);
             texts.push(text);
           }
           points.push(NaN, NaN, NaN);
-          colours.push(paths.gain[p]);
+          colours.push(paths.gain_db[p]);
           texts.push("");
         }
         const line = { width: 3, color: colours, colorscale: plotlyScale("gain"), cmin: range[0], cmax: range[1] };
@@ -148,12 +148,12 @@
 
   // --- Gaussians ------------------------------------------------------------------------------------------------------
   const gaussians = data.gaussians && Object.fromEntries(
-    ["position", "scale", "rotation", "strength"].map((name) => [name, unpack(data.gaussians[name])]));
+    ["position_m", "log_scale", "rotation_xyzw", "strength_db"].map((name) => [name, unpack(data.gaussians[name])]));
   if (gaussians) {
-    const count = gaussians.position.shape[0];
+    const count = gaussians.position_m.shape[0];
     const sphere = icosphere();
-    const top = gaussians.strength.values.reduce((a, b) => Math.max(a, b));
-    const bottom = gaussians.strength.values.reduce((a, b) => Math.min(a, b));
+    const top = gaussians.strength_db.values.reduce((a, b) => Math.max(a, b));
+    const bottom = gaussians.strength_db.values.reduce((a, b) => Math.min(a, b));
     const range = [Math.max(bottom, top - data.span_db), top];
     state.gaussians = Math.min(count, 200);
     addLayer({
@@ -171,16 +171,16 @@
   }
 
   function ellipsoids(transmitter, shown, sphere) {
-    const count = gaussians.position.shape[0];
-    const slot = gaussians.scale.shape[0] > 1 ? transmitter : 0;
+    const count = gaussians.position_m.shape[0];
+    const slot = gaussians.log_scale.shape[0] > 1 ? transmitter : 0;
     const vertices = sphere.vertices.length;
     const made = { x: [], y: [], z: [], i: [], j: [], k: [], intensity: [], text: [] };
     for (let g = 0; g < shown; g++) {
-      const centre = at(gaussians.position.values, g);
-      const scale = at(gaussians.scale.values, slot * count + g).map(Math.exp);
+      const centre = at(gaussians.position_m.values, g);
+      const scale = at(gaussians.log_scale.values, slot * count + g).map(Math.exp);
       const start = 4 * (slot * count + g);
-      const turn = rotation(...gaussians.rotation.values.subarray(start, start + 4));
-      const strength = gaussians.strength.values[transmitter * count + g];
+      const turn = rotation(...gaussians.rotation_xyzw.values.subarray(start, start + 4));
+      const strength = gaussians.strength_db.values[transmitter * count + g];
       const text = `${number(strength)} dB`;
       for (const unit of sphere.vertices) {
         const local = unit.map((value, axis) => value * scale[axis]);
@@ -203,15 +203,15 @@
   if (data.maps.length) {
     const maps = data.maps.map((one) => ({
       ...one,
-      x: unpack(one.x).values,
-      y: unpack(one.y).values,
-      z: one.z && unpack(one.z).values,
+      x: unpack(one.x_m).values,
+      y: unpack(one.y_m).values,
+      z: one.z_m && unpack(one.z_m).values,
       values: Object.fromEntries(Object.entries(one.values).map(([name, packed]) => [name, unpack(packed)])),
     }));
-    maps.sort((a, b) => (a.height ?? Infinity) - (b.height ?? Infinity));
+    maps.sort((a, b) => (a.height_m ?? Infinity) - (b.height_m ?? Infinity));
     const names = Object.keys(data.quantities);
     Object.assign(state, { quantity: names[0], map: 0, mapOpacity: 0.9 });
-    const title = (one) => (one.z ? `points (${one.name})` : `${number(one.height, 2)} m (${one.name})`);
+    const title = (one) => (one.z ? `points (${one.name})` : `${number(one.height_m, 2)} m (${one.name})`);
     addLayer({
       name: maps.length > 1 ? `maps (${maps.length})` : `map at ${title(maps[0])}`,
       scale: () => ["map", data.quantities[state.quantity].range, data.quantities[state.quantity].label],
@@ -244,7 +244,7 @@
     const width = one.x.length;
     const lines = (each) => Array.from(one.y, (_, r) => Array.from(values.subarray(r * width, (r + 1) * width), each));
     return [{
-      type: "surface", x: one.x, y: one.y, z: lines((v) => (Number.isFinite(v) ? one.height : null)), surfacecolor: lines((v) => v),
+      type: "surface", x: one.x, y: one.y, z: lines((v) => (Number.isFinite(v) ? one.height_m : null)), surfacecolor: lines((v) => v),
       text: lines((v) => number(v, 2)), showscale: false, lighting: { ambient: 1, diffuse: 0, specular: 0 }, ...scale, ...shared,
     }];
   }
@@ -252,8 +252,9 @@
   const meshOptions = () => [slider("Opacity of the mesh", 0.05, 1, 0.05, state.mesh, (v) => (state.mesh = v))];
 
   // --- mesh -----------------------------------------------------------------------------------------------------------
-  for (const [place, mesh] of data.meshes.entries()) {
-    const corners = unpack(mesh.corners).values;
+  const meshes = data.scene ? data.scene.meshes : [];
+  for (const [place, mesh] of meshes.entries()) {
+    const corners = unpack(mesh.corners_m).values;
     const surface = unpack(mesh.surface).values;
     const triangles = surface.length;
     const every = (k) => Int32Array.from({ length: triangles }, (_, t) => 3 * t + k);
@@ -263,7 +264,7 @@
       i: every(0),
       j: every(1),
       k: every(2),
-      color: mesh.colour,
+      color: data.colours[mesh.material],
       flatshading: true,
       lighting: { ambient: 0.75, diffuse: 0.5, specular: 0.05, facenormalsepsilon: 0, vertexnormalsepsilon: 0 },
       text: Array.from({ length: 3 * triangles }, (_, v) => plain(mesh.names[surface[Math.floor(v / 3)]])),
@@ -272,13 +273,13 @@
     addLayer({
       name: mesh.ceiling ? `${mesh.material}, ceiling` : mesh.material,
       on: !mesh.ceiling,
-      swatch: mesh.colour,
-      options: place === data.meshes.length - 1 ? meshOptions : null,
+      swatch: data.colours[mesh.material],
+      options: place === meshes.length - 1 ? meshOptions : null,
       traces: () => [{ ...trace, opacity: state.mesh }],
     });
   }
-  if (data.edges && data.edges.shape[0]) {
-    const ends = unpack(data.edges).values;
+  if (data.scene && data.scene.edges_m.shape[0]) {
+    const ends = unpack(data.scene.edges_m).values;
     const lines = [];
     for (let i = 0; i < ends.length; i += 6) lines.push(ends.subarray(i, i + 3), ends.subarray(i + 3, i + 6), [NaN, NaN, NaN]);
     const trace = { type: "scatter3d", mode: "lines", ...xyz(lines.flatMap((p) => [...p])), hoverinfo: "skip" };

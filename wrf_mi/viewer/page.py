@@ -7,16 +7,18 @@ import json
 from functools import cache
 from importlib import import_module
 from importlib.resources import files
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
+from numpy.typing import NDArray
 
 from ..core import InputError
 from ..scene.preview import ENDS, SPAN_DB
-from .content import MapContent, MaterialMesh, RowsContent, ViewContent
-from .pack import packed
+from .content import MapContent, ViewContent
+from .pack import plain
 
 SCALES = {"strength": "viridis", "gain": "plasma", "error": "YlOrRd", "map": "turbo"}
 """Colour map of each quantity."""
@@ -76,96 +78,36 @@ def page(content: ViewContent) -> str:
 
 
 def page_data(content: ViewContent) -> dict[str, Any]:
-    """Plain data of the page; arrays as of `packed`."""
-    rows, gaussians, paths, scene = content.rows, content.gaussians, content.paths, content.scene
-    colours = _material_colours(content)
-    return {
-        "title": content.title,
-        "notes": content.notes,
+    """Plain data of the page: the content by the names of its fields, arrays as of `packed`, and colours."""
+    data: dict[str, Any] = plain(content)
+    if content.rows is not None:
+        data["rows"]["range"] = _range(content.rows.score, 2)
+    return data | {
         "scales": {name: [to_hex(c) for c in colormaps[m](np.linspace(0, 1, STOPS))] for name, m in SCALES.items()},
         "span_db": SPAN_DB,
         "ends": {name: colour for name, _, colour in ENDS},
-        "receivers": {"names": list(content.receivers), "position": packed(content.receivers_m)},
-        "meshes": [] if scene is None else [_mesh(mesh, colours[mesh.material]) for mesh in scene.meshes],
-        "edges": None if scene is None else packed(scene.edges_m),
-        "rows": None if rows is None else _rows(rows),
-        "gaussians": None
-        if gaussians is None
-        else {
-            "position": packed(gaussians.position_m),
-            "scale": packed(np.log(np.maximum(gaussians.scale_m, 1e-9))),
-            "rotation": packed(gaussians.rotation_xyzw),
-            "strength": packed(gaussians.strength_db),
-            "total": gaussians.total,
-        },
-        "paths": None
-        if paths is None
-        else {
-            **{name: packed(getattr(paths, name)) for name in ("tx", "rx", "order", "kind")},
-            "kinds": list(paths.kinds),
-            "gain": packed(paths.gain_db),
-            "length": packed(paths.length_m),
-            "corners": packed(paths.corners_m),
-        },
-        "maps": [_map(one) for one in content.maps],
+        "colours": _material_colours(content),
         "quantities": _quantities(content.maps),
-    }
-
-
-def _mesh(mesh: MaterialMesh, colour: str) -> dict[str, Any]:
-    return {
-        "material": mesh.material,
-        "ceiling": mesh.ceiling,
-        "colour": colour,
-        "corners": packed(mesh.corners_m),
-        "surface": packed(mesh.surface),
-        "names": list(mesh.names),
     }
 
 
 def _material_colours(content: ViewContent) -> dict[str, str]:
     names = [] if content.scene is None else sorted({mesh.material for mesh in content.scene.meshes})
     others = [name for name in names if name not in MATERIALS]
-    colours = {name: OTHER_MATERIALS[index % len(OTHER_MATERIALS)] for index, name in enumerate(others)}
-    return MATERIALS | colours
-
-
-def _rows(rows: RowsContent) -> dict[str, Any]:
-    received = rows.score[np.isfinite(rows.score)]
-    low, high = np.percentile(received, [2, 98]) if received.size else (0.0, 1.0)
-    return {
-        "row": packed(rows.row),
-        "position": packed(rows.tx_pos_m),
-        "score": packed(rows.score),
-        "range": [float(low), float(high)],
-        "label": rows.label,
-        "digits": rows.digits,
-        "higher_is_better": rows.higher_is_better,
-        "stored": packed(rows.stored),
-        "observed": rows.observed,
-        "quantity": rows.quantity,
-    }
-
-
-def _map(one: MapContent) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "height": one.height_m,
-        "x": packed(one.x_m),
-        "y": packed(one.y_m),
-        "z": None if one.z_m is None else packed(one.z_m),
-        "receivers": list(one.receivers),
-        "values": {name: packed(values) for name, values in one.values.items()},
-    }
+    return MATERIALS | dict(zip(others, cycle(OTHER_MATERIALS), strict=False))
 
 
 def _quantities(maps: list[MapContent]) -> dict[str, Any]:
     """Label and common range of the colours of each quantity of all maps."""
-    found: dict[str, Any] = {}
+    quantities: dict[str, Any] = {}
     for name in dict.fromkeys(name for one in maps for name in one.values):
-        every = np.concatenate([one.values[name].ravel() for one in maps if name in one.values])
-        known = every[np.isfinite(every)]
-        low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
-        label = next(one.labels[name] for one in maps if name in one.labels)
-        found[name] = {"label": label, "range": [float(low), float(high)]}
-    return found
+        having = [one for one in maps if name in one.values]
+        values = np.concatenate([one.values[name].ravel() for one in having])
+        quantities[name] = {"label": having[0].labels[name], "range": _range(values, 1)}
+    return quantities
+
+
+def _range(values: NDArray[Any], tail: float) -> list[float]:
+    """Ends of a colour scale that leave a percentage of the known values beyond either of them."""
+    known = values[np.isfinite(values)]
+    return np.percentile(known, [tail, 100 - tail]).tolist() if known.size else [0.0, 1.0]

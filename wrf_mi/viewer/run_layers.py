@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..core.angles import FloatArray
-from ..core.paths import Paths
 from ..core.types import IntArray
 from ..models.gaussian.model import FittedField
 from ..models.ray_tracing import CORRECTED, PATHS
@@ -30,7 +29,8 @@ IMAGE_BYTES = 4_000_000
 """Bytes of a page for observations that are images, at most."""
 PATH_NUMBERS = 1_000_000
 """Coordinates of all paths of a page, at most: 2.7 MB."""
-WEAKEST_GAIN = 1e-20
+WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9
+"""Limits before logarithms."""
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
 OnStage = Callable[[str, float], None]
@@ -132,6 +132,7 @@ def gaussians_content(
     )
     if (scale == scale[:1]).all() and (rotation == rotation[:1]).all():
         scale, rotation = scale[:1], rotation[:1]
+    log_scale = np.log(np.maximum(scale, SMALLEST_M))
     total = strength.shape[1]
     notes = []
     if len(order) < total:
@@ -139,7 +140,7 @@ def gaussians_content(
             f"Gaussians: the {len(order)} of {total} of the largest mean power over the stored transmitters "
             "(option --gaussians)."
         )
-    return GaussiansContent(clouds[0].position_m[order], scale, rotation, strength[:, order], total), notes
+    return GaussiansContent(clouds[0].position_m[order], log_scale, rotation, strength[:, order], total), notes
 
 
 def run_scene(run: Run, frequency_hz: float) -> Any | None:
@@ -153,7 +154,7 @@ def paths_content(
     rows: IntArray,
     tx_pos_m: FloatArray,
     scene: Any | None,
-    options: ViewOptions,
+    limits: ViewOptions,
     on_stage: OnStage,
     progress: bool,
 ) -> tuple[PathsContent | None, list[str]]:
@@ -163,26 +164,21 @@ def paths_content(
         traced, source = load_trace(run.folder / PATHS).of_transmitters(rows), "as stored in the run"
     elif scene is not None:
         on_stage("tracing paths", 0.0)
-        traced = _traced(run, scene, tx_pos_m, progress)
+        # The options that the run's settings state, else those of `wrf_mi.tracing`.
+        settings, record = run.config.settings, run.problem.record
+        options = getattr(getattr(settings, "traced", settings), "options", None)
+        options = options if isinstance(options, TraceOptions) else TraceOptions()
+        traced = trace_paths(scene, tx_pos_m, record.receivers, options, progress, tx_antenna=record.tx_antenna)
         depth = traced.options.max_depth
         source = f"traced for this view in {run.config.scene}, at most {depth} interactions, {traced.rays} rays"
     else:
         return None, []
-    found = path_layer(traced, options.paths)
+    found = path_layer(traced, limits.paths)
     notes = [f"Paths: {source}."]
     if len(found.tx) < len(traced.paths):
         text = f"the strongest {len(found.tx)} of {len(traced.paths)}"
-        notes.append(f"Paths: {text}, at most {options.paths} of each transmitter to each receiver.")
+        notes.append(f"Paths: {text}, at most {limits.paths} of each transmitter to each receiver.")
     return found, notes
-
-
-def _traced(run: Run, scene: Any, tx_pos_m: FloatArray, progress: bool) -> TraceResult:
-    """Paths by the options that the run's settings state, else by those of `wrf_mi.tracing`."""
-    settings, record = run.config.settings, run.problem.record
-    stated = getattr(settings, "traced", settings)
-    options = getattr(stated, "options", None)
-    options = options if isinstance(options, TraceOptions) else TraceOptions()
-    return trace_paths(scene, tx_pos_m, record.receivers, options, progress, tx_antenna=record.tx_antenna)
 
 
 def path_layer(traced: TraceResult, most: int) -> PathsContent:
@@ -192,7 +188,9 @@ def path_layer(traced: TraceResult, most: int) -> PathsContent:
     pair = paths.tx + paths.n_tx * paths.rx
     order = np.lexsort((-gain_db, pair))
     rank = np.arange(len(order)) - np.searchsorted(pair[order], pair[order])
-    kept = np.sort(order[rank < min(most, _affordable(paths))])
+    # Paths of each pair of devices that a page has room for.
+    room = PATH_NUMBERS // (3 * (paths.interactions.shape[1] + 2) * max(1, paths.n_tx * paths.n_rx))
+    kept = np.sort(order[rank < min(most, max(1, room))])
     paths, gain_db = paths.select(kept), gain_db[kept]
     bounces = paths.bounces
     receivers_m = np.stack([receiver.position_m for receiver in traced.receivers])
@@ -206,8 +204,3 @@ def path_layer(traced: TraceResult, most: int) -> PathsContent:
     return PathsContent(
         paths.tx, paths.rx, bounces, kind.reshape(-1), words, gain_db, paths.length_m, np.concatenate(corners)
     )
-
-
-def _affordable(paths: Paths) -> int:
-    """Number of paths of each pair of devices that a page has room for."""
-    return max(1, PATH_NUMBERS // (3 * (paths.interactions.shape[1] + 2) * max(1, paths.n_tx * paths.n_rx)))

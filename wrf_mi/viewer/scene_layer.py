@@ -11,9 +11,8 @@ import trimesh
 
 from ..core import InputError
 from ..runs.scene_view import surfaces_of
-from ..scene.coordinates import require_near
 from ..scene.preview import ceiling_faces, free_edges
-from ..scene.surfaces import Surface, mesh_parts
+from ..scene.surfaces import Surface
 from ..tracing import open_scene
 from ..tracing.scenes import MESHES
 from .content import MaterialMesh, SceneContent
@@ -23,7 +22,8 @@ MOST_TRIANGLES = 100_000
 MOST_EDGES = 20_000
 OPENED_HZ = 3.5e9
 """Carrier at which a scene without data is opened; materials are shown by name, so that it has no influence."""
-NO_MATERIAL = "no material"
+NO_MATERIAL, ANY_MATERIAL = "no material", "concrete"
+"""Label of a bare mesh, and the material that it is opened with."""
 
 
 def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
@@ -36,21 +36,11 @@ def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Su
     Raises:
         InputError: no such scene, or one that cannot be opened.
     """
-    path = Path(source)
-    if path.suffix.lower() not in MESHES or material is not None:
-        return surfaces_in(open_scene(source, OPENED_HZ, material=material))
-    if not path.is_file():
+    bare = material is None and Path(source).suffix.lower() in MESHES
+    if bare and not Path(source).is_file():
         raise InputError(f"{source}: no such file; give a run folder, a map or a scene")
-    parts = mesh_parts(path)
-    if not parts:
-        raise InputError(f"{source}: holds no surface; give a scene with triangles")
-    names = [path.stem] if len(parts) == 1 else [f"{path.stem}_{index}" for index in range(len(parts))]
-    surfaces = []
-    for name, part in zip(names, parts, strict=True):
-        require_near(np.asarray(part.vertices), source)
-        part.merge_vertices()
-        surfaces.append(Surface(name, "other", np.asarray(part.vertices, float), np.asarray(part.faces)))
-    return surfaces, dict.fromkeys(names, NO_MATERIAL)
+    surfaces, materials = surfaces_in(open_scene(source, OPENED_HZ, material=ANY_MATERIAL if bare else material))
+    return surfaces, dict.fromkeys(materials, NO_MATERIAL) if bare else materials
 
 
 def surfaces_in(scene: Any) -> tuple[list[Surface], dict[str, str]]:

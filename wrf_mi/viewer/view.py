@@ -4,15 +4,30 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from wrf_mi_scenes import scenes
 
 from ..core import InputError
+from ..core.angles import FloatArray
 from ..core.files import write_atomically
+from ..core.types import IntArray
+from ..runs.folder import CONFIG
+from ..runs.results import read_run
+from ..runs.run import Run, open_run
+from ..tasks.conditions import scene_carrier
 from .content import SHOWN_GAUSSIANS, SHOWN_PATHS, STORED_TRANSMITTERS, ViewContent, ViewOptions
-from .gather import Source, gather
+from .map_layer import is_map, read_map, thinned
 from .page import page, plotly_js
+from .run_layers import OnStage, gaussians_content, paths_content, rows_content, run_scene
+from .scene_layer import read_scene, scene_content, surfaces_in
+
+Source = str | Path | Run | Any
+"""A run, its folder, a scene by name, folder or file, a ``sionna.rt.Scene``, a map file or an ``xarray.Dataset``."""
 
 LARGEST_BYTES = 15_000_000
 """Largest size of a page."""
@@ -62,6 +77,93 @@ class View:
         return f'<iframe srcdoc="{html.escape(self.html)}" style="{frame}" title="wrf_mi view"></iframe>'
 
 
+@dataclass
+class _Gathered:
+    """What is known of a view, source by source."""
+
+    options: ViewOptions
+    material: str | None
+    on_stage: OnStage
+    progress: bool
+    content: ViewContent = field(default_factory=lambda: ViewContent(""))
+    titles: list[str] = field(default_factory=list)
+    scene: tuple[Any, dict[str, str]] | None = None
+    material_used: bool = False
+
+    def add(self, source: Source) -> None:
+        """Add a source, by its kind."""
+        if isinstance(source, Run):
+            self._add_run(source)
+        elif hasattr(source, "data_vars"):
+            self._add_map(source)
+        elif hasattr(source, "mi_scene"):
+            self.titles.append("scene")
+            self._take_scene(*surfaces_in(source))
+        elif not Path(source).exists() and str(source) not in scenes():
+            known = ", ".join(scenes())
+            raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {known})")
+        elif (Path(source) / CONFIG).is_file():
+            self._add_run(open_run(source))
+        elif is_map(Path(source)):
+            self._add_map(source)
+        else:
+            self.on_stage("opening the scene", 0.0)
+            self.titles.append(Path(source).name)
+            self._take_scene(*read_scene(source, self.material))
+            self.material_used = True
+
+    def _add_map(self, source: Any) -> None:
+        found, notes = read_map(source)
+        self.content.maps.append(found)
+        self.content.notes += notes
+        self.titles.append(found.name)
+
+    def _take_scene(self, surfaces: Any, materials: dict[str, str]) -> None:
+        if self.scene is None:
+            self.scene = surfaces, materials
+
+    def _add_run(self, run: Run) -> None:
+        """Add what a run has and no earlier one: rows, scene, Gaussians, paths."""
+        content, results, record = self.content, read_run(run.folder), run.problem.record
+        self.titles.append(f"{results.name}: {run.config.model} on {record.name}")
+        first = content.rows is None
+        if first:
+            content.receivers = results.receivers
+            content.receivers_m = np.stack([receiver.position_m for receiver in record.receivers])
+            content.rows, notes = rows_content(results, self.options)
+            content.notes += notes
+        scene = None
+        if run.config.scene is not None:
+            self.on_stage("opening the scene", 0.0)
+            scene = run_scene(run, scene_carrier(record))
+            self._take_scene(*surfaces_in(scene))
+        if content.rows is None:
+            return
+        stored = content.rows.stored
+        numbers, positions = content.rows.row[stored], content.rows.tx_pos_m[stored]
+        same = [receiver.name for receiver in record.receivers] == list(content.receivers)
+        same = same and numbers.max() < len(record) and np.array_equal(record.tx_pos_m[numbers], positions)
+        if not first and not same:
+            content.notes.append(f"{results.name}: of other data than the first run; only its scene is shown.")
+            return
+        if content.gaussians is None:
+            content.gaussians, notes = gaussians_content(run, positions, self.options, self.on_stage)
+            content.notes += notes
+        if content.paths is None:
+            self._add_paths(run, numbers, positions, scene)
+
+    def _add_paths(self, run: Run, numbers: IntArray, positions: FloatArray, scene: Any) -> None:
+        try:
+            found, notes = paths_content(
+                run, numbers, positions, scene, self.options, self.on_stage, progress=self.progress
+            )
+        except InputError as error:
+            # A transmitter inside a solid, for example, hides paths but nothing else.
+            found, notes = None, [f"Paths: not traced, {error}"]
+        self.content.paths = found
+        self.content.notes += notes
+
+
 def view(
     *sources: Source,
     transmitters: int = STORED_TRANSMITTERS,
@@ -97,4 +199,21 @@ def view(
     if not sources:
         raise InputError("view: nothing to show; give a run folder, a scene or a map")
     plotly_js()  # refused before the work
-    return View(gather(sources, options, material, on_stage, progress))
+    found = _Gathered(options, material, on_stage, progress)
+    for source in sources:
+        found.add(source)
+    if material is not None and not found.material_used:
+        raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
+    content = found.content
+    if found.scene is not None:
+        content.scene, note = scene_content(*found.scene)
+        content.notes += [note] if note else []
+    content.maps, notes = thinned(content.maps)
+    content.notes += notes
+    content.title = "; ".join(found.titles)
+    if not content.receivers:
+        content.receivers = tuple(dict.fromkeys(name for one in content.maps for name in one.receivers))
+        content.receivers_m = np.full((len(content.receivers), 3), np.nan)
+    if content.scene is None and content.rows is None and not content.maps:
+        raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")
+    return View(content)

@@ -7,10 +7,8 @@ import time
 
 import numpy as np
 import pytest
-from wrf_mi_scenes.divided import cluttered_room, divided_room
-
-from wrf_mi.runs import timing
-from wrf_mi.runs.timing import (
+from wrf_mi_bench import timing
+from wrf_mi_bench.timing import (
     Interval,
     bootstrap,
     exponent,
@@ -20,6 +18,7 @@ from wrf_mi.runs.timing import (
     ratio,
     split,
 )
+from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 BUSY_S = 0.02
 ARRAY_MB = 64

@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 import psutil
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap as resampled
-from threadpoolctl import threadpool_limits
 
-from ..backend import init
-from ..core.angles import FloatArray
+from wrf_mi.backend import init
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.tasks.scores import Interval, bootstrap
 
 init()
 
@@ -37,23 +36,8 @@ Call = Callable[[], Any]
 
 REPEATS, WARM_UP = 15, 2
 """Timed calls, and calls before them: the first compiles, the second still fills caches."""
-RESAMPLES = 2000
-"""Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
-CONFIDENCE = 0.95
 RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 LOOK_EVERY_S = 1e-3
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A median with the limits of its 95 % bootstrap interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
 
 
 @dataclass(frozen=True)
@@ -73,39 +57,6 @@ class Split:
     execution: float
     kernels: int
     compiled: int
-
-
-def bootstrap(samples: ArrayLike, statistic: Callable[..., Any] = np.median, seed: int = 0) -> Interval:
-    """Statistic of independent samples [n] with its 95 % percentile interval.
-
-    Args:
-        samples: samples, one at least.
-        statistic: function of an array and ``axis``.
-        seed: seed of the resamples.
-
-    Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), section 13.3; `scipy.stats.bootstrap`.
-    """
-    values = np.asarray(samples, float)
-    if values.ndim != 1 or not len(values):
-        raise ValueError(f"bootstrap: samples of shape {values.shape}; give [n], one at least")
-    return _interval([values], statistic, seed)
-
-
-def _interval(samples: Sequence[FloatArray], statistic: Callable[..., Any], seed: int) -> Interval:
-    # SciPy asks for two samples; a single one twice has the same quantiles.
-    data = [np.resize(values, max(2, len(values))) for values in samples]
-    draws: dict[str, Any] = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "rng": seed}
-    low, high = resampled(data, statistic, method="percentile", vectorized=True, **draws).confidence_interval
-    return Interval(float(statistic(*data, axis=-1)), float(low), float(high))
-
-
-def one_blas_thread() -> AbstractContextManager[Any]:
-    """Context with BLAS on one thread, as its threads spin while they wait for each other.
-
-    Where another process has a core, the spectrum of an array would take twenty times as long.
-    """
-    result: AbstractContextManager[Any] = threadpool_limits(1, "blas")
-    return result
 
 
 def settle(result: Any) -> None:
@@ -272,7 +223,7 @@ def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) 
     def slope(*samples: FloatArray, axis: int) -> Any:
         return np.tensordot(x, np.log([np.median(values, axis=axis) for values in samples]), 1) / (x @ x)
 
-    return _interval([np.asarray(values, float) for values in list(times)[kept]], slope, seed)
+    return bootstrap(*list(times)[kept], statistic=slope, seed=seed)
 
 
 def larger_half(count: int) -> slice:

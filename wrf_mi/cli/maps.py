@@ -1,0 +1,195 @@
+"""``wrf-mi map``, ``locate`` and ``view``: maps, positions and views of runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..core import InputError
+from .options import Arguments, add_command
+from .output import Watch, show, summary_table
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``map``, ``locate`` and ``view`` to the commands."""
+    for add in (_add_map, _add_locate, _add_view):
+        add(commands)
+
+
+def _add_map(commands: Any) -> None:
+    text = "map power, coverage and best receiver over a plane or a mesh"
+    parser = add_command(commands, "map", map_command, text)
+    add = parser.add_argument
+    add("run", metavar="RUN", help="run folder")
+    add("--out", required=True, metavar="FILE", help="file to write: MAP.nc, MAP.zarr or MAP.csv; beside it MAP.png")
+    text = "z of the transmitter, metres (default: the median of the data's); the grid covers the scene, or the data"
+    add("--height", type=float, metavar="M", help=text)
+    text = "mesh whose faces' centres are the positions, in place of the grid (PLY, STL, OBJ, GLB; metres)"
+    add("--surface", metavar="MESH", help=text)
+    text = "spacing of the grid, metres (default: 0.1), or longest edge of the mesh's faces, which are halved"
+    add("--step", type=float, metavar="M", help=text)
+    text = "name of a receiver, repeatable (default: all)"
+    add("--receiver", action="append", metavar="NAME", help=text)
+    text = "received power above which a position is covered, dBm (default: -90; in dB for spectra, where none is set)"
+    add("--threshold", type=float, metavar="DBM", help=text)
+    text = "transmit power, dBm: what path gain and received power differ by (default: 0)"
+    add("--transmit-power", type=float, default=0.0, metavar="DBM", help=text)
+    text = "yaw of the transmitter, degrees, for models that know it (default: mean over 8 headings)"
+    add("--heading", type=float, metavar="DEG", help=text)
+    add("--frequency", type=float, metavar="HZ", help="carrier, where the data have several")
+
+
+def map_command(a: Arguments) -> int:
+    """Write a radio map and its picture."""
+    from ..core.files import write_figure
+    from ..maps.api import radio_map
+    from ..maps.dataset import check_map_file, write_map
+    from ..maps.picture import map_figure
+    from ..runs.run import open_run
+
+    out = Path(a.out)
+    check_map_file(out)
+    run = open_run(a.run)
+    with Watch() as watch:
+        dataset = radio_map(
+            run,
+            height_m=a.height,
+            step_m=a.step,
+            surface=a.surface,
+            receivers=a.receiver,
+            threshold_dbm=a.threshold,
+            transmit_dbm=a.transmit_power,
+            heading_deg=a.heading,
+            frequency_hz=a.frequency,
+            on_progress=watch.on_progress,
+        )
+    write_map(dataset, out)
+    picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))
+    if "power_std_db" not in dataset:
+        print("no coverage: the model states no standard deviation; train with --intervals", file=sys.stderr)
+    sizes = {str(name): int(dataset.sizes[name]) for name in ("receiver", "y", "x", "point") if name in dataset.sizes}
+    names = [str(name) for name in dataset.data_vars]
+    shape = " x ".join(str(count) for name, count in sizes.items() if name != "receiver")
+    text = f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}"
+    return show(a.json, {"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names}, text)
+
+
+def _add_locate(commands: Any) -> None:
+    parser = add_command(commands, "locate", locate_command, "position of a transmitter from what receivers received")
+    add = parser.add_argument
+    add("run", metavar="RUN", help="run folder of a model of signal strengths that states standard deviations")
+    text = (
+        "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was received, "
+    )
+    text += "and true positions x, y in metres if known (default: the test rows of the run)"
+    add("--input", metavar="FILE.csv", help=text)
+    text = "file to write: estimate x, y, z, radius and area of the region, nearest neighbours; FILE.png beside it"
+    add("--out", required=True, metavar="FILE.csv", help=text)
+    text = "also write the probability of each position: arrays x_m, y_m, height_m, probability"
+    add("--posterior", metavar="FILE.npz", help=text)
+    add("--level", type=float, default=0.9, metavar="P", help="probability that regions hold (default: 0.9)")
+    add("--step", type=float, metavar="M", help="distance between positions (default: 0.25 m, more for large areas)")
+    add("--height", type=float, metavar="M", help="height of the transmitters (default: that of the run's data)")
+    text = "standard deviation of the transmitter's power about that of the data (default: chosen by held-out rows)"
+    add("--offset", type=float, metavar="DB", help=text)
+
+
+def locate_command(a: Arguments) -> int:
+    """Write positions to a file, and a picture beside it."""
+    from ..core.array_files import write_arrays
+    from ..core.files import write_figure
+    from ..maps.locate import locate, located_run
+    from ..maps.locate_figure import draw_positions
+    from ..maps.locate_file import (
+        figures_of,
+        posterior_arrays,
+        read_observations,
+        test_observations,
+        write_positions_file,
+    )
+
+    out = Path(a.out)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: positions are written as .csv; give such a name")
+    if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
+        raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
+    run = located_run(a.run)
+    strengths_dbm, true_m = (
+        test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
+    )
+    options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
+    with Watch(resumable=True) as watch:
+        found = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
+    picture = out.with_suffix(".png")
+    write_positions_file(out, found, true_m)
+    write_figure(picture, draw_positions(run, found, true_m))
+    if a.posterior is not None:
+        write_arrays(Path(a.posterior), posterior_arrays(found), compressed=True)
+    figures = figures_of(found, true_m)
+    text = f"{_summary(figures)}\n{len(found)} positions: {out}\npicture: {picture}"
+    return show(a.json, {"out": str(out), "picture": str(picture), **figures}, text)
+
+
+def _summary(figures: dict[str, Any]) -> str:
+    form, held = figures["likelihood"], figures.get("held_out")
+    shape = "normal" if form["degrees"] is None else f"Student-t of {form['degrees']:g} degrees of freedom"
+    text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
+    text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
+    text += ", receivers that received nothing count" if form["silence"] else ""
+    if held is None:
+        text += " (default: the run has too few training rows to hold any out)"
+    else:
+        share = f"{held['inside']:.0%} inside their 90 % regions"
+        what = f"{held['rows']} predictions of held-out training rows"
+        text += f", chosen by {what}: {share}, mean error {held['error_m']:.2f} m"
+    known = {
+        f"area of the {figures['level']:.0%} region (m2)": figures["area_m2"],
+        f"radius of {figures['level']:.0%} (m)": figures["radius_m"],
+        "error (m)": figures.get("error_m"),
+    }
+    if "neighbours" in figures:
+        known[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
+    text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
+    if "inside" in figures:
+        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {figures['level']:.0%} regions"
+    return text
+
+
+def _add_view(commands: Any) -> None:
+    text = "write an interactive 3D view of a run, a scene and maps: one HTML file that needs no network"
+    parser = add_command(commands, "view", view_command, text)
+    add = parser.add_argument
+    text = "run folder; scene: name, folder, Mitsuba XML or mesh; map: NetCDF file or Zarr folder. Several are combined"
+    add("sources", nargs="+", metavar="RUN|SCENE|MAP", help=text)
+    add("--out", required=True, metavar="VIEW.html", help="file to write")
+    text = "held-out rows whose observations, Gaussians' signals and paths are stored (default: 40)"
+    add("--transmitters", type=int, metavar="N", help=text)
+    add("--gaussians", type=int, metavar="N", help="Gaussians, the strongest (default: 1000)")
+    add(
+        "--paths",
+        type=int,
+        metavar="N",
+        help="paths of each transmitter to each receiver, the strongest (default: 200)",
+    )
+    add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete (default: none)")
+
+
+def view_command(a: Arguments) -> int:
+    """Write a view."""
+    from ..viewer.view import view
+
+    out = Path(a.out)
+    if out.is_dir():
+        raise InputError(f"{out}: a folder; give the name of a file, such as {out / 'view.html'}")
+    limits = {name: getattr(a, name) for name in ("transmitters", "gaussians", "paths")}
+    limits = {name: value for name, value in limits.items() if value is not None}
+    with Watch() as watch:
+        found = view(
+            *a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty()
+        )
+    size = found.write(out).stat().st_size
+    names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in found.counts}
+    counted = ", ".join(f"{n} {names[name][: -1 if n == 1 else None]}" for name, n in found.counts.items())
+    text = "\n".join([counted, *found.content.notes, f"view: {out} ({size / 1e6:.1f} MB)"])
+    return show(a.json, {"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes}, text)

@@ -1,0 +1,132 @@
+"""``wrf-mi evaluate``, ``predict``, ``compress`` and ``compare``: what is done with finished runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..core import InputError
+from .options import Arguments, add_command, add_operator, add_scheduler, check_operator
+from .output import Watch, show, show_metrics
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``evaluate``, ``predict``, ``compress`` and ``compare`` to the commands."""
+    for add in (_add_evaluate, _add_predict, _add_compress, _add_compare):
+        add(commands)
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = add_command(commands, "evaluate", evaluate_command, "score a run on its held-out rows")
+    parser.add_argument("run", metavar="RUN", help="run folder")
+    text = "score on the test rows of another split that the run was not trained on; nothing is written"
+    parser.add_argument("--split", help=text)
+    text = (
+        "draw how reliable probabilities of coverage are on the test rows, P(level > threshold) against observed share"
+    )
+    parser.add_argument("--reliability", metavar="FILE.png", help=text)
+    add_operator(parser)
+
+
+def evaluate_command(a: Arguments) -> int:
+    """Score a run again."""
+    from ..runs.api import evaluate_run
+
+    if a.reliability is not None and a.split is not None:
+        raise InputError("evaluate: --reliability is of the run's own test rows; omit --split")
+    if a.reliability is not None and Path(a.reliability).suffix.lower() != ".png":
+        raise InputError(f"{a.reliability}: the picture is written as .png; give such a name")
+    check_operator(a)
+    metrics = evaluate_run(a.run, a.split, not a.no_operator)
+    if a.reliability is not None:
+        metrics["coverage"] = _reliability(Path(a.run), Path(a.reliability))
+    show_metrics(metrics, None if a.split else Path(a.run), a.json)
+    if a.reliability is not None and not a.json:
+        error, score = metrics["coverage"]["error"], metrics["coverage"]["brier"]
+        print(f"coverage: observed share off by {error:.3f} on average, Brier score {score:.3f}: {a.reliability}")
+    return 0
+
+
+def _reliability(run: Path, picture: Path) -> dict[str, Any]:
+    """Draw the reliability of coverage; its errors and thresholds."""
+    from ..core.files import write_figure
+    from ..maps.coverage import reliability_figure, run_reliability
+
+    found = run_reliability(run)
+    write_figure(picture, reliability_figure({run.resolve().name: found}))
+    return {"error": found.error, "brier": found.brier, "threshold_db": found.threshold_db.tolist()}
+
+
+def _add_predict(commands: Any) -> None:
+    parser = add_command(commands, "predict", predict_command, "predict at new transmitter positions")
+    parser.add_argument("run", metavar="RUN", help="run folder")
+    given = parser.add_mutually_exclusive_group(required=True)
+    text = "positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
+    given.add_argument("--tx", metavar="FILE.csv", help=text)
+    text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
+    given.add_argument("--input", metavar="FILE.npz", help=text)
+    text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
+    parser.add_argument("--out", required=True, metavar="FILE", help=text)
+    add_operator(parser)
+    add_scheduler(parser)
+
+
+def predict_command(a: Arguments) -> int:
+    """Write predictions to a file."""
+    from ..parallel import open_scheduler
+    from ..runs.api import predict_to_file
+    from ..runs.prediction_file import read_inputs
+
+    check_operator(a)
+    inputs = read_inputs(a.tx, a.input)
+    with open_scheduler(a.scheduler) as scheduler:
+        positions = (inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
+        workers = scheduler if a.scheduler else None
+        given: dict[str, Any] = {"uplink": inputs.uplink, "carriers_hz": inputs.carriers_hz}
+        shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
+    value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
+    return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
+
+
+def _add_compress(commands: Any) -> None:
+    text = "make a smaller and faster run of a run, and measure the loss of accuracy"
+    parser = add_command(commands, "compress", compress_command, text)
+    add = parser.add_argument
+    add("run", metavar="RUN", help="run folder")
+    add("--out", required=True, metavar="RUN2", help="run folder to make")
+    add("--budget", type=int, default=0, metavar="N", help="number of Gaussians to keep (default: all)")
+    add("--width", type=int, default=0, metavar="N", help="neurons per layer of a smaller network")
+    add("--layers", type=int, default=0, metavar="N", help="hidden layers of a smaller network")
+    add("--terms", type=int, default=0, metavar="K", help="convert to a factorised field of K terms")
+    text = "steps in which the smaller network learns the old one's output (default: 6000)"
+    add("--distil", type=int, default=6000, metavar="STEPS", help=text)
+    add("--fine-tune", type=int, default=0, metavar="STEPS", help="further steps on the training rows (default: 0)")
+    add("--precision", default="half", help="precision of stored numbers: single, half (default) or 8bit")
+
+
+def compress_command(a: Arguments) -> int:
+    """Compress a run."""
+    from ..runs.compressed import compress_run, render
+    from ..training.compress import Compression
+
+    how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
+    with Watch() as watch:
+        found = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
+    return show(a.json, found, f"{render(found)}\nresults: {a.out}")
+
+
+def _add_compare(commands: Any) -> None:
+    text = "write a page that compares runs: tables, paired differences, pictures, commands (docs/compare.md)"
+    parser = add_command(commands, "compare", compare_command, text, json_output=False)
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder to write to")
+
+
+def compare_command(a: Arguments) -> int:
+    """Compare runs."""
+    from ..runs.compare import compare
+
+    with Watch() as watch:
+        page = compare(a.runs, a.out, watch.on_progress)
+    print(f"comparison: {page}")
+    return 0
