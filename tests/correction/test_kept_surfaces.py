@@ -8,10 +8,9 @@ import numpy as np
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.correction import CorrectionOptions
-from wrf_mi.correction.fit import Fit, Found, Known
-from wrf_mi.correction.least_squares import Noise, Solution
+from wrf_mi.correction.choices import ABSENT, ABSENT_VALUES, material_places
+from wrf_mi.correction.fit import Fit, State
 from wrf_mi.correction.misfit import Misfit, search_options
-from wrf_mi.correction.search import ABSENT, ABSENT_VALUES, material_places
 from wrf_mi.tracing import open_scene
 
 
@@ -31,10 +30,9 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> No
     slab = next(k for k, name in enumerate(first.misfit.sides[0].slabs.names) if name.startswith("wall_01"))
     vector = first.stated.copy()
     vector[material_places(first.misfit, slab)] = ABSENT_VALUES
-    known = Known("materials", vector, {first.misfit.sides[0].slabs.names[slab]: ABSENT})
-    found = Found(Solution(vector, np.eye(len(vector)), Noise(1.0, 1.0)), known)
+    state = State("materials", vector, vector, {first.misfit.sides[0].slabs.names[slab]: ABSENT})
     second = fit(0, (first.misfit.planes, first.misfit.slabs))
     assert not second.misfit.counts()[1][slab]
-    over = second.carried_over(found, first)
-    assert second.absent(over.known, over.vector) == first.absent(known, vector) != frozenset()
+    over = second.carried_over(state, first)
+    assert second.absent(over) == first.absent(state) != frozenset()
     np.testing.assert_array_equal(over.vector, vector)

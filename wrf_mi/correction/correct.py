@@ -1,6 +1,6 @@
 """Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-Paths are found with the stated scene; choice (`wrf_mi.correction.search`) and least squares
+Paths are found with the stated scene; choice (`wrf_mi.correction.moves`) and least squares
 (`wrf_mi.correction.least_squares`) are done in rounds on training rows, once more with the paths of the scene that they
 found where planes have moved. What is kept is decided on other training rows.
 """
@@ -36,9 +36,10 @@ from ..tracing.instrument_parameters import gain_name
 from ..tracing.moved_scene import moved_search
 from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
-from .fit import LEAST_PATHS, Fit, Found
+from .fit import LEAST_PATHS, Fit, State
 from .misfit import Misfit, search_options
-from .options import DEFAULTS, FRAME, GAIN, HIDDEN, PLANES, STRENGTHS, CorrectionOptions, OnStage
+from .moves import Moves
+from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
 
 LEVEL = 0.9
 """Level of the intervals for which errors of rows that a scene knows are enlarged."""
@@ -150,14 +151,13 @@ def correct_scene(
     parts = _parts(record, split)
     hidden = _surfaces_of(prepared.tables("surface").slabs.names, supposed)
 
-    def fit_of(record: Record, rows: IntArray, found: Found | None = None, by: Fit | None = None) -> Fit:
-        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a fit has found."""
+    def fit_of(record: Record, rows: IntArray, state: State | None = None, by: Fit | None = None) -> Fit:
+        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a state has them."""
         on_stage("tracing", 0.0)
         searched = None
-        if found and by and _moves(found.known.stage):
-            absent = by.absent(found.known, found.vector)
-            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(found).items()}
-            searched = moved_search(copy, prepared.surfaces, parameters, absent)
+        if state and by and _moves(state.stage):
+            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(state).items()}
+            searched = moved_search(copy, prepared.surfaces, parameters, by.absent(state))
         # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
         further = (by.misfit.planes, by.misfit.slabs) if by else hidden
         how = search_options(options), options.changes, prepared, searched, further
@@ -168,16 +168,16 @@ def correct_scene(
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
-    chosen = {stage: _Stage(found, trial) for stage, found in trial.all_parts().items()}
+    chosen = {stage: (Moves(trial, stage).found(), trial) for stage in _stages(options)}
     stated = fit_of(parts.held, parts.held_rows).misfit
     unseen = dict.fromkeys(chosen, stated)
     scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}
-    for stage, (found, by) in chosen.items():
+    for stage, (state, by) in chosen.items():
         if _moves(stage):
-            again = fit_of(parts.known, parts.known_rows, found, by)
-            found, by = chosen[stage] = _Stage(again.continued(found, by), again)
-            unseen[stage] = fit_of(parts.held, parts.held_rows, found, by).misfit
-        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], found, by))
+            again = fit_of(parts.known, parts.known_rows, state, by)
+            state, by = chosen[stage] = Moves(again, stage).continued(state, by), again
+            unseen[stage] = fit_of(parts.held, parts.held_rows, state, by).misfit
+        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
     judged = {key: parts.units(score) for key, score in scores.items()}
     kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
@@ -186,14 +186,11 @@ def correct_scene(
     materials, parameters, data = dict[str, str](), dict[str, FloatArray](), None
     absent = final.misfit.slabs[list(final.supposed.values())].tolist()
     if best:
-        start = final.carried_over(*best)
-        solution = final.solve(kept, start.vector, start.known.mean)
-        last = Found(solution, start.known)
-        vector, free, parameters = solution.vector, final.free(kept), final.of_scene(last)
-        deviation[free] = np.sqrt(np.diag(solution.covariance))
-        materials, absent = dict(start.known.materials), final.absent(start.known, vector)
+        state = final.solved(final.carried_over(*best))
+        vector, free, parameters = state.vector, final.free(kept), final.of_scene(state)
+        deviation[free], others = final.uncertainty(state)
+        materials, absent = dict(state.materials), final.absent(state)
         before = _vector_at(parts, unseen[kept], *best), parts.with_mean_gain(vector, final.misfit)
-        others = final.left_out_residuals(kept, solution)
         ratio = _error_ratio(unseen[kept], before[0], final.misfit, before[1], others)
         data = CorrectionData(name, split.all_train, ratio)
     kinds = _kinds(scene)
@@ -230,16 +227,17 @@ def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArr
     return np.array([int(parts[slab][1]) for slab in slabs], np.int64), slabs
 
 
-class _Stage(NamedTuple):
-    """What a stage has found, and the fit that has."""
+def _stages(options: CorrectionOptions) -> list[str]:
+    """Parts that are changed together: materials without planes, and all."""
+    stages, still = ["+".join(options.parts)], [part for part in options.parts if part not in (PLANES, FRAME)]
+    if MATERIALS in still and len(still) < len(options.parts):
+        stages.insert(0, "+".join(still))
+    return stages
 
-    found: Found
-    by: Fit
 
-
-def _vector_at(parts: _Parts, misfit: Misfit, found: Found, by: Fit) -> FloatArray:
-    """Vector of a misfit of other rows from what a fit has found, with the mean gain at receivers held out."""
-    return parts.with_mean_gain(misfit.vector_of(by.of_scene(found)), misfit)
+def _vector_at(parts: _Parts, misfit: Misfit, state: State, by: Fit) -> FloatArray:
+    """Vector of a misfit of other rows from a state of a fit, with the mean gain at receivers held out."""
+    return parts.with_mean_gain(misfit.vector_of(by.of_scene(state)), misfit)
 
 
 def _error_ratio(unseen: Misfit, found: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:

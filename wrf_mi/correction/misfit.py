@@ -305,6 +305,9 @@ class Misfit:
             found[places] = task.score(values.reshape(truth.shape), truth)
         return found
 
+    def accept(self, vector: FloatArray) -> None:
+        """Nothing, as residuals are exact at all vectors (`wrf_mi.correction.path_sum.PathSum.accept`)."""
+
     @property
     def plane_entries(self) -> IntArray:
         """Entries of the vector that are the planes' shifts, then their tilts; none where planes are not parameters."""

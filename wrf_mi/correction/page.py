@@ -36,11 +36,11 @@ from ..tracing.corrected_scene import (
 )
 from ..tracing.material_parameters import SURFACE, name_of, slabs_of_faces
 from ..tracing.plane_parameters import SHIFT, TILT
+from .choices import CONSTANTS, QUANTITIES
 from .correct import Correction
 from .fit import LEAST_PATHS
 from .frame import rigid_motion, scene_entries
 from .options import FRAME, MATERIALS
-from .search import CONSTANTS, QUANTITIES
 
 PAGE, PICTURE = "correction.md", "correction.png"
 SUPPORTED = 0.5

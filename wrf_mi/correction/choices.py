@@ -1,17 +1,13 @@
-"""Materials and shifts of planes by exhaustive choice, one surface after another.
+"""Alternatives of surfaces and planes: common building materials, absence, and shifts on a lattice.
 
 Least squares start near the solution: within a quarter of a wavelength of each path's length and with roughly the right
-materials. Here each surface tries every common building material, and "absent"; each plane tries shifts. A choice
-is kept where it raises the likelihood by more than `GAIN`.
+materials. `wrf_mi.correction.moves` tries these alternatives.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from operator import itemgetter
-from typing import Protocol
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +15,10 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import (
-    EXPONENT,
-    LEAST_CONDUCTIVITY,
-    LEAST_SUSCEPTIBILITY,
-    SURFACE,
-    name_of,
-)
+from ..tracing.material_parameters import EXPONENT, LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, SURFACE, name_of
 from ..tracing.materials import itu_constants, itu_exponent
 from ..tracing.plane_parameters import SHIFT, TILT
-from .least_squares import Noise
 from .misfit import Misfit
-from .path_sum import PathSum, near
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
@@ -41,15 +29,8 @@ ABSENT = "absent"
 """Choice of a surface that waves do not notice."""
 ABSENT_VALUES = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, 0.001]), 0.0)
 """Its entries of the vector, in the order of `QUANTITIES`; 1 mm of almost nothing."""
-GAIN = 0.5
-"""Least increase of the log-likelihood for which a choice changes."""
-SWEEPS = 3
 JOINT = 10
 """Number of planes whose material and shift are chosen together."""
-REFINED = 8
-"""Number of shifts, the best with their best materials, that are compared after least-squares steps."""
-SHIFTS_EACH = 3
-"""Number of shifts of each material that are compared so, where materials are in doubt."""
 STEP = 1 / 16
 """Step of the shifts, wavelengths: paths change by up to an eighth."""
 FARTHEST = 2.0
@@ -86,6 +67,12 @@ class Choice:
     def joint(self) -> bool:
         """Whether material and shift are chosen together."""
         return bool(self.material.size and self.plane.size)
+
+    @property
+    def shifts(self) -> Choice:
+        """The shifts of a joint choice, for any material."""
+        values = {name.partition(", ")[2]: values[self.of_plane] for name, values in self.values.items()}
+        return replace(self, places=self.plane, values=values, of_plane=self.of_plane[self.of_plane])
 
 
 def material_choices(misfit: Misfit, hit: IntArray, frequency_hz: float) -> list[Choice]:
@@ -146,96 +133,3 @@ def joint_choices(
     ]
     done = {one.what for pair in pairs for one in pair}
     return [*joined, *(one for one in (*shifts, *materials) if one.what not in done)]
-
-
-class Rules(Protocol):
-    """What is known of a vector apart from observations."""
-
-    misfit: Misfit
-
-    def planes_cost(self, vector: FloatArray) -> float:
-        """Negative logarithm of the planes' prior, without its constant."""
-
-    def expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
-        """Entries ``places`` by all others, in place of alternatives' NaN."""
-
-    def refined(self, trials: Misfit | PathSum, vector: FloatArray, places: IntArray) -> FloatArray:
-        """The vector after some least-squares steps of the entries ``places`` on the residuals of ``trials``."""
-
-
-def choose(
-    rules: Rules,
-    vector: FloatArray,
-    choices: Sequence[Choice],
-    on_choice: Callable[[int, int], None],
-) -> tuple[FloatArray, dict[str, str]]:
-    """Coordinate descent over choices, in sweeps until none changes.
-
-    Args:
-        rules: residuals and prior of a vector.
-        vector: start [p].
-        choices: choices in the order in which they are tried.
-        on_choice: called with the number of choices tried and their number.
-
-    Returns:
-        The vector, and the material or shift taken by each choice that changed.
-    """
-    vector, taken = np.array(vector, float), dict[str, str]()
-    for sweep in range(SWEEPS):
-        trials = near(rules.misfit, vector)
-        noise, changed = Noise.of(trials.residual(vector)), False
-        for number, choice in enumerate(choices):
-            on_choice(sweep * len(choices) + number, SWEEPS * len(choices))
-            least, name, there = alternatives(rules, trials, noise, choice, vector)[0]
-            if least < cost(rules, trials, noise, vector) - GAIN:
-                taken[choice.what], vector, changed = name.partition(",")[0], there, True
-                if isinstance(trials, PathSum):
-                    trials.accept(there)
-        if not changed:
-            break
-    return vector, taken
-
-
-def cost(rules: Rules, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
-    """Negative logarithm of the likelihood of a vector and of the planes' prior, without its constant."""
-    return noise.cost(trials.residual(vector)) + rules.planes_cost(vector)
-
-
-def alternatives(
-    rules: Rules,
-    trials: Misfit | PathSum,
-    noise: Noise,
-    choice: Choice,
-    vector: FloatArray,
-    of_materials: bool = False,
-) -> list[tuple[float, str, FloatArray]]:
-    """Alternatives of a choice, those with the least cost first: cost, name and vector.
-
-    Of a material and a shift together, the best of some shifts, or with ``of_materials`` those of each material and the
-    plane where it is, are compared after least squares, too.
-    """
-    tried, expected = list[tuple[float, str, FloatArray]](), rules.expected(vector, choice.places)
-    for name, values in choice.values.items():
-        there = vector.copy()
-        there[choice.places] = np.where(np.isnan(values), expected, values)
-        tried.append((cost(rules, trials, noise, there), name, there))
-    tried.sort(key=itemgetter(0))
-    if choice.joint:
-        # A plane that is tilted, too, fits at the right shift only once its tilts do.
-        kind, each, most = (0, SHIFTS_EACH, len(tried)) if of_materials else (2, 1, REFINED)
-        count, few = Counter[str](), list[tuple[str, FloatArray]]()
-        for _, name, there in tried:
-            key = name.partition(",")[kind]
-            if count[key] < each and len(few) < most:
-                count[key] += 1
-                few.append((name, there))
-        if of_materials:  # also where the plane is, as the shifts above are those of a lattice
-            for name in count:
-                there = next(there for other, there in few if other.partition(",")[0] == name).copy()
-                there[choice.plane] = vector[choice.plane]
-                few.append((name, there))
-        places = choice.places if trials is rules.misfit else choice.plane
-        for name, there in few:
-            better = rules.refined(trials, there, places)
-            tried.append((cost(rules, trials, noise, better), name, better))
-    return sorted(tried, key=itemgetter(0))
