@@ -175,7 +175,8 @@ def test_rows_that_no_changed_path_reaches_are_kept(spectra: Misfit) -> None:
     """A material that some rows meet changes their reports, all others stay as they are."""
     trials, vector = PathSum(spectra, spectra.start), spectra.start.copy()
     slabs = np.arange(len(spectra.sides[0].slabs.names))
-    met = [np.unique(trials._row[(trials._slabs == slab).any(axis=1)]) for slab in slabs]
+    paths = spectra.paths
+    met = [np.unique(paths.row[(paths.slab == slab).any(axis=1)]) for slab in slabs]
     slab = next(slab for slab in slabs if 0 < len(met[slab]) < len(spectra.observed))
     vector[spectra.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     change = trials.residual(vector) - trials.residual(spectra.start)

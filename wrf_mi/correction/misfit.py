@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -44,6 +44,25 @@ LATTICE = (12, 40)
 """Most elevations and azimuths of the lattice of directions."""
 FLOOR = 0.5
 """Share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels."""
+
+
+class PathTable(NamedTuple):
+    """The n paths of a misfit.
+
+    Attributes:
+        entry: place of each path among the entries of its side's `wrf_mi.tracing.traced_field.TracedPaths` [n].
+        side: number of its side [n], ascending.
+        row: its row of `Misfit.residual` [n], ascending in a side.
+        plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.
+        reflects: whether it is reflected there [n, depth].
+    """
+
+    entry: IntArray
+    side: IntArray
+    row: IntArray
+    plane: IntArray
+    slab: IntArray
+    reflects: NDArray[np.bool_]
 
 
 class Misfit:
@@ -237,44 +256,41 @@ class Misfit:
             found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
         return found / self.unit[:, None] - self.observed
 
-    def entries(self) -> list[IntArray]:
-        """Places of each side's paths among the entries of its `wrf_mi.tracing.traced_field.TracedPaths`."""
-        return [np.flatnonzero(side.exists) for side in self.sides]
+    @cached_property
+    def paths(self) -> PathTable:
+        """Rows, sides and interactions of all paths, side by side."""
+        depth = max(len(side.chains.levels) for side in self.sides)
+        entries = [np.flatnonzero(side.exists) for side in self.sides]
+        sides = zip(self.sides, self.places, entries, strict=True)
+        row = [places[exists // (len(side.exists) // len(places))] for side, places, exists in sides]
+        met = zip(*(side.chains.met(depth) for side in self.sides), strict=True)
+        number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
+        return PathTable(np.concatenate(entries), number, np.concatenate(row), *map(np.concatenate, met))
 
-    def gains(self, vector: FloatArray, entries: Sequence[IntArray]) -> NDArray[np.complex128]:
-        """Gains of some paths of a vector, side by side, without exp(-j k length).
+    def gains(self, vector: FloatArray, which: IntArray) -> NDArray[np.complex128]:
+        """Gains of a vector [p], without exp(-j k length), of the paths ``which`` of `paths`, ascending."""
+        params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
+        for number in np.unique(paths.side[which]):
+            here = paths.side[which] == number
+            real, imaginary = self._gains[number](params, to_uint(paths.entry[which[here]]))
+            result[here] = np.asarray(real) + 1j * np.asarray(imaginary)
+        return result
 
-        Args:
-            vector: parameters [p].
-            entries: paths of each side, of `entries`.
-        """
-        params, found = self._device(vector), [np.zeros(0, complex)]
-        for gain, places in zip(self._gains, entries, strict=True):
-            if len(places):
-                real, imaginary = gain(params, to_uint(places))
-                found.append(np.asarray(real) + 1j * np.asarray(imaginary))
-        return np.concatenate(found)
-
-    def unit_signals(self, vector: FloatArray, entries: Sequence[IntArray]) -> list[NDArray[np.complex128]]:
-        """Signals [paths, elements] of some paths of each side at an array's elements, for gains of one.
-
-        Args:
-            vector: parameters [p].
-            entries: paths of each side, of `entries`.
-        """
-        params, found = self._device(vector), list[NDArray[np.complex128]]()
-        for side, model, places in zip(self.sides, self.models, entries, strict=True):
+    def unit_signals(self, vector: FloatArray) -> NDArray[np.complex128]:
+        """Signals [paths, elements] of all paths of a vector [p] at an array's elements, for gains of one."""
+        params, signals = self._device(vector), list[NDArray[np.complex128]]()
+        for number, (side, model) in enumerate(zip(self.sides, self.models, strict=True)):
             assert isinstance(model, ArrayReceiver)
-            signals = np.zeros((len(places), len(model.elements_m)), complex)
-            if len(places):
-                with dr.suspend_grad():
-                    traced = side(params, entries=to_uint(places))
-                    one = dr.ones(type(traced.length_m), len(places))
-                    alone = replace(traced, gain=(one, dr.zeros(type(one), len(places))))
-                    real, imaginary = model.elements(alone, type(one))
-                signals = (np.asarray(real) + 1j * np.asarray(imaginary)).reshape(signals.shape)
-            found.append(signals)
-        return found
+            entry = self.paths.entry[self.paths.side == number]
+            if not len(entry):
+                continue
+            with dr.suspend_grad():
+                traced = side(params, entries=to_uint(entry))
+                one = dr.ones(type(traced.length_m), len(entry))
+                alone = replace(traced, gain=(one, dr.zeros(type(one), len(entry))))
+                real, imaginary = model.elements(alone, type(one))
+            signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
+        return np.concatenate(signals)
 
     def jacobian(
         self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
@@ -323,13 +339,9 @@ class Misfit:
         """Number of paths that each plane of ``planes`` reflects, and that meet each slab of ``slabs``, over all
         receivers.
         """
-        planes, slabs = np.zeros(len(self.planes), np.int64), np.zeros(len(self.slabs), np.int64)
-        for side in self.sides:
-            for level in side.chains.levels:
-                reflects, passes = (np.asarray(mask) & side.exists for mask in (level.reflects, level.transmits))
-                np.add.at(planes, np.asarray(level.plane)[reflects], 1)
-                np.add.at(slabs, np.asarray(level.material)[reflects | passes], 1)
-        return planes, slabs
+        paths = self.paths
+        reflecting, met = paths.plane[paths.reflects], paths.slab[paths.slab >= 0]
+        return np.bincount(reflecting, minlength=len(self.planes)), np.bincount(met, minlength=len(self.slabs))
 
 
 def _met_surfaces(
@@ -339,15 +351,14 @@ def _met_surfaces(
 
     Of furniture of 100,000 facets, the paths of some rows meet hundreds.
     """
-    used_planes, used_slabs = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
-    used_planes[planes], used_slabs[slabs] = True, True
-    for side in sides:
-        for level in side.chains.levels:
-            met = (np.asarray(level.reflects) | np.asarray(level.transmits)) & side.exists
-            used_planes[np.asarray(level.plane)[met]] = True
-            used_slabs[np.asarray(level.material)[met]] = True
-    used_planes[:1], used_slabs[:1] = True, True  # Dr.Jit gathers from no empty array
-    return np.flatnonzero(used_planes), np.flatnonzero(used_slabs)
+    used = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
+    for mask, further, column in zip(used, (planes, slabs), (0, 1), strict=True):
+        mask[further] = True
+        for side in sides:
+            numbers = side.chains.met(len(side.chains.levels))[column]
+            mask[numbers[numbers >= 0]] = True
+        mask[:1] = True  # Dr.Jit gathers from no empty array
+    return np.flatnonzero(used[0]), np.flatnonzero(used[1])
 
 
 def _recorded_gain(side: TracedField) -> Recorded:

@@ -1,13 +1,13 @@
 """What instruments report of sums over paths, and the derivatives of the reports.
 
-Each kind takes totals [n, values], sums of waves or of powers, and factors [n, 1] of the receivers' gains, of some rows
-[n], in ascending order.
+Each kind takes signals [n, values] of some rows [n], in ascending order: sums of waves or of powers, times the
+receivers' gains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,42 +21,24 @@ if TYPE_CHECKING:
     from .misfit import Misfit
 
 Complex = NDArray[np.complex128]
-
-
 Slopes = Callable[[Complex, IntArray], FloatArray]
-"""Derivatives of reports by changes of totals, and the places of their rows among those of the reports."""
-
-
-class Reports(Protocol):
-    """Reports of totals."""
-
-    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
-        """Reports [n, values] as those of `Misfit`, before the unit of each row."""
-        ...
-
-    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
-        """Derivative of `report` by that of the totals."""
-        ...
+"""Derivatives of reports by changes of signals, and the places of their rows among those of the reports."""
 
 
 class Channels:
     """Channels of a single antenna, real and imaginary part in turn."""
 
-    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
-        """Reports as of `Reports`."""
-        return np.ascontiguousarray(total * factor).view(float)
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports [n, values] as those of `Misfit`, before the unit of each row."""
+        return np.ascontiguousarray(signal).view(float)
 
-    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
-        """Derivative as of `Reports`."""
-        return lambda change, which: self.report(change, factor[which], rows[which])
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative of `report` by the signals."""
+        return lambda change, which: self.report(change, rows[which])
 
 
-class Strengths:
-    """Powers in dB, of totals of powers, as `wrf_mi.graph.combine.PowerReceiver` reports them.
-
-    Args:
-        misfit: residuals of signal strengths.
-    """
+class Strengths(Channels):
+    """Powers in dB, as `wrf_mi.graph.combine.PowerReceiver` reports them."""
 
     def __init__(self, misfit: Misfit) -> None:
         self._floor = np.full((len(misfit.observed), 1), np.nan)
@@ -64,25 +46,20 @@ class Strengths:
             assert isinstance(model, PowerReceiver)
             self._floor[places] = model.floor
 
-    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
-        """Reports as of `Reports`."""
-        power = total.real * np.abs(factor) ** 2 + LEAST_POWER
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports as of `Channels`."""
+        power = signal.real + LEAST_POWER
         return 10 * np.log10(np.where(power > SILENCE, power + LEAST_POWER, self._floor[rows]))
 
-    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
-        """Derivative as of `Reports`."""
-        scale = np.abs(factor) ** 2
-        power = total.real * scale + LEAST_POWER
-        weight = np.where(power > SILENCE, 10 / np.log(10) * scale / (power + LEAST_POWER), 0)
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative as of `Channels`."""
+        power = signal.real + LEAST_POWER
+        weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
         return lambda change, which: weight[which] * change.real
 
 
-class Spectra:
-    """Bartlett spectra of element signals, scaled as `wrf_mi.graph.combine.ArrayReceiver.instrument_scale` does.
-
-    Args:
-        misfit: residuals of spectra.
-    """
+class Spectra(Channels):
+    """Bartlett spectra of element signals, scaled as `wrf_mi.graph.combine.ArrayReceiver.instrument_scale` does."""
 
     def __init__(self, misfit: Misfit) -> None:
         self._matrices = list[NDArray[np.complex64]]()
@@ -94,24 +71,21 @@ class Spectra:
             self._matrices.append(matrix.astype(np.complex64))
             self._side[places] = side
 
-    def report(self, total: Complex, factor: Complex, rows: IntArray) -> FloatArray:
-        """Reports as of `Reports`."""
-        spectrum = _magnitude(self._images(total * factor, rows))
-        low, _, inverse = _scale(spectrum)
-        return np.asarray((spectrum - np.take_along_axis(spectrum, low, axis=1)) * inverse, float)
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports as of `Channels`."""
+        return np.asarray(_scaled(_magnitude(self._images(signal, rows)))[0], float)
 
-    def slopes(self, total: Complex, factor: Complex, rows: IntArray) -> Slopes:
-        """Derivative as of `Reports`."""
-        image = self._images(total * factor, rows)
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative as of `Channels`."""
+        image = self._images(signal, rows)
         spectrum = _magnitude(image)
-        low, high, inverse = _scale(spectrum)
+        share, low, high, inverse = _scaled(spectrum)
         weight = image.conj() / spectrum
-        share = (spectrum - np.take_along_axis(spectrum, low, axis=1)) * inverse
 
         def slope(change: Complex, which: IntArray) -> FloatArray:
-            found = (weight[which] * self._images(change * factor[which], rows[which])).real
-            least, most = (np.take_along_axis(found, end[which], axis=1) for end in (low, high))
-            return np.asarray((found - least - share[which] * (most - least)) * inverse[which], float)
+            by_pixel = (weight[which] * self._images(change, rows[which])).real
+            least, most = (np.take_along_axis(by_pixel, end[which], axis=1) for end in (low, high))
+            return np.asarray((by_pixel - least - share[which] * (most - least)) * inverse[which], float)
 
         return slope
 
@@ -120,17 +94,19 @@ class Spectra:
         side, single = self._side[rows], signal.astype(np.complex64)
         if len(self._matrices) == 1:
             return single @ self._matrices[0]
-        found = np.empty((len(rows), self._matrices[0].shape[1]), np.complex64)
+        images = np.empty((len(rows), self._matrices[0].shape[1]), np.complex64)
         for number in np.unique(side):
-            found[side == number] = single[side == number] @ self._matrices[number]
-        return found
+            images[side == number] = single[side == number] @ self._matrices[number]
+        return images
 
 
-def _scale(spectrum: NDArray[np.float32]) -> tuple[IntArray, IntArray, NDArray[np.float32]]:
-    """Places of the least and the largest value of each row [n, 1], and the factor that scales them to 0 and 1."""
+def _scaled(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
+    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
     low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
-    span = np.take_along_axis(spectrum, high, axis=1) - np.take_along_axis(spectrum, low, axis=1)
-    return low, high, np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+    least = np.take_along_axis(spectrum, low, axis=1)
+    span = np.take_along_axis(spectrum, high, axis=1) - least
+    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+    return (spectrum - least) * inverse, low, high, inverse
 
 
 def _magnitude(image: NDArray[np.complex64]) -> NDArray[np.float32]:

@@ -15,10 +15,12 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core import Antenna
 from ..core.antenna import ANTENNA
+from ..core.types import IntArray
 from ..gaussians.footprint import Pose, cross, dot, tangent_basis
 from .slab import slab
 
@@ -71,6 +73,20 @@ class Chains:
     def select(self, index: Any) -> Chains:
         """Select the paths of an unsigned integer array of indices."""
         return dr.gather(Chains, self, index)
+
+    def met(self, depth: int) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
+        """Planes and materials that the p paths meet at up to ``depth`` interactions [p, depth], -1 for none, and
+        whether they are reflected there; without place holders.
+        """
+        exists = np.flatnonzero(self.exists.numpy() > 0)
+        plane, material = np.full((2, len(exists), depth), -1)
+        reflects = np.zeros((len(exists), depth), bool)
+        for k, level in enumerate(self.levels):
+            reflects[:, k] = np.asarray(level.reflects)[exists]
+            is_met = reflects[:, k] | np.asarray(level.transmits)[exists]
+            for column, numbers in ((plane, level.plane), (material, level.material)):
+                column[is_met, k] = np.asarray(numbers)[exists[is_met]]
+        return plane, material, reflects
 
 
 @dataclass
