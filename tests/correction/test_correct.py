@@ -33,7 +33,6 @@ from wrf_mi.scene.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.corrected_scene import material_constants
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -88,7 +87,7 @@ def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Pa
     )
     assert slabs.names == expected.names
     felt = [not name.startswith("board") for name in slabs.names]
-    ratio = material_constants(slabs, found.parameters)[felt, 0] / expected.permittivity[felt]
+    ratio = slabs.fitted(found.misfit.named(found.vector)).permittivity[felt] / expected.permittivity[felt]
     assert np.mean(np.abs(ratio - 1) < PERMITTIVITY) >= 0.8
 
 
@@ -152,7 +151,7 @@ def test_a_wall_is_of_another_material_that_reflects_alike_at_one_carrier(
     stated = stated_scene(tmp_path / "stated")
     found = correct_scene(stated, record, make_splits(record, "official")[0], CorrectionOptions(steps=10))
     np.testing.assert_allclose(found.vector[found.misfit.parts[SHIFT]], shift, atol=PLANE_M)
-    assert {name.partition("/")[0]: kind for name, kind in found.materials.items()}["wall_02"] == "glass"
+    assert {name.partition("/")[0]: kind for name, kind in found.state.materials.items()}["wall_02"] == "glass"
 
 
 LOW_BOX = (2.0, 2.0, 0.03), (3.8, 3.4, 0.36)
@@ -190,7 +189,8 @@ def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path: Path, m
     assert mean[found.kept] > mean[""] + 3
 
     again = correct_scene(tmp_path / "corrected", record, split, replace(options, steps=0))
-    assert not again.supposed & {surface.name for surface in tops}
+    supposed = {name.partition("/")[0] for name in again.fit.supposed}
+    assert not supposed & {surface.name for surface in tops}
     kept = {one["surface"] for one in write_page(again, tmp_path / "again")["materials"] if not one["absent"]}
     assert level[0] in kept
     assert np.nanmean(again.scores[""]) > mean[""] + 3
@@ -208,10 +208,10 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(
     scene, split = stated_scene(tmp_path / "stated", TRUE_MATERIALS), make_splits(record, "official")[0]
     options = CorrectionOptions(parts=("materials", "hidden"), depth=3, rays=1 << 14, steps=3)
     found = correct_scene(scene, record, split, options)
-    faces = {name: kind for name, kind in found.materials.items() if name.startswith(("other", "hidden"))}
+    faces = {name: kind for name, kind in found.state.materials.items() if name.startswith(("other", "hidden"))}
     assert len(faces) == 5
     assert set(faces.values()) == {material}
-    assert not found.absent
+    assert not found.fit.absent(found.state)
     assert np.nanmean(found.scores[found.kept]) > 19
 
 
@@ -237,7 +237,7 @@ def test_standard_deviations_cover_the_errors(corrected: Any) -> None:
     part = found.misfit.parts[SHIFT]
     error = np.abs(found.vector[part] - shift)
     assert (error < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < found.prior[part] / 2).all()
+    assert (found.deviation[part] < found.fit.prior_deviation[part] / 2).all()
 
 
 def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) -> None:

@@ -15,16 +15,13 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import EXPONENT, LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, SURFACE, name_of
+from ..tracing.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SURFACE, name_of
 from ..tracing.materials import itu_constants, itu_exponent
 from ..tracing.plane_parameters import SHIFT, TILT
 from .misfit import Misfit
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
-CONSTANTS = ("permittivity", "conductivity", "thickness")
-QUANTITIES = (*CONSTANTS, EXPONENT)
-"""Parameters of a surface's material, in the order of a choice's values."""
 ABSENT = "absent"
 """Choice of a surface that waves do not notice."""
 ABSENT_VALUES = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, 0.001]), 0.0)
@@ -107,15 +104,13 @@ def shift_choices(misfit: Misfit, hit: IntArray, sd_m: float, frequency_hz: floa
     return [Choice(names[plane], place, values, of_plane) for plane, place in places.items()] if most else []
 
 
-def joint_choices(
-    materials: Sequence[Choice], shifts: Sequence[Choice], plane_of: Mapping[str, int], supposed: Collection[str]
-) -> list[Choice]:
+def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], supposed: Collection[str]) -> list[Choice]:
     """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
     for supposed faces, and all other choices by themselves.
 
     At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
     """
-    with_material = {f"plane {plane_of[one.what]}": one for one in reversed(materials)}
+    with_material = {f"plane {one.what.rpartition('/')[2]}": one for one in reversed(materials)}
     every = [(with_material[one.what], one) for one in shifts if one.what in with_material]
     pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what in supposed]
     joined = [

@@ -10,12 +10,11 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 from threadpoolctl import threadpool_limits
 
@@ -55,46 +54,40 @@ class Correction:
 
     Attributes:
         scene: the stated scene (``sionna.rt.Scene``).
-        misfit: residuals over all training rows, with parameters of the surfaces that their paths meet.
-        kept: parts that were changed, joined by "+"; "" for none.
-        vector: parameters [p] of `Misfit`.
-        deviation: their standard deviations [p], 0 of those that were held.
-        prior: standard deviations before the correction [p].
-        free: indices of the changed entries.
-        materials: material that each changed surface took first, by its name.
-        absent: surfaces that are left out, by their numbers in the scene.
+        fit: fit to all training rows, with parameters of the surfaces that their paths meet.
+        state: its parameters and choices; its stage is what was changed, "" for nothing.
+        deviation: standard deviations of the parameters [p], 0 of those that were not changed.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
-        supposed: names of objects that the stated scene lacks (`wrf_mi.scene.hidden`).
-        options: options.
-        scene_parameters: parameters by name for all planes and surfaces of the scene; none where nothing was changed.
         data: rows that were used, and how much smaller their errors are for it; None where nothing was changed.
         seconds: duration.
         facts: sizes for the page.
     """
 
     scene: Any
-    misfit: Misfit
-    kept: str
-    vector: FloatArray
+    fit: Fit
+    state: State
     deviation: FloatArray
-    prior: FloatArray
-    free: IntArray
-    materials: Mapping[str, str]
-    absent: frozenset[int]
     scores: Mapping[str, FloatArray]
     kinds: Mapping[str, Kind]
-    supposed: frozenset[str]
-    options: CorrectionOptions
-    scene_parameters: Mapping[str, FloatArray] = field(default_factory=dict)
-    data: CorrectionData | None = None
-    seconds: float = 0.0
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    data: CorrectionData | None
+    seconds: float
+    facts: Mapping[str, Any]
 
     @property
-    def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Parameters of `misfit` by the names of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
-        return self.misfit.named(self.vector)
+    def misfit(self) -> Misfit:
+        """Residuals over all training rows."""
+        return self.fit.misfit
+
+    @property
+    def kept(self) -> str:
+        """Parts that were changed, joined by "+"; "" for none."""
+        return self.state.stage
+
+    @property
+    def vector(self) -> FloatArray:
+        """Parameters [p] of `misfit`."""
+        return self.state.vector
 
 
 def default_options(record: Record) -> CorrectionOptions:
@@ -182,42 +175,22 @@ def correct_scene(
     kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
     final = fit_of(record, split.all_train, *(best or ()))
-    vector, deviation, free = final.stated, np.zeros(len(final.stated)), np.zeros(0, np.int64)
-    materials, parameters, data = dict[str, str](), dict[str, FloatArray](), None
-    absent = final.misfit.slabs[list(final.supposed.values())].tolist()
+    state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
     if best:
         state = final.solved(final.carried_over(*best))
-        vector, free, parameters = state.vector, final.free(kept), final.of_scene(state)
-        deviation[free], others = final.uncertainty(state)
-        materials, absent = dict(state.materials), final.absent(state)
-        before = _vector_at(parts, unseen[kept], *best), parts.with_mean_gain(vector, final.misfit)
-        ratio = _error_ratio(unseen[kept], before[0], final.misfit, before[1], others)
+        deviation[final.free(kept)], others = final.uncertainty(state)
+        before = _vector_at(parts, unseen[kept], *best)
+        after = parts.with_mean_gain(state.vector, final.misfit)
+        ratio = _error_ratio(unseen[kept], before, final.misfit, after, others)
         data = CorrectionData(name, split.all_train, ratio)
-    kinds = _kinds(scene)
-    return Correction(
-        opened,
-        final.misfit,
-        kept,
-        vector,
-        deviation,
-        final.prior_deviation,
-        free,
-        materials,
-        frozenset(absent),
-        scores,
-        kinds,
-        supposed,
-        options,
-        parameters,
-        data,
-        time.perf_counter() - begun,
-        {
-            "rows": len(split.all_train),
-            "held_out": len(parts.held_rows),
-            "held_out_receivers": list(parts.out),
-            "paths": sum(int(s.exists.sum()) for s in final.misfit.sides),
-        },
-    )
+    facts = {
+        "rows": len(split.all_train),
+        "held_out": len(parts.held_rows),
+        "held_out_receivers": list(parts.out),
+        "paths": len(final.misfit.paths.row),
+    }
+    seconds = time.perf_counter() - begun
+    return Correction(opened, final, state, deviation, scores, _kinds(scene), data, seconds, facts)
 
 
 def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArray, IntArray]:
@@ -264,21 +237,14 @@ def _moves(stage: str) -> bool:
 
 
 class _Parts(NamedTuple):
-    """Observations that a correction is fitted to, and others that decide what is kept.
-
-    Attributes:
-        known, held: the record as each sees it.
-        known_rows, held_rows: rows of each.
-        out, fitted: names of the receivers of ``held``, which ``known`` has not seen, and of those that it has; empty
-            where rows are held out instead.
-    """
+    """Observations that a correction is fitted to, ``known``, and ``held`` ones that decide what is kept."""
 
     known: Record
     known_rows: IntArray
     held: Record
     held_rows: IntArray
-    out: tuple[str, ...] = ()
-    fitted: tuple[str, ...] = ()
+    out: tuple[str, ...] = ()  # names of the receivers of ``held``; none where rows are held out instead
+    fitted: tuple[str, ...] = ()  # names of the receivers of ``known``
 
     def units(self, score: FloatArray) -> FloatArray:
         """Independent scores: those of rows, or the mean of each receiver that is held out."""
@@ -300,11 +266,7 @@ class _Parts(NamedTuple):
 
 
 def _parts(record: Record, split: Split) -> _Parts:
-    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those.
-
-    Raises:
-        InputError: too few training rows.
-    """
+    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those."""
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
     if split.held_receivers and len(trained) > 3:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])

@@ -17,7 +17,7 @@ from .choices import ABSENT, ABSENT_VALUES, Choice, material_places
 from .frame import rigid_motions, scene_entries
 from .least_squares import Noise, Prior, left_out_residuals, minimised, posterior_covariance
 from .misfit import Misfit
-from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
+from .options import FRAME, FRAME_SD, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
 
 LEAST_PATHS = 10
@@ -106,6 +106,10 @@ class Fit:
         for name, gains in missing.items():
             self.stated[misfit.parts[name].start] += np.mean(gains)
 
+    def start(self, stage: str) -> State:
+        """The scene as stated, without the faces that it lacks."""
+        return State(stage, self.stated, self.stated, dict.fromkeys(self.supposed, ABSENT))
+
     def free(self, kept: str) -> IntArray:
         """Entries of the vector that a stage changes: those of surfaces and planes that enough paths meet."""
         parts = kept.split("+")
@@ -120,17 +124,16 @@ class Fit:
                 moved = entries.reshape(-1, size)[self.planes].ravel()
                 free.append(moved if PLANES in parts or FRAME in parts else entries[:0])
             else:
-                free.append(entries)
+                free.append(entries if kept else entries[:0])
         return np.sort(np.concatenate(free))
 
     def prior(self, mean: FloatArray, free: IntArray) -> Prior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
         covariance = np.diag(np.square(self.prior_deviation[free]))
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            deviation = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
             _, among, which = np.intersect1d(free, self.misfit.plane_entries, return_indices=True)
             motions = self.misfit.motions[which]
-            covariance[np.ix_(among, among)] += (motions * deviation**2) @ motions.T
+            covariance[np.ix_(among, among)] += (motions * FRAME_SD**2) @ motions.T
         return Prior(mean[free], np.linalg.inv(covariance))
 
     def cost(self, state: State, noise: Noise) -> float:
@@ -162,8 +165,7 @@ class Fit:
         planes, motions = self.misfit.plane_entries, self.misfit.motions
         known = np.isin(planes, np.setdiff1d(self.free(PLANES), without))
         weight = known / np.square(self.prior_deviation[planes])
-        before = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
-        information = motions.T @ (weight[:, None] * motions) + np.diag(before**-2.0)
+        information = motions.T @ (weight[:, None] * motions) + np.diag(FRAME_SD**-2.0)
         return np.asarray(np.linalg.solve(information, motions.T @ (weight * vector[planes])), float)
 
     def absent(self, state: State) -> frozenset[int]:

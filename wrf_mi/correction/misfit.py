@@ -30,13 +30,12 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
 from ..tracing.instrument_parameters import instrument_parameters
-from ..tracing.material_parameters import PREFIX, SlabMaterials
+from ..tracing.material_parameters import PREFIX, QUANTITIES
 from ..tracing.moved_scene import MovedSearch
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions
-from ..tracing.walls import plane_centres
 from .frame import rigid_motions, scene_entries
 from .options import PATTERNS, CorrectionOptions
 
@@ -83,6 +82,7 @@ class Misfit:
     Attributes:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
             parameters are entries of the vector.
+        tables: materials and planes of the scene.
         sides: traced side of each of these at each carrier, receiver by receiver.
         models: receiver models of the sides.
         places: entries of ``observed`` of each side.
@@ -112,7 +112,7 @@ class Misfit:
         self.receivers = [placed[number] for number in seen]
         self._image = task.image
         shared = prepared or Prepared(scene)
-        self._tables = shared.tables(options.materials)
+        self.tables = shared.tables(options.materials)
         shape = record.observation.shape[2:]
         size, whole_size = (1, 1), (1, 1)
         if task.image:
@@ -136,11 +136,11 @@ class Misfit:
         # The same order of entries whichever receivers are seen.
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
-            self._instruments |= instrument_parameters(receiver, options.gain, options.pattern_degree)
-        self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self._tables.slabs.names))
+            self._instruments |= instrument_parameters(receiver, options.pattern_degree)
+        self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
             self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
-            tables = self._tables.select(shared.surfaces, self.planes, self.slabs)
+            tables = self.tables.select(shared.surfaces, self.planes, self.slabs)
             sides = [side.select(tables, self.planes, self.slabs) for side in sides]
         self.sides = sides
         every = {name: value for name, value in sides[0].parameters().items() if name.startswith((PREFIX, SHIFT, TILT))}
@@ -154,16 +154,6 @@ class Misfit:
         self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
         self._gains = [_recorded_gain(side) for side in self.sides]
 
-    @property
-    def scene_slabs(self) -> SlabMaterials:
-        """Stated materials of all surfaces of the scene."""
-        return self._tables.slabs
-
-    @cached_property
-    def centre_m(self) -> FloatArray:
-        """Centres of the planes, [k, 3] in metres."""
-        return plane_centres(self.sides[0].surfaces)[0][self.planes]
-
     @cached_property
     def motions(self) -> FloatArray:
         """Derivatives of `plane_entries` by a rigid motion of the scene [3 k, 6] (`rigid_motions`)."""
@@ -172,7 +162,7 @@ class Misfit:
 
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
-        stated = self._tables.slabs.parameters(thickness=True, exponent=True) | self._tables.planes.parameters()
+        stated = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
         found = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
         for name in stated.keys() & found.keys():
             every = stated[name].astype(float)
@@ -207,11 +197,6 @@ class Misfit:
     def several_carriers(self) -> bool:
         """Whether rows of several carriers tell how conductivities depend on the frequency."""
         return len({side.frequency_hz for side in self.sides}) > 1
-
-    @property
-    def carriers(self) -> int:
-        """Number of sides of each receiver."""
-        return len(self.sides) // len(self.receivers)
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
@@ -330,11 +315,6 @@ class Misfit:
         parts = [self.parts[name] for name in (SHIFT, TILT) if name in self.parts]
         return np.concatenate([np.zeros(0, np.int64), *(np.arange(part.start, part.stop) for part in parts)])
 
-    @property
-    def plane_of_slab(self) -> dict[str, int]:
-        """Plane of each slab, the surface of an object, by its name."""
-        return {name: int(name.rpartition("/")[2]) for name in self.sides[0].slabs.names}
-
     def counts(self) -> tuple[IntArray, IntArray]:
         """Number of paths that each plane of ``planes`` reflects, and that meet each slab of ``slabs``, over all
         receivers.
@@ -385,5 +365,4 @@ def search_options(options: CorrectionOptions) -> TracedOptions:
         transmission=True, max_depth=options.depth, max_reflections=options.reflections, rays=options.rays
     )
     degree = options.pattern_degree if PATTERNS in options.parts else 0
-    whole: dict[str, Any] = {"materials": "surface", "thickness": True, "exponent": True, "planes": True}
-    return TracedOptions(trace, degree, faint=options.faint, **whole)
+    return TracedOptions(trace, degree, materials="surface", planes=True, faint=options.faint, constants=QUANTITIES)

@@ -21,7 +21,7 @@ from .choices import ABSENT, Choice, joint_choices, material_choices, shift_choi
 from .fit import Fit, State
 from .least_squares import Noise
 from .misfit import Misfit
-from .options import FRAME, MATERIALS, PLANES
+from .options import FRAME, FRAME_SD, MATERIALS, PLANES
 from .path_sum import PathSum, near
 
 GAIN = 0.5
@@ -61,19 +61,18 @@ class Moves:
         parts, options, misfit = stage.split("+"), fit.options, fit.misfit
         shifts, materials = list[Choice](), list[Choice]()
         if SHIFT in misfit.parts and (PLANES in parts or FRAME in parts):
-            sd_m = float(np.hypot(options.shift_sd_m * (PLANES in parts), options.frame_sd_m * (FRAME in parts)))
+            sd_m = float(np.hypot(options.shift_sd_m * (PLANES in parts), FRAME_SD[0] * (FRAME in parts)))
             shifts = shift_choices(misfit, fit.planes, sd_m, fit.frequency_hz)
         if MATERIALS in parts:
             materials = material_choices(misfit, fit.slabs, fit.frequency_hz)
-        self.choices = joint_choices(materials, shifts, misfit.plane_of_slab, fit.supposed)
+        self.choices = joint_choices(materials, shifts, fit.supposed)
         self.joint = [choice for choice in self.choices if choice.joint]
         self.material = [choice for choice in self.choices if choice.material.size]
 
     def found(self) -> State:
         """The most probable state that is found from the stated one."""
         fit = self.fit
-        state = State(self.stage, fit.stated, fit.stated, dict.fromkeys(fit.supposed, ABSENT))
-        state, _ = self._chosen(state, self.choices, f"{self.title}, round 1")
+        state, _ = self._chosen(fit.start(self.stage), self.choices, f"{self.title}, round 1")
         state = self._rounds(fit.solved(state, ROUND_STEPS), range(2, ROUNDS + 1))
         state = self._boxes(state)
         if len(self.joint) < 2:

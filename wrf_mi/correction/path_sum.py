@@ -26,7 +26,6 @@ from ..tasks import task_of
 from ..tracing.image_method import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.walls import moved_planes
 from .sums import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:
@@ -90,10 +89,11 @@ class PathSum:
         gains.
         """
         record, task, gains = misfit.record, task_of(misfit.record), {side.gain_name for side in misfit.sides}
+        carriers = len(misfit.sides) // len(misfit.receivers)
         known = set() if task.in_decibel else {SHIFT, TILT}
         others = {name for name in misfit.parts if not name.startswith((PREFIX, "receiver."))} - known
         devices = {name for name in misfit.parts if name.startswith("receiver.") and not name.endswith(".gain")}
-        if others or devices or len(gains) * misfit.carriers < len(misfit.sides):
+        if others or devices or len(gains) * carriers < len(misfit.sides):
             return False
         if task.in_decibel:
             powers = (isinstance(model, PowerReceiver) and not model.interference for model in misfit.models)
@@ -103,7 +103,7 @@ class PathSum:
             sizes, count = {len(m.elements_m) for m in arrays}, len(misfit.paths.row)
             return len(arrays) == len(misfit.models) and len(sizes) == 1 and max(sizes) * count <= MOST_WAVES
         channels = task.is_complex and record.observation.ndim == 3
-        return channels and SHIFT in misfit.parts and misfit.carriers == 1
+        return channels and SHIFT in misfit.parts and carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector.
@@ -209,9 +209,7 @@ class PathSum:
         return self._k if len(self._k) == 1 else self._k[which]
 
     def _waves_of(self, which: IntArray, gain: Complex, shifts: FloatArray, key: tuple[bytes, ...]) -> Complex:
-        """What is summed of some paths, which ``key`` identifies: waves [paths, frequencies or elements], or powers
-        [paths, 1].
-        """
+        """Waves [paths, frequencies or elements] of some paths, which ``key`` identifies, or powers [paths, 1]."""
         if self._unit is None:
             return (np.abs(gain[:, None]) ** 2).astype(complex)
         name = (*key, shifts.tobytes())
@@ -242,15 +240,12 @@ def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
 def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[FloatArray, csr_array]:
     """Lengths [n] of all paths, and their derivatives by shifts, then tilts, of the q planes [n, 3 q].
 
-    Args:
-        misfit: residuals with the paths.
-        mirrors: plane that reflects each path at each interaction [n, depth], -1 for none.
-        vector: parameters [p].
+    ``mirrors``: plane that reflects each path at each interaction [n, depth], -1 for none.
     """
-    surfaces, chosen, count, centre = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes), misfit.centre_m
-    axes, (shift, tilt) = surfaces.axes[chosen], (vector[misfit.parts[name]] for name in (SHIFT, TILT))
-    change = np.column_stack([shift, tilt.reshape(count, 2)])
-    normal, offset = moved_planes(surfaces.normal[chosen], axes, centre, change)
+    surfaces, chosen, count = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes)
+    axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
+    shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
+    normal, offset = surfaces.moved_planes(shift, tilt.reshape(count, 2), chosen)
     sources = [np.stack([np.asarray(c) for c in side.chains.source_m], axis=-1) for side in misfit.sides]
     first = np.cumsum([0, *map(len, sources[:-1])])
     point = np.concatenate(sources)[first[misfit.paths.side] + misfit.paths.entry]

@@ -19,19 +19,10 @@ from ..scene.folder import plain_name, write_scene
 from ..scene.materials import CARRIER, THICKNESS_M, Materials
 from ..scene.materials import EXPONENT as LAW
 from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
-from .material_parameters import (
-    EXPONENT,
-    SURFACE,
-    MaterialGrouping,
-    SlabMaterials,
-    name_of,
-    read_materials,
-    slabs_of_faces,
-)
+from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
 from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .surfaces import Surfaces, scene_surfaces
-from .walls import moved_planes, plane_centres
 
 FLAT = 0.2
 """Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
@@ -43,8 +34,6 @@ UNCHANGED = 1e-4
 """Relative change of a constant below which a material keeps its name: less than any measurement supports."""
 ODD_IN_FILES, ODD_IN_MATERIALS = r"[^\w.-]", r"[^A-Za-z0-9_]"
 """Characters of other scenes' names that those of surfaces and materials of a scene folder do not have."""
-QUANTITIES = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
-"""Trainable constants of a slab, and the least value of each (`wrf_mi.tracing.material_parameters`)."""
 
 
 def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
@@ -94,22 +83,12 @@ def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tup
     shift, tilt = shift if shift.size else np.zeros(count), tilt if tilt.size else np.zeros((count, 2))
     if shift.shape != (count,) or tilt.shape != (count, 2):
         raise ValueError(f"planes_at: shifts {shift.shape} and tilts {tilt.shape} of a scene of {count} planes")
-    change = np.column_stack([shift, tilt])
-    return moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
+    return surfaces.moved_planes(shift, tilt)
 
 
 def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArray) -> tuple[IntArray, IntArray]:
-    """Of the planes at each of ``count`` corners, the largest first, those that are not parallel to what the larger
-    ones span.
-
-    Args:
-        pairs: corner and plane [n, 2].
-        count: number of corners c.
-        area: area of each plane [q].
-        normal: unit normals [q, 3].
-
-    Returns:
-        Planes [c, 3] and their numbers [c].
+    """Planes [count, 3] at each corner, the largest first, that are not parallel to what larger ones span, and their
+    numbers [count]; of ``pairs`` of corner and plane [n, 2], and areas [q] and normals [q, 3] of the planes.
     """
     corner, plane = pairs[np.lexsort((pairs[:, 1], -area[pairs[:, 1]], pairs[:, 0]))].T
     first = np.searchsorted(corner, np.arange(count + 1))
@@ -137,25 +116,6 @@ def check_materials(scene: Any) -> None:
     for name, thing in scene.objects.items():
         if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
-
-
-def material_constants(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Relative permittivity, conductivity in S/m and thickness in metres of n slabs, [n, 3], from ``parameters`` where
-    they have them.
-    """
-    values = np.stack([slabs.permittivity, slabs.conductivity, slabs.thickness_m], axis=1).astype(float)
-    for column, (quantity, least) in enumerate(QUANTITIES.items()):
-        for index, name in enumerate([SURFACE] if slabs.grouping == "surface" else slabs.names):
-            if (found := parameters.get(name_of(name, quantity))) is not None:
-                rows = slice(None) if name == SURFACE else slice(index, index + 1)
-                values[rows, column] = least + np.exp(np.ravel(np.asarray(found, float)))
-    return values
-
-
-def material_exponents(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Exponents of the conductivities of n slabs [n], from ``parameters`` where they have them."""
-    found = parameters.get(name_of(SURFACE, EXPONENT)) if slabs.grouping == "surface" else None
-    return slabs.exponent if found is None else np.asarray(found, float).ravel()
 
 
 def write_corrected_scene(
@@ -197,9 +157,10 @@ def write_corrected_scene(
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
-    fitted, exponent = material_constants(slabs, parameters), material_exponents(slabs, parameters)
+    corrected = slabs.fitted(parameters)
+    fitted, exponent = corrected.table, corrected.exponent
     # As stated, or as parameters state it: metal has a permittivity of 1, of whose logarithm less one there is none.
-    stated = [material_constants(slabs, start) for start in ({}, slabs.parameters(thickness=True))]
+    stated = [slabs.table, slabs.fitted(slabs.parameters(QUANTITIES)).table]
     changed: NDArray[np.bool_] = np.all(
         [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated], axis=0
     )

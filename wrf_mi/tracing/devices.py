@@ -48,7 +48,10 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
         what = surfaces.called(int(thing[first]))
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
-    beyond = _beyond(surfaces, positions_m)
+    if not len(surfaces.triangles):
+        return
+    low, high = surfaces.triangles.min(axis=(0, 1)), surfaces.triangles.max(axis=(0, 1))
+    beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
         text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres"
@@ -143,14 +146,6 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
         solid = np.arctan2(dot(a, np.cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
         number[part] = np.abs(solid.sum(axis=1)) / (2 * np.pi)
     return number
-
-
-def _beyond(surfaces: Surfaces, points: FloatArray) -> FloatArray:
-    """Distance [n] of points beyond the box around the scene along the worst axis, at most 0 inside; 0 without one."""
-    if not len(surfaces.triangles):
-        return np.zeros(len(points))
-    low, high = surfaces.triangles.min(axis=(0, 1)), surfaces.triangles.max(axis=(0, 1))
-    return np.asarray(np.maximum(low - points, points - high).max(axis=1))
 
 
 def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:

@@ -10,23 +10,29 @@ Vectors are lists of three Dr.Jit arrays, complex numbers pairs (re, im).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import speed_of_light
+from scipy.constants import epsilon_0, speed_of_light
 
+from ..backend.device import columns_on_device
 from ..core import Antenna
+from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
 from ..gaussians.footprint import Pose, cross, dot, tangent_basis
-from .slab import slab
+from .buffer import SPECULAR, TRANSMISSION
+from .surfaces import Surfaces
 
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
 
+Float64: Any = dr.float64_array_t(mi.Float)
 Vector = list[Any]
 Complex = tuple[Any, Any]
 Tables = tuple[Any, Any, Any, Any]
@@ -125,7 +131,7 @@ def evaluate_paths(
         tx_antenna: antenna of the transmitters.
 
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
-    and 5.3; slabs as `wrf_mi.tracing.slab`.
+    and 5.3; slabs as `slab`.
     """
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
@@ -201,3 +207,86 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
     """
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
+
+
+def chains_of(
+    surfaces: Surfaces, types: NDArray[np.uint8], face: IntArray, material: IntArray, sources: Sequence[FloatArray]
+) -> Chains:
+    """Chains of p paths, float64.
+
+    Args:
+        surfaces: surfaces of the scene.
+        types: interactions [p, depth], from the transmitter.
+        face: faces at which they are [p, depth].
+        material: indices of the materials there [p, depth].
+        sources: five columns [p]: coordinates of each path's transmitter, cosine and sine of its heading.
+    """
+    depth = types.shape[1] if types.any() else 0
+    types, face = types[:, :depth], face[:, :depth]
+    plane, used, index = np.append(surfaces.plane, 0)[face], types != 0, material[:, :depth].astype(np.uint32)
+    # All columns of a type by one copy: each copy is a kernel of its own.
+    normal, offset = surfaces.normal[plane] * used[..., None], surfaces.offset[plane] * used
+    columns = [column for k in range(depth) for column in (*normal[:, k].T, offset[:, k])]
+    numbers = columns_on_device([*columns, *sources, np.ones(len(types))], Float64)
+    kinds = [types[:, k] == kind for k in range(depth) for kind in (SPECULAR, TRANSMISSION)]
+    masks = columns_on_device(kinds, mi.Bool)
+    indices = columns_on_device([table[:, k] for k in range(depth) for table in (index, plane)], mi.UInt32)
+    levels = [
+        Level(numbers[4 * k : 4 * k + 3], numbers[4 * k + 3], *masks[2 * k : 2 * k + 2], *indices[2 * k : 2 * k + 2])
+        for k in range(depth)
+    ]
+    *place, exists = numbers[4 * depth :]
+    return Chains(place[:3], tuple(place[3:]), exists, levels)
+
+
+@dataclass
+class SlabCoefficients:
+    """Complex reflection and transmission coefficients of p passages, TE and TM."""
+
+    reflected_te: Any
+    reflected_tm: Any
+    transmitted_te: Any
+    transmitted_tm: Any
+
+
+def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, frequency_hz: Any) -> SlabCoefficients:
+    """Reflection at and transmission through a homogeneous slab in air.
+
+    With the complex relative permittivity eta = eps_r - j sigma / (2 pi f eps_0), for the time factor exp(+j omega t),
+    and s = sqrt(eta - sin^2 theta), the Fresnel coefficients of one face are
+
+        r_TE = (cos theta - s) / (cos theta + s),   r_TM = (eta cos theta - s) / (eta cos theta + s)
+
+    and those of a slab of thickness d, with q = 2 pi d s / lambda,
+
+        R = r (1 - exp(-2 j q)) / (1 - r^2 exp(-2 j q)),   T = (1 - r^2) exp(-j q) / (1 - r^2 exp(-2 j q)).
+
+    R refers to the front face. T includes the phase of the way through the slab; that of the same way through air is
+    not subtracted. A perfect conductor has r_TE = -1 and r_TM = +1. Sionna RT's ``itu_coefficients_single_layer_slab``
+    has the same equations, in float32 for any input; here in the type of ``cosine``. Differentiable in all Dr.Jit
+    arguments.
+
+    Args:
+        cosine: cosine of the angle of incidence theta, a Dr.Jit array of either float type, [p].
+        permittivity: relative permittivity eps_r, [p].
+        conductivity: sigma, S/m, [p].
+        thickness_m: d, metres, [p].
+        frequency_hz: carrier frequency f, a number or an array of the same type.
+
+    Source: ITU-R P.2040-3, equations 37, 43 and 44.
+    """
+    kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)
+    j = kind(0, 1)
+    eta = permittivity - j * (conductivity / (2 * np.pi * frequency_hz * epsilon_0))
+    root = dr.sqrt(eta - (1 - cosine * cosine))
+    te = (cosine - root) / (cosine + root)
+    tm = (eta * cosine - root) / (eta * cosine + root)
+    once = dr.exp(-j * (2 * np.pi * frequency_hz / speed_of_light) * thickness_m * root)
+    twice = once * once
+    through_te, through_tm = (1 / (1 - r * r * twice) for r in (te, tm))
+    return SlabCoefficients(
+        te * (1 - twice) * through_te,
+        tm * (1 - twice) * through_tm,
+        (1 - te * te) * once * through_te,
+        (1 - tm * tm) * once * through_tm,
+    )

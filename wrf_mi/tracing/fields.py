@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
-from .buffer import SPECULAR, TRANSMISSION, Legs, to_buffer
+from .buffer import SPECULAR, TRANSMISSION, Legs, point_array, to_buffer
 from .image_method import image_sources
 from .options import TraceOptions
 from .surfaces import Surfaces
@@ -63,15 +63,6 @@ def sionna_orientation(to_world: ArrayLike) -> FloatArray:
         # A device that looks straight up or down has many equivalent angles.
         warnings.filterwarnings("ignore", "Gimbal lock")
         return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
-
-
-def point_array(points: FloatArray) -> Any:
-    """Points [n, 3] as Mitsuba's ``Point3f``."""
-    import mitsuba as mi
-
-    from ..backend.device import to_vectors
-
-    return to_vectors(points, mi.Point3f)
 
 
 def field_of(

@@ -17,21 +17,19 @@ from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from .buffer import Legs, join
+from .buffer import Legs, join, sampled_paths
 from .devices import before_surfaces, check_devices, from_behind
-from .estimate import check_search
 from .fields import AT_ANTENNA_M, path_gains, scattering_materials
 from .image_method import image_sources
 from .images import specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
-from .sampled import sampled_paths
-from .search import ReflectionChains, shoot
+from .search import ReflectionChains, check_search, shoot
 from .surfaces import Surfaces, scene_surfaces
 
 if TYPE_CHECKING:
     from .material_parameters import MaterialGrouping
-    from .scene_tables import SceneTables
+    from .plane_parameters import SceneTables
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +92,7 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .scene_tables import SceneTables
+        from .plane_parameters import SceneTables
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
@@ -124,12 +122,6 @@ class Prepared:
             image = image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:]
             found.append(ReflectionChains(plane, image, np.zeros(len(plane), np.int64)))
         return ReflectionChains.joined(found)
-
-    def specular_paths(
-        self, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
-    ) -> Legs:
-        """Paths from points [s, 3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
-        return specular_paths(self.surfaces, chains, sources_m, targets_m, options)
 
 
 def trace_paths(
@@ -239,7 +231,7 @@ def _search(
             chains, step = shared.chains(some, options, rays), max(1, PAIRS_TOGETHER // len(some))
             for start in range(0, len(targets), step):
                 batch = targets[start : start + step]
-                found = [shared.specular_paths(chains, some, batch, options)]
+                found = [specular_paths(shared.surfaces, chains, some, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
                     for index, source in enumerate(some):
                         legs = sampled_paths(scene, shared.surfaces, source, batch, options, rays)
@@ -279,7 +271,7 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
     best, calm, rays = np.zeros(2), 0, FIRST_RAYS
     while True:
         chains = shared.new_chains(sources, plain, rays, options.seed + rays.bit_length())
-        legs = shared.specular_paths(chains, sources, targets, plain)
+        legs = specular_paths(shared.surfaces, chains, sources, targets, plain)
         found = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
         calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
         best = np.maximum(best, found)

@@ -13,8 +13,8 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from . import TraceResult, trace_paths
+from .instrument_parameters import moved_m
 from .moved_scene import MovedSearch
-from .pose import moved_m
 from .solve import Prepared
 from .traced_field import TracedField, TracedOptions, needs_search
 
