@@ -8,7 +8,7 @@ found where planes have moved. What is kept is decided on other training rows.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,9 +30,8 @@ from ..scene.surfaces import KINDS, Kind
 from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
-from ..tracing.corrected_scene import check_materials
+from ..tracing.corrected_scene import check_materials, moved_search
 from ..tracing.instrument_parameters import gain_name
-from ..tracing.moved_scene import moved_search
 from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit, State
@@ -142,7 +141,9 @@ def correct_scene(
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
     parts = _parts(record, split)
-    hidden = _surfaces_of(prepared.tables("surface").slabs.names, supposed)
+    named = [name.rpartition("/")[::2] for name in prepared.tables("surface").slabs.names]
+    slabs = np.array([slab for slab, (thing, _) in enumerate(named) if thing in supposed], np.int64)
+    hidden = np.array([int(named[slab][1]) for slab in slabs], np.int64), slabs
 
     def fit_of(record: Record, rows: IntArray, state: State | None = None, by: Fit | None = None) -> Fit:
         """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a state has them."""
@@ -191,13 +192,6 @@ def correct_scene(
     }
     seconds = time.perf_counter() - begun
     return Correction(opened, final, state, deviation, scores, _kinds(scene), data, seconds, facts)
-
-
-def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArray, IntArray]:
-    """Numbers of the planes and of the surfaces of some objects, by the names of a scene's surfaces."""
-    parts = [name.rpartition("/")[::2] for name in names]
-    slabs = np.array([slab for slab, (thing, _) in enumerate(parts) if thing in objects], np.int64)
-    return np.array([int(parts[slab][1]) for slab in slabs], np.int64), slabs
 
 
 def _stages(options: CorrectionOptions) -> list[str]:

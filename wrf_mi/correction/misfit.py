@@ -29,9 +29,9 @@ from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing import TraceOptions
+from ..tracing.corrected_scene import MovedSearch
 from ..tracing.instrument_parameters import instrument_parameters
 from ..tracing.material_parameters import PREFIX, QUANTITIES
-from ..tracing.moved_scene import MovedSearch
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields

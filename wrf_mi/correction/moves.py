@@ -7,7 +7,6 @@ hold these where they are, as either fits only beside the other.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from operator import itemgetter
@@ -139,20 +138,16 @@ class Moves:
         tried.sort(key=itemgetter(0))
         if choice.joint:
             # A plane that is tilted, too, fits at the right shift only once its tilts do.
-            kind, each, most = (0, SHIFTS_EACH, len(tried)) if of_materials else (2, 1, REFINED)
-            best, few = dict[str, FloatArray](), list[tuple[str, FloatArray]]()
-            count = Counter[str]()
+            groups = dict[str, list[tuple[str, FloatArray]]]()  # by material or by shift
             for _, name, other in tried:
-                key = name.partition(",")[kind]
-                if count[key] < each and len(few) < most:
-                    count[key] += 1
-                    few.append((name, other))
-                    best.setdefault(key, other)
-            if of_materials:  # also where the plane is, as the shifts above are those of a lattice
-                for name, other in best.items():
-                    in_place = other.copy()
+                groups.setdefault(name.partition(",")[0 if of_materials else 2], []).append((name, other))
+            few = [group[0] for group in groups.values()][:REFINED]
+            if of_materials:
+                few = [one for group in groups.values() for one in group[:SHIFTS_EACH]]
+                for material, group in groups.items():  # also where the plane is: the shifts are those of a lattice
+                    in_place = group[0][1].copy()
                     in_place[choice.plane] = vector[choice.plane]
-                    few.append((name, in_place))
+                    few.append((material, in_place))
             places = choice.places if trials is self.fit.misfit else choice.plane
             for name, other in few:
                 better = self.fit.refined(trials, other, places)

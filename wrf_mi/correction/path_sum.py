@@ -23,7 +23,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..tasks import task_of
-from ..tracing.image_method import mirrored
+from ..tracing.images import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
 from .sums import Channels, Complex, Spectra, Strengths

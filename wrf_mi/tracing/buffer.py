@@ -158,18 +158,9 @@ def join(parts: list[Legs], depth: int) -> Legs:
 def sampled_paths(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions, rays: int
 ) -> Legs:
-    """Paths with at least one diffuse reflection or diffraction from a source to each target.
+    """Paths with at least one diffuse reflection or diffraction from a source [3] to each target [n, 3], metres.
 
-    Args:
-        scene: ``sionna.rt.Scene``.
-        surfaces: surfaces of the scene.
-        source_m: position [3], metres.
-        targets_m: positions [n, 3], metres.
-        options: kinds of interaction and depth.
-        rays: number of rays from the source.
-
-    Returns:
-        Paths with source 0 and target 0..n-1; vertices in single precision.
+    Source 0, target 0..n-1; vertices are in single precision.
     """
     import drjit as dr
     from sionna.rt.path_solvers.image_method import ImageMethod

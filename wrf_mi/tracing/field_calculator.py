@@ -195,15 +195,9 @@ def _interact(
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
-    """Real field vectors of an antenna with derivatives, see `wrf_mi.core.Antenna.field`.
+    """Real field vectors of an antenna, three arrays [q] in the world's frame, with derivatives.
 
-    Args:
-        antenna: pattern and polarisation.
-        direction: unit vectors, three arrays [q] of any float type, world frame.
-        axes: the antenna's x, y and z axis in the world's frame.
-
-    Returns:
-        Three arrays [q], world frame.
+    As `wrf_mi.core.Antenna.field`, of unit vectors ``direction`` and the antenna's axes x, y and z in that frame.
     """
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
@@ -212,14 +206,9 @@ def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Ve
 def chains_of(
     surfaces: Surfaces, types: NDArray[np.uint8], face: IntArray, material: IntArray, sources: Sequence[FloatArray]
 ) -> Chains:
-    """Chains of p paths, float64.
+    """Chains of p paths with interactions ``types`` at faces, of materials by their indices, all [p, depth].
 
-    Args:
-        surfaces: surfaces of the scene.
-        types: interactions [p, depth], from the transmitter.
-        face: faces at which they are [p, depth].
-        material: indices of the materials there [p, depth].
-        sources: five columns [p]: coordinates of each path's transmitter, cosine and sine of its heading.
+    ``sources``: five columns [p], coordinates of each path's transmitter, cosine and sine of its heading.
     """
     depth = types.shape[1] if types.any() else 0
     types, face = types[:, :depth], face[:, :depth]

@@ -16,7 +16,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
 from .buffer import SPECULAR, TRANSMISSION, Legs, point_array, to_buffer
-from .image_method import image_sources
+from .images import image_sources
 from .options import TraceOptions
 from .surfaces import Surfaces
 
@@ -72,17 +72,14 @@ def field_of(
     rays: int,
     loop_mode: Literal["symbolic", "evaluated"] = "symbolic",
 ) -> tuple[Any, Any]:
-    """Complex gains of paths as Dr.Jit arrays, differentiable in the materials with ``loop_mode="evaluated"``.
+    """Complex gains [p] of paths as Dr.Jit arrays, without the phase exp(-j k length).
 
     Args:
         scene: ``sionna.rt.Scene``.
         buffer: p paths from source to target, from `wrf_mi.tracing.buffer.to_buffer`; may be used again.
         ends: sources and targets.
         rays: number of rays shot per source, for diffuse reflections.
-        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster and has no derivatives.
-
-    Returns:
-        Real and imaginary part, ``mi.Float`` [p], without the phase exp(-j k length).
+        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
     """
     import drjit as dr
     import mitsuba as mi

@@ -167,15 +167,9 @@ def read_materials(scene: Any) -> SlabMaterials:
 
 
 def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
-    """The slabs of a scene, and the slab of each face.
+    """The slabs of a ``sionna.rt.Scene``, by named material or by surface, and the index of each face's slab [f].
 
-    Args:
-        scene: a ``sionna.rt.Scene``.
-        surfaces: its faces [f].
-        grouping: slabs of named materials or of surfaces.
-
-    Returns:
-        The slabs, and the index of each face's slab [f]; -1 where its material is not a slab.
+    The index is -1 where the face's material is not a slab.
     """
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]

@@ -118,30 +118,21 @@ class SceneTables:
 
     def select(self, surfaces: Surfaces, planes: IntArray, slabs: IntArray) -> SceneTables:
         """Tables of some planes and materials by their numbers, in that order; other faces have no material (-1)."""
-        chosen = self.slabs.select(slabs)
-        number = np.append(_places(slabs, len(self.slabs.names), -1), -1)
-        constants = chosen.constants(Float64)
-        return SceneTables(chosen, number[self.slab_of_face], constants, PlaneTables.of(surfaces, planes))
+        chosen, number = self.slabs.select(slabs), np.full(len(self.slabs.names) + 1, -1)
+        number[slabs] = np.arange(len(slabs))
+        slab_of_face = number[self.slab_of_face]  # the last one, -1, for faces without a material
+        return SceneTables(chosen, slab_of_face, chosen.constants(Float64), PlaneTables.of(surfaces, planes))
 
 
 def renumbered(levels: Sequence[Level], planes: IntArray, slabs: IntArray) -> list[Level]:
-    """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``.
+    """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``, ascending.
 
-    Both have all those that a path meets; interactions that are place holders get the number 0.
+    Both have all those that a path meets; interactions that are place holders get any of these numbers.
     """
 
     def places(numbers: Any, chosen: IntArray) -> Any:
-        number = np.asarray(numbers)
-        size = int(max(number.max(initial=0), chosen.max(initial=0))) + 1
-        return to_uint(_places(chosen, size, 0)[number])
+        return to_uint(np.minimum(np.searchsorted(chosen, np.asarray(numbers)), len(chosen) - 1))
 
     return [
         replace(level, plane=places(level.plane, planes), material=places(level.material, slabs)) for level in levels
     ]
-
-
-def _places(chosen: IntArray, count: int, missing: int) -> IntArray:
-    """Place of each of ``count`` numbers among those chosen, or ``missing``."""
-    places = np.full(count, missing, np.int64)
-    places[chosen] = np.arange(len(chosen))
-    return places

@@ -125,19 +125,7 @@ def traced_powers(
     options: TraceOptions,
     tx_antenna: Antenna,
 ) -> FloatArray:
-    """Received power for 0 dBm sent, traced or read.
-
-    Args:
-        scene: from `wrf_mi.tracing.open_scene`.
-        prepared: shared state of the scene.
-        tx_pos_m: transmitters [m, 3], metres, outside of solids.
-        receivers: n_rx receivers.
-        options: paths that are traced.
-        tx_antenna: antenna of the transmitters.
-
-    Returns:
-        Power in dBm [n_rx, m], NaN without a path.
-    """
+    """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
     if (slab_of_face >= 0).all():  # other materials have no digest

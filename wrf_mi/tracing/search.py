@@ -213,14 +213,9 @@ def _unique_rows(rows: IntArray) -> IntArray:
 def possible(
     surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
+    """Pairs of chain and target [n, 3] whose points of reflection lie within the bounds of the chain's planes.
 
     A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
-
-    Args:
-        surfaces: surfaces of the scene.
-        chains: chains from any sources.
-        targets_m: positions [n, 3], metres.
 
     Yields:
         Indices of chains and of targets, in chunks; in a chunk by the number of reflections.
@@ -272,12 +267,7 @@ def hits(options: TraceOptions, rays: int) -> int:
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
-    """Announce a search that takes long, and refuse one that takes more than an hour.
-
-    Args:
-        options: kinds of path and depth.
-        rays: number of rays from each source.
-        sources: number of sources whose rays are shot.
+    """Announce a search from a number of sources that takes long.
 
     Raises:
         InputError: a search of more than an hour, naming what makes it shorter.

@@ -20,8 +20,7 @@ from ..core.types import IntArray
 from .buffer import Legs, join, sampled_paths
 from .devices import before_surfaces, check_devices, from_behind
 from .fields import AT_ANTENNA_M, path_gains, scattering_materials
-from .image_method import image_sources
-from .images import specular_paths
+from .images import image_sources, specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
 from .search import ReflectionChains, check_search, shoot
@@ -61,12 +60,7 @@ class Prepared:
         self._checked: set[bytes] = set()
 
     def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
-        """Refuse antennas inside solids and warn of those near surfaces, each position once.
-
-        Args:
-            tx_pos_m: transmitters as stated [n, 3], metres.
-            receivers: receivers as stated.
-            first_row: number of the first transmitter in error messages, from 0.
+        """Refuse antennas inside solids and warn of those near surfaces, each position once, as stated.
 
         Raises:
             InputError: see `wrf_mi.tracing.devices.check_devices`.
