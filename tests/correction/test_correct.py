@@ -22,7 +22,8 @@ from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.correction.correct import _error_ratio
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
+from wrf_mi.correction.options import PARTS
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
@@ -34,6 +35,7 @@ from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 ROOM = correction_rooms.surfaces
@@ -74,17 +76,7 @@ def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Pa
     found, *_ = corrected
     slabs = found.misfit.sides[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
-    expected = (
-        Misfit(
-            found.misfit.record,
-            found.misfit.rows[:2],
-            true,
-            search_options(CorrectionOptions(depth=1, rays=4096, faint=0.0)),
-            lambda name: True,
-        )
-        .sides[0]
-        .slabs
-    )
+    expected = Prepared(true).tables("surface").slabs
     assert slabs.names == expected.names
     felt = [not name.startswith("board") for name in slabs.names]
     ratio = slabs.fitted(found.misfit.named(found.vector)).permittivity[felt] / expected.permittivity[felt]
@@ -347,15 +339,15 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
 def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) -> None:
     """To 1 %, or the rounding of float32 reports, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
     record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
-    options = search_options(CorrectionOptions(("patterns",), depth=2, rays=4096, faint=0.0, pattern_degree=1))
-    misfit = Misfit(record, np.arange(rows), scene, options, lambda name: True)
+    options = CorrectionOptions(PARTS, depth=2, rays=4096, faint=0.0, pattern_degree=1)
+    misfit = Misfit(record, np.arange(rows), Prepared(scene), options)
     planes, slabs = misfit.counts()
     place_of = {"plane": int(planes.argmax()), "material": int(slabs.argmax())}  # those that most paths meet
     size = {TILT: 2}
     columns = np.array(
         [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
     )
-    slopes = misfit.jacobian(misfit.start, columns, lambda place: None)
+    slopes = misfit.jacobian(misfit.start, columns)
     assert [tangent.n_recordings for tangent in misfit._tangents] == [1] * len(misfit.sides)
     seen = np.isfinite(misfit.observed).all(axis=1)
     assert (slopes[:, ~seen] == 0).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from correction_rooms import CARRIER_HZ, channels, stated_scene
 from wrf_mi.correction import CorrectionOptions
 from wrf_mi.correction.choices import ABSENT, ABSENT_VALUES, material_places
 from wrf_mi.correction.fit import Fit, State
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
 from wrf_mi.tracing import open_scene
+from wrf_mi.tracing.solve import Prepared
 
 
 def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> None:
@@ -21,8 +23,8 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> No
     record = channels(scene, 24)
 
     def fit(reflections: int, surfaces: tuple[np.ndarray, np.ndarray]) -> Fit:
-        how = search_options(CorrectionOptions(("materials",), depth=1, reflections=reflections, rays=4096))
-        misfit = Misfit(record, np.arange(12), opened, how, options.changes, surfaces=surfaces)
+        how = replace(options, reflections=reflections)
+        misfit = Misfit(record, np.arange(12), Prepared(opened), how, surfaces=surfaces)
         return Fit(misfit, options, lambda what, share: None)
 
     none = np.zeros(0, np.int64)

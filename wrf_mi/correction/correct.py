@@ -35,7 +35,7 @@ from ..tracing.instrument_parameters import gain_name
 from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit, State
-from .misfit import Misfit, search_options
+from .misfit import Misfit
 from .moves import Moves
 from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
 
@@ -154,8 +154,8 @@ def correct_scene(
             searched = moved_search(copy, prepared.surfaces, parameters, by.absent(state))
         # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
         further = (by.misfit.planes, by.misfit.slabs) if by else hidden
-        how = search_options(options), options.changes, prepared, searched, further
-        return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed, boxes.members)
+        misfit = Misfit(record, rows, prepared, options, searched, further)
+        return Fit(misfit, options, on_stage, supposed, boxes.members)
 
     trial = fit_of(parts.known, parts.known_rows)
     if not any(side.exists.any() for side in trial.misfit.sides):

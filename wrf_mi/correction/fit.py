@@ -205,19 +205,13 @@ class Fit:
     def solved(self, state: State, most_steps: int | None = None) -> State:
         """Least squares of a stage's entries from a state, in at most ``most_steps`` steps."""
         free, misfit = self.free(state.stage), self.misfit
-        what = f"least squares of {len(free)} parameters"
         steps = self.options.steps if most_steps is None else min(most_steps, self.options.steps)
-        done = 0
 
         def jacobian(vector: FloatArray) -> NDArray[np.float32]:
-            def on_column(place: int) -> None:
-                self.on_stage(what, (done + place / max(len(free), 1)) / steps)
-
-            return near(misfit, vector).jacobian(vector, free, on_column)
+            return near(misfit, vector).jacobian(vector, free)
 
         def on_step(step: int) -> None:
-            nonlocal done
-            done = step
+            self.on_stage(f"least squares of {len(free)} parameters", step / steps)
 
         prior = self.prior(state.mean, free)
         vector, residual = minimised(misfit.residual, jacobian, state.vector, free, prior, steps, on_step)

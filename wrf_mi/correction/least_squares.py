@@ -124,14 +124,15 @@ def minimised(
         free: indices [k] of the parameters that change.
         prior: prior of these parameters.
         steps: largest number of steps.
-        on_step: called with the number of a step, from 1, after it.
+        on_step: called with the number of a step, from 0, before it.
 
     Returns:
         Most probable parameters [p] and their residuals.
     """
     vector, damping = np.array(start, float), FIRST_DAMPING
     present = residual(vector)
-    for step in range(1, steps + 1):
+    for step in range(steps):
+        on_step(step)
         noise = Noise.of(present)
         before = noise.cost(present) + prior.cost(vector[free])
         information, slope = _normal(jacobian(vector), present, noise)
@@ -148,7 +149,6 @@ def minimised(
         else:
             break
         vector, present, damping = trial, tried, max(damping / HARDER, LEAST_DAMPING)
-        on_step(step)
         if before - after < CONVERGED:
             break
     return vector, present

@@ -7,7 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,16 +28,15 @@ from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from ..tracing import TraceOptions
 from ..tracing.corrected_scene import MovedSearch
 from ..tracing.instrument_parameters import instrument_parameters
 from ..tracing.material_parameters import PREFIX, QUANTITIES
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField, TracedOptions
+from ..tracing.traced_field import TracedField
 from .frame import rigid_motions, scene_entries
-from .options import PATTERNS, CorrectionOptions
+from .options import CorrectionOptions
 
 LATTICE = (12, 40)
 """Most elevations and azimuths of the lattice of directions."""
@@ -70,11 +69,9 @@ class Misfit:
     Args:
         record: measurements of any task.
         rows: rows that are compared.
-        scene: scene of `wrf_mi.tracing.open_scene`, at the record's carrier or, of several, at the one at which
-            parameters of materials hold.
-        options: options of the traced side.
-        wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
-        prepared: shared state of the scene.
+        prepared: shared state of the scene, at the record's carrier or, of several, at the one at which parameters of
+            materials hold.
+        options: options of the search, and which parameters of `TracedField.parameters` are entries of the vector.
         searched: where paths are searched; None: in the scene as stated.
         surfaces: numbers of planes and of surfaces of the scene that have parameters though no path meets them; all
             others have none. None: all have parameters.
@@ -98,10 +95,8 @@ class Misfit:
         self,
         record: Record,
         rows: IntArray,
-        scene: Any,
-        options: TracedOptions,
-        wanted: Callable[[str], bool],
-        prepared: Prepared | None = None,
+        prepared: Prepared,
+        options: CorrectionOptions,
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
@@ -111,8 +106,8 @@ class Misfit:
         seen = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in seen]
         self._image = task.image
-        shared = prepared or Prepared(scene)
-        self.tables = shared.tables(options.materials)
+        traced = options.traced
+        self.tables = prepared.tables(traced.materials)
         shape = record.observation.shape[2:]
         size, whole_size = (1, 1), (1, 1)
         if task.image:
@@ -126,8 +121,8 @@ class Misfit:
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in zip(seen, self.receivers, strict=True):
-            given = record.tx_pos_m[rows], receiver, options, shared, heading, carriers
-            sides += traced_fields(scene, *given, searched=searched)
+            given = record.tx_pos_m[rows], receiver, traced, prepared, heading, carriers
+            sides += traced_fields(prepared.scene, *given, searched=searched)
             for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))
@@ -136,15 +131,15 @@ class Misfit:
         # The same order of entries whichever receivers are seen.
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
-            self._instruments |= instrument_parameters(receiver, options.pattern_degree)
-        self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
+            self._instruments |= instrument_parameters(receiver, traced.pattern_degree)
+        self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
             self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
-            tables = self.tables.select(shared.surfaces, self.planes, self.slabs)
+            tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
             sides = [side.select(tables, self.planes, self.slabs) for side in sides]
         self.sides = sides
         every = {name: value for name, value in sides[0].parameters().items() if name.startswith((PREFIX, SHIFT, TILT))}
-        values = {name: value for name, value in (every | self._instruments).items() if wanted(name)}
+        values = {name: value for name, value in (every | self._instruments).items() if options.changes(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
@@ -277,9 +272,7 @@ class Misfit:
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
         return np.concatenate(signals)
 
-    def jacobian(
-        self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
-    ) -> NDArray[np.float32]:
+    def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
         """Derivatives [columns, n_rx * rows, values] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
@@ -287,7 +280,6 @@ class Misfit:
             direction = self._device(np.eye(1, len(vector), column)[0])
             for tangent, places in zip(self._tangents, self.places, strict=True):
                 slopes[place, places] = tangent(params, direction).numpy().reshape(len(places), -1)
-            on_column(place)
         slopes /= self.unit[:, None].astype(np.float32)
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return slopes
@@ -357,12 +349,3 @@ def _stride(length: int, most: int) -> int:
     """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
     found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
     return found if 3 * (length // found) >= most else 1
-
-
-def search_options(options: CorrectionOptions) -> TracedOptions:
-    """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
-    trace = TraceOptions(
-        transmission=True, max_depth=options.depth, max_reflections=options.reflections, rays=options.rays
-    )
-    degree = options.pattern_degree if PATTERNS in options.parts else 0
-    return TracedOptions(trace, degree, materials="surface", planes=True, faint=options.faint, constants=QUANTITIES)

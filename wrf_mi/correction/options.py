@@ -12,9 +12,10 @@ from pydantic import Field
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
 from ..tracing.instrument_parameters import TX_PATTERN
-from ..tracing.material_parameters import EXPONENT, PREFIX
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
+from ..tracing.material_parameters import EXPONENT, PREFIX, QUANTITIES
+from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
 from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
@@ -81,6 +82,13 @@ class CorrectionOptions(CheckedSettings):
             raise InputError(f"correct: {HIDDEN} needs {MATERIALS}, by which a face is there or not")
         if not self.parts:
             raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
+
+    @property
+    def traced(self) -> TracedOptions:
+        """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
+        trace = TraceOptions(transmission=True, max_depth=self.depth, max_reflections=self.reflections, rays=self.rays)
+        degree = self.pattern_degree if PATTERNS in self.parts else 0
+        return TracedOptions(trace, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES)
 
     def changes(self, name: str) -> bool:
         """Whether a parameter of `wrf_mi.tracing.traced_field.TracedField` is changed."""

@@ -29,7 +29,7 @@ from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
 from ..tracing.corrected_scene import moved_triangles, write_corrected_scene
-from ..tracing.material_parameters import QUANTITIES, SURFACE, name_of, slabs_of_faces
+from ..tracing.material_parameters import QUANTITIES, SURFACE, name_of
 from ..tracing.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
@@ -282,13 +282,11 @@ def _with_sd(value: float, sd: float) -> str:
 
 def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list[str]:
     """The change of the material of each face, a key of `CHANGES`."""
-    side = correction.misfit.sides[0]
-    slab_of_face = slabs_of_faces(side.scene, side.surfaces, "surface")[1]
     of_slab = [AS_STATED] * facts["surfaces"]
     for index, one in zip(correction.misfit.slabs, facts["materials"], strict=True):
         if one["sd_log"] is not None:
             of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
-    return [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
+    return [of_slab[slab] if slab >= 0 else AS_STATED for slab in correction.misfit.tables.slab_of_face]
 
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:

@@ -11,7 +11,6 @@ a factor of its sums.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -121,9 +120,7 @@ class PathSum:
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
         return self._reports.report(signal, rows) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
-    def jacobian(
-        self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
-    ) -> NDArray[np.float32]:
+    def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
         """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; those by materials are
         differences over `STEP`.
         """
@@ -133,7 +130,7 @@ class PathSum:
         total = self._total + self._sums(waves - self._waves[touched], touched)
         receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
         changes = list[tuple[IntArray, Complex]]()
-        for number, column in enumerate(columns):
+        for column in columns:
             if column in receiver:
                 imaginary, rows = receiver[column]
                 by_gain = (1j if imaginary else 1) if self._unit is not None else (0 if imaginary else 2)
@@ -151,7 +148,6 @@ class PathSum:
                 # Parameters are rounded to single precision, gains are not.
                 step = float(np.float32(there[column])) - float(np.float32(vector[column]))
                 changes.append((rows, self._sums((waves - present[moved]) / step, moved)[rows]))
-            on_column(number)
         every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
         factor = self._factor(vector)
         slopes = self._reports.slopes((total * factor)[every], every)

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from ..core import Receiver
 from ..core.angles import FloatArray
 from ..gaussians.footprint import Pose, principal_axes
-from .options import MAX_DEGREE
 
 TX_PATTERN = "pattern.transmitter"
 """Name of the parameter [2, c] of the transmitters' pattern."""
@@ -44,11 +43,10 @@ def pattern_name(receiver: Receiver) -> str:
 
 def instrument_parameters(receiver: Receiver, pattern_degree: int) -> dict[str, NDArray[np.float32]]:
     """Initial values by name: the stated pose and gain, and with a degree of patterns those of both antennas."""
-    sizes = dict.fromkeys(pose_names(receiver), 3) | {gain_name(receiver): 2}
-    values = {name: np.zeros(size, np.float32) for name, size in sizes.items()}
+    shapes: dict[str, tuple[int, ...]] = {**dict.fromkeys(pose_names(receiver), (3,)), gain_name(receiver): (2,)}
     if pattern_degree:
-        values |= {name: pattern_coefficients(pattern_degree) for name in (pattern_name(receiver), TX_PATTERN)}
-    return values
+        shapes |= {name: (2, (pattern_degree + 1) ** 2 - 1) for name in (pattern_name(receiver), TX_PATTERN)}
+    return {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
 
 
 def pose_names(receiver: Receiver) -> tuple[str, str]:
@@ -103,22 +101,11 @@ def spread_pose(pose: Pose, count: int) -> Pose:
     return Pose(wide[:3], [wide[3:6], wide[6:9], wide[9:12]])
 
 
-def pattern_coefficients(degree: int) -> NDArray[np.float32]:
-    """Coefficients of F = 1: zeros [2, (degree + 1)^2 - 1], real and imaginary parts, by degree and order.
-
-    Raises:
-        ValueError: a degree outside 1..8.
-    """
-    if not 1 <= degree <= MAX_DEGREE:
-        raise ValueError(f"pattern_coefficients: degree {degree}; give 1 to {MAX_DEGREE}")
-    return np.zeros((2, (degree + 1) ** 2 - 1), np.float32)
-
-
 def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
     """Complex factor F(u) of directions in the antenna's frame. Differentiable in both arguments.
 
     Args:
-        coefficients: tensor [2, (L + 1)^2 - 1] from `pattern_coefficients`.
+        coefficients: real and imaginary parts by degree and order, tensor [2, (L + 1)^2 - 1].
         direction: unit vectors u, three arrays [p] of any float type, which is that of the result.
 
     Returns:
