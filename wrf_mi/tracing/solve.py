@@ -301,24 +301,14 @@ def _paths(
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
     legs, gain, length = legs.select(order), gain[order], length[order]
     tx, rx, vertices = tx_pos_m[legs.source], rx_pos_m[legs.target], legs.vertices_m
-    # Nearest points that tell a direction: an antenna may be within a sheet that its path passes.
-    first, last = rx, tx
-    for level in range(vertices.shape[1]):
-        for ends, back in ((tx, vertices.shape[1] - 1 - level), (rx, level)):
-            point, used = vertices[:, back], legs.interactions[:, back] != 0
-            used = (used & (np.linalg.norm(np.nan_to_num(point) - ends, axis=1) > AT_ANTENNA_M))[:, None]
-            if ends is tx:
-                first = np.where(used, point, first)
-            else:
-                last = np.where(used, point, last)
     objects = np.where(legs.interactions != 0, surfaces.object_of(np.maximum(legs.face, 0)), -1)
     paths = Paths(
         tx=legs.source,
         rx=legs.target,
         gain=gain,
         length_m=length,
-        departure=_unit(first - tx),
-        arrival=_unit(last - rx),
+        departure=_directions(tx, rx, vertices),
+        arrival=_directions(rx, tx, vertices[:, ::-1]),
         interactions=legs.interactions,
         vertices_m=vertices,
         objects=objects.astype(np.int32),
@@ -329,5 +319,10 @@ def _paths(
     return paths, legs
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+def _directions(ends_m: FloatArray, others_m: FloatArray, points_m: FloatArray) -> FloatArray:
+    """Unit vectors [p, 3] from ends of paths towards the next points [p, depth, 3] (NaN: none), or the other ends."""
+    # Nearest points that tell a direction: an antenna may be within a sheet that its path passes.
+    apart = np.nan_to_num(np.linalg.norm(points_m - ends_m[:, None], axis=2)) > AT_ANTENNA_M
+    nearest = points_m[np.arange(len(points_m)), apart.argmax(axis=1)]
+    way = np.where(apart.any(axis=1)[:, None], nearest, others_m) - ends_m
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
