@@ -347,8 +347,8 @@ def test_gains_that_are_not_numbers_are_refused(scene: Any, monkeypatch: pytest.
     evaluate = traced_field_module.evaluate_paths
 
     def broken(*given: Any) -> Any:
-        paths = evaluate(*given)
-        return replace(paths, gain=(paths.gain[0] * dr.nan, paths.gain[1]))
+        (real, imaginary), *others = evaluate(*given)
+        return (real * dr.nan, imaginary), *others
 
     monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
     with pytest.raises(InputError, match="gains that are not numbers"):

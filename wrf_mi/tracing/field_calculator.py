@@ -95,21 +95,8 @@ class Chains:
         return plane, material, reflects
 
 
-@dataclass
-class EvaluatedPaths:
-    """Geometry and gain of q paths.
-
-    Attributes:
-        gain: lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length).
-        length_m: unfolded length, metres.
-        departure: unit vectors leaving the transmitter, in its frame (rotated by its heading).
-        arrival: unit vectors from the receiver towards the incoming wave, in the receiver's frame.
-    """
-
-    gain: Complex  # two float arrays [q]
-    length_m: Any  # float [q]
-    departure: Vector  # three float arrays [q]
-    arrival: Vector  # three float arrays [q]
+EvaluatedPaths = tuple[Complex, Any, Vector, Vector]
+"""Gain, length, departure and arrival of q paths, see `evaluate_paths`."""
 
 
 def evaluate_paths(
@@ -129,6 +116,11 @@ def evaluate_paths(
         frequency_hz: carrier frequency.
         rx_antenna: antenna of the receiver.
         tx_antenna: antenna of the transmitters.
+
+    Returns:
+        Gain lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length);
+        unfolded length, metres; unit vectors leaving the transmitter, in its frame (rotated by its heading), and from
+        the receiver towards the incoming wave, in the receiver's frame.
 
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
     and 5.3; slabs as `slab`.
@@ -162,9 +154,8 @@ def evaluate_paths(
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
     taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
-    return EvaluatedPaths(
-        (dot(taken, real) * loss, dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
-    )
+    gain = dot(taken, real) * loss, dot(taken, imaginary) * loss
+    return gain, length, departure, pose.to_local(arrival)
 
 
 def _interact(

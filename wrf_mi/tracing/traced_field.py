@@ -246,17 +246,17 @@ class TracedField:
         paths = self._evaluated(chains, parameters)
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
         dr.eval(paths)
-        gain = paths.gain
+        gain, length_m, departure, arrival = paths
         if self.gain_name in parameters:
             amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
             sine, cosine = dr.sincos(phase)
             gain = times(gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
-        for name, direction in ((pattern_name(self.receiver), paths.arrival), (TX_PATTERN, paths.departure)):
+        for name, direction in ((pattern_name(self.receiver), arrival), (TX_PATTERN, departure)):
             if name in parameters:
                 gain = times(gain, pattern_factor(parameters[name], direction))
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
-        return TracedPaths(gain, paths.length_m, paths.arrival, batch, each)
+        return TracedPaths(gain, length_m, arrival, batch, each)
 
     def _evaluated(self, chains: Chains, parameters: Mapping[str, Any]) -> EvaluatedPaths:
         """Paths with the given parameters but those of antennas and gain."""
@@ -355,7 +355,7 @@ class TracedField:
         if not dr.width(chains.exists):
             return np.zeros(0)
         with dr.suspend_grad():
-            real, imaginary = self._evaluated(chains, self._present).gain
+            real, imaginary = self._evaluated(chains, self._present)[0]
             power = real * real + imaginary * imaginary
         amplitude: FloatArray = np.sqrt(power.numpy())
         if not np.isfinite(amplitude).all():
