@@ -52,7 +52,6 @@ class Correction:
     """A corrected scene.
 
     Attributes:
-        scene: the stated scene (``sionna.rt.Scene``).
         fit: fit to all training rows, with parameters of the surfaces that their paths meet.
         state: its parameters and choices; its stage is what was changed, "" for nothing.
         deviation: standard deviations of the parameters [p], 0 of those that were not changed.
@@ -63,7 +62,6 @@ class Correction:
         facts: sizes for the page.
     """
 
-    scene: Any
     fit: Fit
     state: State
     deviation: FloatArray
@@ -191,7 +189,7 @@ def correct_scene(
         "paths": len(final.misfit.paths.row),
     }
     seconds = time.perf_counter() - begun
-    return Correction(opened, final, state, deviation, scores, _kinds(scene), data, seconds, facts)
+    return Correction(final, state, deviation, scores, _kinds(scene), data, seconds, facts)
 
 
 def _stages(options: CorrectionOptions) -> list[str]:

@@ -62,7 +62,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     with atomic_folder(Path(folder), replace=replace) as part:
         write_corrected_scene(
             part,
-            correction.scene,
+            correction.misfit.sides[0].scene,
             correction.fit.of_scene(correction.state),
             grouping="surface",
             kinds=correction.kinds,
@@ -242,7 +242,7 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         lines.append("")
     fitted = [one for one in facts["materials"] if one["sd_log"] is not None]
     if fitted:
-        several, hz = correction.misfit.several_carriers, float(correction.scene.frequency[0])
+        several, hz = correction.misfit.several_carriers, correction.fit.frequency_hz
         law = " At another carrier f it is multiplied by (f / f0)^d." if several else ""
         text = f"Conductivities hold at the carrier f0 = {hz / 1e9:.6g} GHz.{law} A constant in parentheses is not"
         lines += ["## Materials", "", f"{text} identified."]

@@ -11,6 +11,7 @@ a factor of its sums.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,18 +19,21 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.sparse import coo_array, csr_array
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from ..graph.combine import ArrayReceiver, PowerReceiver
+from ..core.angles import FloatArray, pixel_directions
+from ..core.types import SQUARED_MAGNITUDE_EPS, IntArray
+from ..graph.combine import LEAST_POWER, SILENCE, ArrayReceiver, PowerReceiver
+from ..graph.ports import steering
 from ..tasks import task_of
 from ..tracing.images import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
-from .sums import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:
     from .misfit import Misfit
 
+Complex = NDArray[np.complex128]
+Slopes = Callable[[Complex, IntArray], FloatArray]
+"""Derivatives of reports by changes of signals, and the places of their rows among those of the reports."""
 MOST_WAVES = 1 << 24
 """Most element signals of paths, of 16 bytes each, that are kept for spectra."""
 STEP = 1e-4
@@ -264,3 +268,94 @@ def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[Fl
     rows, columns, values = (np.concatenate(each) for each in zip(*slopes, strict=True))
     # Slopes of a plane that reflects a path twice are added.
     return length, coo_array((values, (rows, columns)), (len(point), 3 * count)).tocsr()
+
+
+class Channels:
+    """Reports of signals [n, values] of some rows [n], in ascending order: sums of waves or of powers, times gains.
+
+    Here channels of a single antenna, real and imaginary part in turn.
+    """
+
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports [n, values] as those of `Misfit`, before the unit of each row."""
+        return np.ascontiguousarray(signal).view(float)
+
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative of `report` by the signals."""
+        return lambda change, which: self.report(change, rows[which])
+
+
+class Strengths(Channels):
+    """Powers in dB, as `wrf_mi.graph.combine.PowerReceiver` reports them."""
+
+    def __init__(self, misfit: Misfit) -> None:
+        self._floor = np.full((len(misfit.observed), 1), np.nan)
+        for model, places in zip(misfit.models, misfit.places, strict=True):
+            assert isinstance(model, PowerReceiver)
+            self._floor[places] = model.floor
+
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports as of `Channels`."""
+        power = signal.real + LEAST_POWER
+        return 10 * np.log10(np.where(power > SILENCE, power + LEAST_POWER, self._floor[rows]))
+
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative as of `Channels`."""
+        power = signal.real + LEAST_POWER
+        weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
+        return lambda change, which: weight[which] * change.real
+
+
+class Spectra(Channels):
+    """Bartlett spectra of element signals, scaled as `wrf_mi.graph.combine.ArrayReceiver.instrument_scale` does."""
+
+    def __init__(self, misfit: Misfit) -> None:
+        self._matrices = list[NDArray[np.complex64]]()
+        self._side = np.zeros(len(misfit.observed), np.int64)
+        for side, (model, places) in enumerate(zip(misfit.models, misfit.places, strict=True)):
+            assert isinstance(model, ArrayReceiver)
+            directions = pixel_directions(model.height, model.width).reshape(-1, 3)
+            matrix = steering(model.elements_m, directions, model.frequency_hz).values
+            self._matrices.append(matrix.astype(np.complex64))
+            self._side[places] = side
+
+    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
+        """Reports as of `Channels`."""
+        return np.asarray(_scaled(_magnitude(self._images(signal, rows)))[0], float)
+
+    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivative as of `Channels`."""
+        image = self._images(signal, rows)
+        spectrum = _magnitude(image)
+        share, low, high, inverse = _scaled(spectrum)
+        weight = image.conj() / spectrum
+
+        def slope(change: Complex, which: IntArray) -> FloatArray:
+            by_pixel = (weight[which] * self._images(change, rows[which])).real
+            least, most = (np.take_along_axis(by_pixel, end[which], axis=1) for end in (low, high))
+            return np.asarray((by_pixel - least - share[which] * (most - least)) * inverse[which], float)
+
+        return slope
+
+    def _images(self, signal: Complex, rows: IntArray) -> NDArray[np.complex64]:
+        """Element signals of some rows in all directions, complex."""
+        side, single = self._side[rows], signal.astype(np.complex64)
+        if len(self._matrices) == 1:
+            return single @ self._matrices[0]
+        images = np.empty((len(rows), self._matrices[0].shape[1]), np.complex64)
+        for number in np.unique(side):
+            images[side == number] = single[side == number] @ self._matrices[number]
+        return images
+
+
+def _scaled(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
+    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
+    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
+    least = np.take_along_axis(spectrum, low, axis=1)
+    span = np.take_along_axis(spectrum, high, axis=1) - least
+    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+    return (spectrum - least) * inverse, low, high, inverse
+
+
+def _magnitude(image: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))
