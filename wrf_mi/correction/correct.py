@@ -160,7 +160,7 @@ def correct_scene(
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
-    chosen = {stage: (Moves(trial, stage).found(), trial) for stage in _stages(options)}
+    chosen = {stage: (Moves(trial, stage).best(), trial) for stage in _stages(options)}
     stated = fit_of(parts.held, parts.held_rows).misfit
     unseen = dict.fromkeys(chosen, stated)
     scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}

@@ -251,9 +251,9 @@ class Misfit:
         """Gains of a vector [p], without exp(-j k length), of the paths ``which`` of `paths`, ascending."""
         params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
         for number in np.unique(paths.side[which]):
-            here = paths.side[which] == number
-            real, imaginary = self._gains[number](params, to_uint(paths.entry[which[here]]))
-            result[here] = np.asarray(real) + 1j * np.asarray(imaginary)
+            of_side = paths.side[which] == number
+            real, imaginary = self._gains[number](params, to_uint(paths.entry[which[of_side]]))
+            result[of_side] = np.asarray(real) + 1j * np.asarray(imaginary)
         return result
 
     def unit_signals(self, vector: FloatArray) -> NDArray[np.complex128]:

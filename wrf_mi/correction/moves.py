@@ -68,7 +68,7 @@ class Moves:
         self.joint = [choice for choice in self.choices if choice.joint]
         self.material = [choice for choice in self.choices if choice.material.size]
 
-    def found(self) -> State:
+    def best(self) -> State:
         """The most probable state that is found from the stated one."""
         fit = self.fit
         state, _ = self._chosen(fit.start(self.stage), self.choices, f"{self.title}, round 1")
@@ -222,8 +222,8 @@ class Moves:
             for _, name, vector in self._alternatives(trials, state.noise, choice, state.vector, of_materials):
                 material = name.partition(",")[0]
                 known = [
-                    material == other if of_materials else abs((vector - there)[choice.plane[0]]) < apart_m
-                    for other, there in tried
+                    material == other if of_materials else abs((vector - tried_vector)[choice.plane[0]]) < apart_m
+                    for other, tried_vector in tried
                 ]
                 if len(tried) > MINIMA or any(known):
                     continue

@@ -133,6 +133,7 @@ class TracedField:
     Attributes:
         frequency_hz: carrier of the paths.
         chains: surfaces that each path meets, planes as stated.
+        interactions: points at which paths meet surfaces, with the planes as stated.
         slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
         surfaces: surfaces of the scene, with the planes of the parameters.
         searches: number of searches so far, without that of ``traced``.
@@ -276,11 +277,6 @@ class TracedField:
         transmitter = np.repeat(np.arange(len(self)), self._each)
         return PathStatistics.of_paths(transmitter, len(self), power, length_m.numpy(), world)
 
-    @property
-    def interactions(self) -> Interactions:
-        """Points at which paths meet surfaces, as found with the planes as stated."""
-        return self._met
-
     def select(self, tables: SceneTables, planes: IntArray, slabs: IntArray) -> TracedField:
         """The same paths with parameters of some planes and materials alone, all those that paths meet among them.
 
@@ -299,7 +295,7 @@ class TracedField:
         """Let Gaussians on the surfaces change paths, by the parameter `wrf_mi.tracing.options.FACTOR`."""
         self._gaussians = gaussians
         count = len(self) * self._each
-        self._weights = PathWeights.of(gaussians, self._met, self._path_of_met, count)
+        self._weights = PathWeights.of(gaussians, self.interactions, self._path_of_met, count)
 
     def search(self, here_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
@@ -332,7 +328,7 @@ class TracedField:
         self._each, self.searched_at_m = each, np.array(here_m, float)
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
-        self._met = Interactions(vertices_m[met], normal)
+        self.interactions = Interactions(vertices_m[met], normal)
         self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
         if self._gaussians is not None:
             self.attach(self._gaussians)
