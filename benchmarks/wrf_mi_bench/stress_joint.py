@@ -31,7 +31,7 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.pose import receiver_pose
+from wrf_mi.tracing.instrument_parameters import pattern_name, receiver_pose
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
 
 from .stress_oracle import ComplexArray, OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
@@ -145,7 +145,7 @@ class _Joint:
         self._case, rng = case, np.random.default_rng(7)
         room = {name: (kind, wall) for kind, (name, wall) in zip(KINDS, box_sheets(ROOM).items(), strict=True)}
         scene = open_scene(write_scene(work, room | case.parts, "Stress"), HZ, THICKNESS_M)
-        options = TracedOptions(case.options, 2, gain=100.0, materials="surface", planes=True)
+        options = TracedOptions(case.options, 2, materials="surface", planes=True)
         self._traced = TracedField(scene, case.tx_pos_m, case.receiver, options)
         self._oracle = TracedOracle(self._traced)
         # Encoded positions are detached, so the functional may hardly depend on them.
@@ -155,7 +155,8 @@ class _Joint:
         values = {f"field.{name}": value.astype(float) for name, value in start.items()}
         values["field.rotation"] = rng.normal(size=values["field.rotation"].shape)
         values |= {name: value.astype(float) for name, value in self._traced.parameters().items()}
-        deviation = {self._traced.pattern_name: 0.01, "pattern.transmitter": 0.01}
+        values[self._traced.gain_name] += [np.log(100.0), 0.0]
+        deviation = {pattern_name(case.receiver): 0.01, "pattern.transmitter": 0.01}
         if case.moved:
             deviation |= {"plane.shift": 1e-3, "plane.tilt": 0.01}
         for name, size in deviation.items():

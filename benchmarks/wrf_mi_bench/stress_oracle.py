@@ -22,9 +22,9 @@ from wrf_mi.core.angles import FloatArray, solid_angles
 from wrf_mi.core.types import SQUARED_MAGNITUDE_EPS
 from wrf_mi.graph.combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.tracing.instrument_parameters import TX_PATTERN, pattern_name
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
-from wrf_mi.tracing.traced_field import TX_PATTERN, TracedField
-from wrf_mi.tracing.walls import moved_planes, plane_centres
+from wrf_mi.tracing.traced_field import TracedField
 
 from .stress_rows import relative
 
@@ -99,10 +99,10 @@ class TracedOracle:
         taken = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
         loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
         gain = (taken * sent).sum(axis=-1) * loss
-        amplitude, phase = values.get(traced.gain_name, np.array([np.log(traced.options.gain), 0.0]))
+        amplitude, phase = values.get(traced.gain_name, np.zeros(2))
         gain = gain * np.exp(amplitude + 1j * phase)
         arrival = -ways[-1] @ to_world
-        for name, direction in ((traced.pattern_name, arrival), (TX_PATTERN, departure)):
+        for name, direction in ((pattern_name(receiver), arrival), (TX_PATTERN, departure)):
             if name in values:
                 gain = gain * pattern(values[name], direction)
         return OraclePaths(gain, length, arrival, len(length) // len(traced))
@@ -111,8 +111,7 @@ class TracedOracle:
         surfaces = self._traced.surfaces
         count = len(surfaces.normal)
         shift, tilt = values.get("plane.shift", np.zeros(count)), values.get("plane.tilt", np.zeros((count, 2)))
-        centre_m, _ = plane_centres(surfaces)
-        return moved_planes(surfaces.normal, surfaces.axes, centre_m, np.column_stack([shift, tilt]))
+        return surfaces.moved_planes(shift, tilt)
 
     def _constant(self, quantity: str, stated: FloatArray, least: float, values: Values) -> FloatArray:
         slabs = self._traced.slabs
@@ -220,7 +219,7 @@ def slab(
 
 
 def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
-    """Factor [p] of an antenna pattern in directions [p, 3], see `wrf_mi.tracing.pattern_parameters`."""
+    """Factor [p] of an antenna pattern in directions [p, 3], see `wrf_mi.tracing.instrument_parameters`."""
     polar, azimuth = np.arccos(np.clip(direction[:, 2], -1, 1)), np.arctan2(direction[:, 1], direction[:, 0])
     series, weights = np.zeros(len(direction), complex), coefficients[0] + 1j * coefficients[1]
     index = 0

@@ -12,7 +12,7 @@ from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
-from wrf_mi.tracing.effects import without_effect
+from wrf_mi.tracing.options import without_effect
 
 DIRECT = {"reflection": False, "max_depth": 0}
 

@@ -14,11 +14,11 @@ from cad_room import CARRIER_HZ
 
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, write_page
 from wrf_mi.correction.fit import LEAST_PATHS
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
 from wrf_mi.datasets import make_splits, read_spectrum_folder, write_spectrum_folder
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.material_parameters import slabs_of_faces
 from wrf_mi.tracing.plane_parameters import SHIFT
+from wrf_mi.tracing.solve import Prepared
 
 SECONDS, MEBIBYTES = 60, 2048
 """Most processor time and memory of a command with 15 rows, on a machine that does nothing else."""
@@ -64,8 +64,8 @@ def test_unmet_facets_stay_one_object_of_the_written_scene(corrected: Correction
     assert facts["surfaces"] > 90_000
     assert len(facts["materials"]) == len(corrected.misfit.slabs)
     written = open_scene(tmp_path / "scene", CARRIER_HZ)
-    side = corrected.misfit.sides[0]
-    present = ~np.isin(slabs_of_faces(side.scene, side.surfaces, "surface")[1], list(corrected.absent))
+    absent = list(corrected.fit.absent(corrected.state))
+    present = ~np.isin(corrected.misfit.tables.slab_of_face, absent)
     assert sum(thing.mi_mesh.face_count() for thing in written.objects.values()) == present.sum()
     assert (tmp_path / "scene" / "correction.json").stat().st_size < 2e6
 
@@ -76,9 +76,9 @@ def test_residuals_do_not_depend_on_surfaces_that_no_path_meets(tmp_path: Path) 
     record = cad_room.record(truth, "spectrum", 6)
     options, rows = CorrectionOptions(depth=2, rays=4096), np.arange(6)
     opened = open_scene(truth, CARRIER_HZ)
-    every = Misfit(record, rows, opened, search_options(options), options.changes)
+    every = Misfit(record, rows, Prepared(opened), options)
     none = np.zeros(0, np.int64)
-    few = Misfit(record, rows, opened, search_options(options), options.changes, surfaces=(none, none))
+    few = Misfit(record, rows, Prepared(opened), options, surfaces=(none, none))
     assert len(few.start) < len(every.start) / 2
     vector = few.start + np.random.default_rng(0).normal(0, 2e-3, len(few.start))
     parameters = few.of_scene(vector)

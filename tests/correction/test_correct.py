@@ -22,7 +22,8 @@ from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
 from wrf_mi.correction.correct import _error_ratio
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
+from wrf_mi.correction.options import PARTS
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
@@ -33,8 +34,8 @@ from wrf_mi.scene.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.corrected_scene import material_constants
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 ROOM = correction_rooms.surfaces
@@ -75,20 +76,10 @@ def test_permittivities_are_recovered_from_channels(corrected: Any, tmp_path: Pa
     found, *_ = corrected
     slabs = found.misfit.sides[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
-    expected = (
-        Misfit(
-            found.misfit.record,
-            found.misfit.rows[:2],
-            true,
-            search_options(CorrectionOptions(depth=1, rays=4096, faint=0.0)),
-            lambda name: True,
-        )
-        .sides[0]
-        .slabs
-    )
+    expected = Prepared(true).tables("surface").slabs
     assert slabs.names == expected.names
     felt = [not name.startswith("board") for name in slabs.names]
-    ratio = material_constants(slabs, found.parameters)[felt, 0] / expected.permittivity[felt]
+    ratio = slabs.fitted(found.misfit.named(found.vector)).permittivity[felt] / expected.permittivity[felt]
     assert np.mean(np.abs(ratio - 1) < PERMITTIVITY) >= 0.8
 
 
@@ -152,7 +143,7 @@ def test_a_wall_is_of_another_material_that_reflects_alike_at_one_carrier(
     stated = stated_scene(tmp_path / "stated")
     found = correct_scene(stated, record, make_splits(record, "official")[0], CorrectionOptions(steps=10))
     np.testing.assert_allclose(found.vector[found.misfit.parts[SHIFT]], shift, atol=PLANE_M)
-    assert {name.partition("/")[0]: kind for name, kind in found.materials.items()}["wall_02"] == "glass"
+    assert {name.partition("/")[0]: kind for name, kind in found.state.materials.items()}["wall_02"] == "glass"
 
 
 LOW_BOX = (2.0, 2.0, 0.03), (3.8, 3.4, 0.36)
@@ -190,7 +181,8 @@ def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path: Path, m
     assert mean[found.kept] > mean[""] + 3
 
     again = correct_scene(tmp_path / "corrected", record, split, replace(options, steps=0))
-    assert not again.supposed & {surface.name for surface in tops}
+    supposed = {name.partition("/")[0] for name in again.fit.supposed}
+    assert not supposed & {surface.name for surface in tops}
     kept = {one["surface"] for one in write_page(again, tmp_path / "again")["materials"] if not one["absent"]}
     assert level[0] in kept
     assert np.nanmean(again.scores[""]) > mean[""] + 3
@@ -208,10 +200,10 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(
     scene, split = stated_scene(tmp_path / "stated", TRUE_MATERIALS), make_splits(record, "official")[0]
     options = CorrectionOptions(parts=("materials", "hidden"), depth=3, rays=1 << 14, steps=3)
     found = correct_scene(scene, record, split, options)
-    faces = {name: kind for name, kind in found.materials.items() if name.startswith(("other", "hidden"))}
+    faces = {name: kind for name, kind in found.state.materials.items() if name.startswith(("other", "hidden"))}
     assert len(faces) == 5
     assert set(faces.values()) == {material}
-    assert not found.absent
+    assert not found.fit.absent(found.state)
     assert np.nanmean(found.scores[found.kept]) > 19
 
 
@@ -237,7 +229,7 @@ def test_standard_deviations_cover_the_errors(corrected: Any) -> None:
     part = found.misfit.parts[SHIFT]
     error = np.abs(found.vector[part] - shift)
     assert (error < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < found.prior[part] / 2).all()
+    assert (found.deviation[part] < found.fit.prior_deviation[part] / 2).all()
 
 
 def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) -> None:
@@ -347,15 +339,15 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
 def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) -> None:
     """To 1 %, or the rounding of float32 reports, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
     record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
-    options = search_options(CorrectionOptions(("patterns",), depth=2, rays=4096, faint=0.0, pattern_degree=1))
-    misfit = Misfit(record, np.arange(rows), scene, options, lambda name: True)
+    options = CorrectionOptions(PARTS, depth=2, rays=4096, faint=0.0, pattern_degree=1)
+    misfit = Misfit(record, np.arange(rows), Prepared(scene), options)
     planes, slabs = misfit.counts()
     place_of = {"plane": int(planes.argmax()), "material": int(slabs.argmax())}  # those that most paths meet
     size = {TILT: 2}
     columns = np.array(
         [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
     )
-    slopes = misfit.jacobian(misfit.start, columns, lambda place: None)
+    slopes = misfit.jacobian(misfit.start, columns)
     assert [tangent.n_recordings for tangent in misfit._tangents] == [1] * len(misfit.sides)
     seen = np.isfinite(misfit.observed).all(axis=1)
     assert (slopes[:, ~seen] == 0).all()

@@ -12,12 +12,13 @@ from correction_rooms import TRUE_MATERIALS, channels, stated_scene
 
 from wrf_mi.core import Record
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, write_page
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
 from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.material_parameters import EXPONENT, SURFACE, name_of
+from wrf_mi.tracing.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
@@ -69,15 +70,14 @@ def test_residuals_are_those_of_each_carrier_alone(tmp_path: Path) -> None:
     scene = stated_scene(tmp_path / "scene", TRUE_MATERIALS)
     record = strengths(scene, 60)
     rows = np.random.default_rng(0).permutation(len(record))[:24]
-    options = search_options(OPTIONS)
-    whole = Misfit(record, rows, open_scene(scene, 2.4e9), options, lambda name: True)
+    whole = Misfit(record, rows, Prepared(open_scene(scene, 2.4e9)), OPTIONS)
     residual = whole.residual(whole.start)
     assert whole.several_carriers
     np.testing.assert_allclose(residual, 0, atol=ROUNDING_DB)
     for carrier_hz in CARRIERS_HZ:
         which = np.flatnonzero(record.carriers_hz[rows] == carrier_hz)
         alone = replace(record, carriers_hz=None, frequencies_hz=np.array([carrier_hz]))
-        single = Misfit(alone, rows[which], open_scene(scene, carrier_hz), options, lambda name: True)
+        single = Misfit(alone, rows[which], Prepared(open_scene(scene, carrier_hz)), OPTIONS)
         assert not single.several_carriers
         np.testing.assert_allclose(residual[which], single.residual(single.start), atol=ROUNDING_DB)
 
@@ -89,7 +89,7 @@ def test_paths_are_searched_once_for_all_carriers(tmp_path: Path, searches: list
     record = replace(record, tx_pos_m=record.tx_pos_m[np.arange(len(record)) % 14])
     opened = open_scene(scene, 2.4e9)
     searches.clear()
-    misfit = Misfit(record, np.arange(len(record)), opened, search_options(OPTIONS), lambda name: True)
+    misfit = Misfit(record, np.arange(len(record)), Prepared(opened), OPTIONS)
     assert len(misfit.sides) == len(CARRIERS_HZ)
     assert searches == [14]
 
@@ -97,9 +97,7 @@ def test_paths_are_searched_once_for_all_carriers(tmp_path: Path, searches: list
 def test_derivatives_by_exponents_are_those_of_finite_differences(tmp_path: Path) -> None:
     """To 1 % of the largest, or the rounding of float32 reports over the step."""
     scene, step = stated_scene(tmp_path / "scene", TRUE_MATERIALS), 0.02
-    misfit = Misfit(
-        strengths(scene, 60), np.arange(50), open_scene(scene, 2.4e9), search_options(OPTIONS), lambda name: True
-    )
+    misfit = Misfit(strengths(scene, 60), np.arange(50), Prepared(open_scene(scene, 2.4e9)), OPTIONS)
     part = misfit.parts[name_of(SURFACE, EXPONENT)]
     columns = np.arange(part.start, part.stop)
     slopes = misfit.jacobian(misfit.start, columns)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from wrf_mi.correction.frame import rigid_motion, rigid_motions
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.surfaces import Surfaces, scene_surfaces
-from wrf_mi.tracing.walls import moved_planes, plane_centres
 
 SECOND_ORDER = 5e-5
 """Metres and rad: a rotation of 1.4 mrad times a displacement of 37 mm, or its square times 5 m."""
@@ -26,10 +25,9 @@ def planes(tmp_path_factory: pytest.TempPathFactory) -> Surfaces:
 def test_motions_are_those_of_the_moved_room(planes: Any) -> None:
     """Shifted and tilted planes are the planes of the room after a small rotation and translation."""
     motion = np.array([0.01, -0.02, 0.03, 1e-3, -5e-4, 8e-4])
-    count, centre = len(planes.normal), plane_centres(planes)[0]
+    count, centre = len(planes.normal), planes.plane_centres_m
     change = rigid_motions(planes) @ motion
-    both = np.column_stack([change[:count], change[count:].reshape(count, 2)])
-    normal, offset = moved_planes(planes.normal, planes.axes, centre, both)
+    normal, offset = planes.moved_planes(change[:count], change[count:].reshape(count, 2))
     turn, middle = Rotation.from_rotvec(motion[3:]), centre.mean(axis=0)
     np.testing.assert_allclose(normal, turn.apply(planes.normal), atol=SECOND_ORDER)
     there = turn.apply(centre - middle) + middle + motion[:3]

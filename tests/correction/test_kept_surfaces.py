@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.correction import CorrectionOptions
-from wrf_mi.correction.fit import Fit, Found, Known
-from wrf_mi.correction.least_squares import Noise, Solution
-from wrf_mi.correction.misfit import Misfit, search_options
-from wrf_mi.correction.search import ABSENT, ABSENT_VALUES, material_places
+from wrf_mi.correction.choices import ABSENT, ABSENT_VALUES, material_places
+from wrf_mi.correction.fit import Fit, State
+from wrf_mi.correction.misfit import Misfit
 from wrf_mi.tracing import open_scene
+from wrf_mi.tracing.solve import Prepared
 
 
 def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> None:
@@ -22,8 +23,8 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> No
     record = channels(scene, 24)
 
     def fit(reflections: int, surfaces: tuple[np.ndarray, np.ndarray]) -> Fit:
-        how = search_options(CorrectionOptions(("materials",), depth=1, reflections=reflections, rays=4096))
-        misfit = Misfit(record, np.arange(12), opened, how, options.changes, surfaces=surfaces)
+        how = replace(options, reflections=reflections)
+        misfit = Misfit(record, np.arange(12), Prepared(opened), how, surfaces=surfaces)
         return Fit(misfit, options, lambda what, share: None)
 
     none = np.zeros(0, np.int64)
@@ -31,10 +32,9 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> No
     slab = next(k for k, name in enumerate(first.misfit.sides[0].slabs.names) if name.startswith("wall_01"))
     vector = first.stated.copy()
     vector[material_places(first.misfit, slab)] = ABSENT_VALUES
-    known = Known("materials", vector, {first.misfit.sides[0].slabs.names[slab]: ABSENT})
-    found = Found(Solution(vector, np.eye(len(vector)), Noise(1.0, 1.0)), known)
+    state = State("materials", vector, vector, {first.misfit.sides[0].slabs.names[slab]: ABSENT})
     second = fit(0, (first.misfit.planes, first.misfit.slabs))
     assert not second.misfit.counts()[1][slab]
-    over = second.carried_over(found, first)
-    assert second.absent(over.known, over.vector) == first.absent(known, vector) != frozenset()
+    over = second.carried_over(state, first)
+    assert second.absent(over) == first.absent(state) != frozenset()
     np.testing.assert_array_equal(over.vector, vector)

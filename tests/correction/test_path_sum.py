@@ -10,12 +10,13 @@ from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.correction.correct import default_options
-from wrf_mi.correction.misfit import Misfit, search_options
+from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.material_parameters import SURFACE, name_of
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.solve import Prepared
 
 ROUNDING = 1e-5
 """Single precision of the tracer's residuals and parameters, k d of 1e3 rad."""
@@ -31,7 +32,7 @@ def misfit(tmp_path_factory: pytest.TempPathFactory) -> Misfit:
     observed[0, 3] = np.nan
     record, options = replace(record, observation=observed), CorrectionOptions(depth=2, rays=8192, faint=0.0)
     opened = open_scene(scene, CARRIER_HZ)
-    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
+    return Misfit(record, np.arange(16), Prepared(opened), options)
 
 
 def moved(misfit: Misfit, shift_m: float = 4e-3, tilt_rad: float = 1e-3) -> np.ndarray:
@@ -95,7 +96,7 @@ def strengths(tmp_path_factory: pytest.TempPathFactory) -> Misfit:
     record = replace(record, task="rssi", observation=observed, receivers=receivers, frequencies_hz=carrier_hz)
     options = replace(default_options(record), rays=8192, parts=(MATERIALS, GAIN))
     opened = open_scene(scene, CARRIER_HZ)
-    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
+    return Misfit(record, np.arange(16), Prepared(opened), options)
 
 
 def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +143,7 @@ def spectra(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     parts = (MATERIALS, PLANES) if request.param else (MATERIALS,)
     options = CorrectionOptions(parts, depth=2, rays=8192, faint=0.0)
     opened = open_scene(scene, CARRIER_HZ)
-    return Misfit(record, np.arange(16), opened, search_options(options), options.changes)
+    return Misfit(record, np.arange(16), Prepared(opened), options)
 
 
 def test_spectra_are_those_of_the_tracer(spectra: Misfit) -> None:
@@ -175,7 +176,8 @@ def test_rows_that_no_changed_path_reaches_are_kept(spectra: Misfit) -> None:
     """A material that some rows meet changes their reports, all others stay as they are."""
     trials, vector = PathSum(spectra, spectra.start), spectra.start.copy()
     slabs = np.arange(len(spectra.sides[0].slabs.names))
-    met = [np.unique(trials._row[(trials._slabs == slab).any(axis=1)]) for slab in slabs]
+    paths = spectra.paths
+    met = [np.unique(paths.row[(paths.slab == slab).any(axis=1)]) for slab in slabs]
     slab = next(slab for slab in slabs if 0 < len(met[slab]) < len(spectra.observed))
     vector[spectra.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     change = trials.residual(vector) - trials.residual(spectra.start)
@@ -197,6 +199,6 @@ def test_receivers_without_rows_are_parameters_but_not_traced(strengths: Misfit)
 def test_a_sum_over_paths_does_not_serve_what_it_cannot_follow(strengths: Misfit, part: str) -> None:
     options = replace(default_options(strengths.record), rays=8192, parts=(MATERIALS, part))
     opened = strengths.sides[0].scene
-    other = Misfit(strengths.record, np.arange(16), opened, search_options(options), options.changes)
+    other = Misfit(strengths.record, np.arange(16), Prepared(opened), options)
     assert PathSum.serves(strengths)
     assert not PathSum.serves(other)

@@ -11,6 +11,7 @@ import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.tracing.instrument_parameters import receiver_pose
 from wrf_mi.tracing.options import FACTOR
 from wrf_mi.tracing.surface_gaussians import SurfaceGaussians
 from wrf_mi.tracing.traced_field import TracedField, TracedOptions
@@ -66,9 +67,10 @@ def both(
     scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
     own = receiver((30, 20, 10))
     options = TraceOptions(max_depth=2, transmission=True, rays=4096)
-    how = TracedOptions(options, pattern_degree=2, gain=300.0, materials=request.param, planes=True)
+    how = TracedOptions(options, pattern_degree=2, materials=request.param, planes=True)
     traced = TracedField(scene, transmitters(BATCH), own, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
+    values[traced.gain_name][0] = np.log(300.0)  # the learned side's size
     met = traced.interactions
     gaussians = SurfaceGaussians(np.column_stack([met.position_m, met.normal])[::5].T, SIZE_M)
     traced.attach(gaussians)
@@ -95,7 +97,9 @@ def terms_of(
 
     def terms(parameters: dict[str, Any]) -> Any:
         own = {name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")}
-        learned = learned_field(field.gaussians(own, tx_pos), traced.pose(parameters, Float64), plane, model.sphere)
+        learned = learned_field(
+            field.gaussians(own, tx_pos), receiver_pose(traced.receiver, parameters, Float64), plane, model.sphere
+        )
         return model(traced(parameters), learned) * weight
 
     return terms

@@ -10,7 +10,7 @@ import pytest
 from traced_rooms import inside, receiver, room
 
 from wrf_mi.core import InputError
-from wrf_mi.tracing import TraceOptions, estimate, search, solve
+from wrf_mi.tracing import TraceOptions, search, solve
 
 IMMEDIATE_S = 5.0
 """More than a refusal takes on a busy machine, and less than the shortest search that is refused."""
@@ -42,7 +42,7 @@ def test_estimate_counts_the_hits_of_the_search(
     monkeypatch.setattr(search, "_shoot", counted)
     monkeypatch.setattr(search, "_kept", type(search._kept)())
     solve.Prepared(closed).chains(inside(2), options, 64)
-    assert counts[0] == 2 * estimate.hits(options, 64)
+    assert counts[0] == 2 * search.hits(options, 64)
 
 
 def test_search_of_hours_is_refused_before_it_begins(closed: Any) -> None:
@@ -56,12 +56,12 @@ def test_search_of_seconds_is_announced_once(
     closed: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     options, prepared = TraceOptions(max_depth=2, rays=64), solve.Prepared(closed)
-    monkeypatch.setattr(estimate, "SECONDS_PER_HIT", 20.0 / estimate.hits(options, 64))
+    monkeypatch.setattr(search, "SECONDS_PER_HIT", 20.0 / search.hits(options, 64))
     for seed in range(2):
         solve.trace_paths(closed, inside(3, seed), receiver([4.0, 3.0, 2.0]), options, prepared=prepared)
     message = "search for paths with up to 2 reflections: about 20 s; faster with a smaller --depth"
     assert caplog.text.count(message) == 1
     caplog.clear()
-    monkeypatch.setattr(estimate, "WARN_S", 30.0)
+    monkeypatch.setattr(search, "WARN_S", 30.0)
     solve.trace_paths(closed, np.array([[1.0, 1.0, 1.0]]), receiver([4.0, 2.0, 2.0]), options)
     assert caplog.text == ""

@@ -13,7 +13,7 @@ from traced_rooms import SHOEBOX, inside, receiver, room
 from wrf_mi.core import Antenna
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers import rssi_dbm
-from wrf_mi.tracing import TraceOptions, kept_powers, trace_paths
+from wrf_mi.tracing import TraceOptions, power_map, trace_paths
 from wrf_mi.tracing.solve import Prepared
 
 OPTIONS = TraceOptions(transmission=True, max_depth=1)
@@ -22,13 +22,13 @@ POSITIONS, CENTRE = inside(5), (3.0, 2.0, 1.5)
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(kept_powers, "user_cache", lambda: tmp_path / "cache")
+    monkeypatch.setattr(power_map, "user_cache", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 
 def powers(scene: Any, positions: FloatArray = POSITIONS, **changed: Any) -> FloatArray:
     given = {"receivers": [receiver(CENTRE)], "options": OPTIONS, "tx_antenna": Antenna(), **changed}
-    return kept_powers.traced_powers(scene, Prepared(scene), positions, **given)
+    return power_map.traced_powers(scene, Prepared(scene), positions, **given)
 
 
 def test_kept_powers_are_those_traced(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +36,7 @@ def test_kept_powers_are_those_traced(tmp_path: Path, cache: Path, monkeypatch: 
     expected = rssi_dbm(trace_paths(scene, POSITIONS, [receiver(CENTRE)], OPTIONS).paths)
     np.testing.assert_allclose(powers(scene), expected, rtol=1e-6)
     assert len(list(cache.rglob("*.npz"))) == 1
-    monkeypatch.setattr(kept_powers, "trace_paths", None)
+    monkeypatch.setattr(power_map, "trace_paths", None)
     np.testing.assert_allclose(powers(scene), expected, rtol=1e-6)
 
 

@@ -10,8 +10,8 @@ from correction_rooms import CARRIER_HZ, HEIGHT, LENGTH, WIDTH, true_scene
 
 from wrf_mi.core import Receiver
 from wrf_mi.tracing import TraceOptions, TraceResult, open_scene, trace_paths
+from wrf_mi.tracing.corrected_scene import moved_search
 from wrf_mi.tracing.material_parameters import slabs_of_faces
-from wrf_mi.tracing.moved_scene import moved_search
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT
 from wrf_mi.tracing.solve import Prepared
 

@@ -30,7 +30,6 @@ from wrf_mi.tracing.corrected_scene import write_corrected_scene
 from wrf_mi.tracing.material_parameters import MaterialGrouping, read_materials
 from wrf_mi.tracing.plane_parameters import SHIFT, TILT, PlaneTables
 from wrf_mi.tracing.surfaces import scene_surfaces
-from wrf_mi.tracing.walls import moved_planes, plane_centres
 
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
@@ -106,7 +105,7 @@ def test_paths_at_moved_planes_are_those_of_a_moved_mesh(tmp_path: Path, shift_m
 def test_planes_move_as_in_numpy(scene: Any) -> None:
     surfaces = scene_surfaces(scene)
     change = np.random.default_rng(0).normal(0, 0.05, (len(surfaces.normal), 3))
-    expected = moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
+    expected = surfaces.moved_planes(change[:, 0], change[:, 1:])
     normal, offset = PlaneTables.of(surfaces).moved({SHIFT: Tensor64(change[:, 0]), TILT: Tensor64(change[:, 1:])})
     np.testing.assert_allclose(np.stack([c.numpy() for c in normal], axis=1), expected[0], atol=1e-14)
     np.testing.assert_allclose(offset.numpy(), expected[1], atol=1e-14)
@@ -208,11 +207,9 @@ def test_training_finds_a_lowered_and_tilted_ceiling(scene: Any, tmp_path: Path)
     # Height at the reflections, not at the centre: over 0.3 m of the ceiling, shift and tilt are hardly distinct.
     spot = np.array([3.0, 2.3, HEIGHT])
     surfaces = scene_surfaces(scene)
-    centre_m, _ = plane_centres(surfaces)
 
     def height(parameters: dict[str, Any]) -> float:
-        change = np.column_stack([parameters[SHIFT], parameters[TILT]]).astype(float)
-        normals, offset_m = moved_planes(surfaces.normal, surfaces.axes, centre_m, change)
+        normals, offset_m = surfaces.moved_planes(parameters[SHIFT], parameters[TILT])
         normal = normals[plane]
         return float((offset_m[plane] - normal[:2] @ spot[:2]) / normal[2])
 

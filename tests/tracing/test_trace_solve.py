@@ -31,7 +31,7 @@ from wrf_mi.tracing import TraceOptions, recompute, trace_paths
 from wrf_mi.tracing import images as images_module
 from wrf_mi.tracing import search as search_module
 from wrf_mi.tracing import solve as solve_module
-from wrf_mi.tracing.image_method import image_sources, meeting_point
+from wrf_mi.tracing.images import image_sources, meeting_point
 from wrf_mi.tracing.materials import perfect_reflector
 
 SINGLE = 2e-4

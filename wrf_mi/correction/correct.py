@@ -1,6 +1,6 @@
 """Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-Paths are found with the stated scene; choice (`wrf_mi.correction.search`) and least squares
+Paths are found with the stated scene; choice (`wrf_mi.correction.moves`) and least squares
 (`wrf_mi.correction.least_squares`) are done in rounds on training rows, once more with the paths of the scene that they
 found where planes have moved. What is kept is decided on other training rows.
 """
@@ -8,14 +8,13 @@ found where planes have moved. What is kept is decided on other training rows.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 from threadpoolctl import threadpool_limits
 
@@ -31,14 +30,14 @@ from ..scene.surfaces import KINDS, Kind
 from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
-from ..tracing.corrected_scene import check_materials
+from ..tracing.corrected_scene import check_materials, moved_search
 from ..tracing.instrument_parameters import gain_name
-from ..tracing.moved_scene import moved_search
 from ..tracing.solve import Prepared
 from ..training.reach import hold_out_groups, improves
-from .fit import LEAST_PATHS, Fit, Found
-from .misfit import Misfit, search_options
-from .options import DEFAULTS, FRAME, GAIN, HIDDEN, PLANES, STRENGTHS, CorrectionOptions, OnStage
+from .fit import LEAST_PATHS, Fit, State
+from .misfit import Misfit
+from .moves import Moves
+from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
 
 LEVEL = 0.9
 """Level of the intervals for which errors of rows that a scene knows are enlarged."""
@@ -53,47 +52,39 @@ class Correction:
     """A corrected scene.
 
     Attributes:
-        scene: the stated scene (``sionna.rt.Scene``).
-        misfit: residuals over all training rows, with parameters of the surfaces that their paths meet.
-        kept: parts that were changed, joined by "+"; "" for none.
-        vector: parameters [p] of `Misfit`.
-        deviation: their standard deviations [p], 0 of those that were held.
-        prior: standard deviations before the correction [p].
-        free: indices of the changed entries.
-        materials: material that each changed surface took first, by its name.
-        absent: surfaces that are left out, by their numbers in the scene.
+        fit: fit to all training rows, with parameters of the surfaces that their paths meet.
+        state: its parameters and choices; its stage is what was changed, "" for nothing.
+        deviation: standard deviations of the parameters [p], 0 of those that were not changed.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
-        supposed: names of objects that the stated scene lacks (`wrf_mi.scene.hidden`).
-        options: options.
-        scene_parameters: parameters by name for all planes and surfaces of the scene; none where nothing was changed.
         data: rows that were used, and how much smaller their errors are for it; None where nothing was changed.
         seconds: duration.
         facts: sizes for the page.
     """
 
-    scene: Any
-    misfit: Misfit
-    kept: str
-    vector: FloatArray
+    fit: Fit
+    state: State
     deviation: FloatArray
-    prior: FloatArray
-    free: IntArray
-    materials: Mapping[str, str]
-    absent: frozenset[int]
     scores: Mapping[str, FloatArray]
     kinds: Mapping[str, Kind]
-    supposed: frozenset[str]
-    options: CorrectionOptions
-    scene_parameters: Mapping[str, FloatArray] = field(default_factory=dict)
-    data: CorrectionData | None = None
-    seconds: float = 0.0
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    data: CorrectionData | None
+    seconds: float
+    facts: Mapping[str, Any]
 
     @property
-    def parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Parameters of `misfit` by the names of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
-        return self.misfit.named(self.vector)
+    def misfit(self) -> Misfit:
+        """Residuals over all training rows."""
+        return self.fit.misfit
+
+    @property
+    def kept(self) -> str:
+        """Parts that were changed, joined by "+"; "" for none."""
+        return self.state.stage
+
+    @property
+    def vector(self) -> FloatArray:
+        """Parameters [p] of `misfit`."""
+        return self.state.vector
 
 
 def default_options(record: Record) -> CorrectionOptions:
@@ -148,98 +139,70 @@ def correct_scene(
     prepared = Prepared(opened)
     prepared.check(record.tx_pos_m, record.receivers)
     parts = _parts(record, split)
-    hidden = _surfaces_of(prepared.tables("surface").slabs.names, supposed)
+    named = [name.rpartition("/")[::2] for name in prepared.tables("surface").slabs.names]
+    slabs = np.array([slab for slab, (thing, _) in enumerate(named) if thing in supposed], np.int64)
+    hidden = np.array([int(named[slab][1]) for slab in slabs], np.int64), slabs
 
-    def fit_of(record: Record, rows: IntArray, found: Found | None = None, by: Fit | None = None) -> Fit:
-        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a fit has found."""
+    def fit_of(record: Record, rows: IntArray, state: State | None = None, by: Fit | None = None) -> Fit:
+        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a state has them."""
         on_stage("tracing", 0.0)
         searched = None
-        if found and by and _moves(found.known.stage):
-            absent = by.absent(found.known, found.vector)
-            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(found).items()}
-            searched = moved_search(copy, prepared.surfaces, parameters, absent)
+        if state and by and _moves(state.stage):
+            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(state).items()}
+            searched = moved_search(copy, prepared.surfaces, parameters, by.absent(state))
         # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
         further = (by.misfit.planes, by.misfit.slabs) if by else hidden
-        how = search_options(options), options.changes, prepared, searched, further
-        return Fit(Misfit(record, rows, opened, *how), options, on_stage, supposed, boxes.members)
+        misfit = Misfit(record, rows, prepared, options, searched, further)
+        return Fit(misfit, options, on_stage, supposed, boxes.members)
 
     trial = fit_of(parts.known, parts.known_rows)
     if not any(side.exists.any() for side in trial.misfit.sides):
         raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
     if not len(trial.free("+".join(options.parts))):
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
-    chosen = {stage: _Stage(found, trial) for stage, found in trial.all_parts().items()}
+    chosen = {stage: (Moves(trial, stage).best(), trial) for stage in _stages(options)}
     stated = fit_of(parts.held, parts.held_rows).misfit
     unseen = dict.fromkeys(chosen, stated)
     scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}
-    for stage, (found, by) in chosen.items():
+    for stage, (state, by) in chosen.items():
         if _moves(stage):
-            again = fit_of(parts.known, parts.known_rows, found, by)
-            found, by = chosen[stage] = _Stage(again.continued(found, by), again)
-            unseen[stage] = fit_of(parts.held, parts.held_rows, found, by).misfit
-        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], found, by))
+            again = fit_of(parts.known, parts.known_rows, state, by)
+            state, by = chosen[stage] = Moves(again, stage).continued(state, by), again
+            unseen[stage] = fit_of(parts.held, parts.held_rows, state, by).misfit
+        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
     judged = {key: parts.units(score) for key, score in scores.items()}
     kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
     final = fit_of(record, split.all_train, *(best or ()))
-    vector, deviation, free = final.stated, np.zeros(len(final.stated)), np.zeros(0, np.int64)
-    materials, parameters, data = dict[str, str](), dict[str, FloatArray](), None
-    absent = final.misfit.slabs[list(final.supposed.values())].tolist()
+    state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
     if best:
-        start = final.carried_over(*best)
-        solution = final.solve(kept, start.vector, start.known.mean)
-        last = Found(solution, start.known)
-        vector, free, parameters = solution.vector, final.free(kept), final.of_scene(last)
-        deviation[free] = np.sqrt(np.diag(solution.covariance))
-        materials, absent = dict(start.known.materials), final.absent(start.known, vector)
-        before = _vector_at(parts, unseen[kept], *best), parts.with_mean_gain(vector, final.misfit)
-        others = final.left_out_residuals(kept, solution)
-        ratio = _error_ratio(unseen[kept], before[0], final.misfit, before[1], others)
+        state = final.solved(final.carried_over(*best))
+        deviation[final.free(kept)], others = final.uncertainty(state)
+        before = _vector_at(parts, unseen[kept], *best)
+        after = parts.with_mean_gain(state.vector, final.misfit)
+        ratio = _error_ratio(unseen[kept], before, final.misfit, after, others)
         data = CorrectionData(name, split.all_train, ratio)
-    kinds = _kinds(scene)
-    return Correction(
-        opened,
-        final.misfit,
-        kept,
-        vector,
-        deviation,
-        final.prior_deviation,
-        free,
-        materials,
-        frozenset(absent),
-        scores,
-        kinds,
-        supposed,
-        options,
-        parameters,
-        data,
-        time.perf_counter() - begun,
-        {
-            "rows": len(split.all_train),
-            "held_out": len(parts.held_rows),
-            "held_out_receivers": list(parts.out),
-            "paths": sum(int(s.exists.sum()) for s in final.misfit.sides),
-        },
-    )
+    facts = {
+        "rows": len(split.all_train),
+        "held_out": len(parts.held_rows),
+        "held_out_receivers": list(parts.out),
+        "paths": len(final.misfit.paths.row),
+    }
+    seconds = time.perf_counter() - begun
+    return Correction(final, state, deviation, scores, _kinds(scene), data, seconds, facts)
 
 
-def _surfaces_of(names: Sequence[str], objects: Collection[str]) -> tuple[IntArray, IntArray]:
-    """Numbers of the planes and of the surfaces of some objects, by the names of a scene's surfaces."""
-    parts = [name.rpartition("/")[::2] for name in names]
-    slabs = np.array([slab for slab, (thing, _) in enumerate(parts) if thing in objects], np.int64)
-    return np.array([int(parts[slab][1]) for slab in slabs], np.int64), slabs
+def _stages(options: CorrectionOptions) -> list[str]:
+    """Parts that are changed together: materials without planes, and all."""
+    stages, still = ["+".join(options.parts)], [part for part in options.parts if part not in (PLANES, FRAME)]
+    if MATERIALS in still and len(still) < len(options.parts):
+        stages.insert(0, "+".join(still))
+    return stages
 
 
-class _Stage(NamedTuple):
-    """What a stage has found, and the fit that has."""
-
-    found: Found
-    by: Fit
-
-
-def _vector_at(parts: _Parts, misfit: Misfit, found: Found, by: Fit) -> FloatArray:
-    """Vector of a misfit of other rows from what a fit has found, with the mean gain at receivers held out."""
-    return parts.with_mean_gain(misfit.vector_of(by.of_scene(found)), misfit)
+def _vector_at(parts: _Parts, misfit: Misfit, state: State, by: Fit) -> FloatArray:
+    """Vector of a misfit of other rows from a state of a fit, with the mean gain at receivers held out."""
+    return parts.with_mean_gain(misfit.vector_of(by.of_scene(state)), misfit)
 
 
 def _error_ratio(unseen: Misfit, found: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:
@@ -266,21 +229,14 @@ def _moves(stage: str) -> bool:
 
 
 class _Parts(NamedTuple):
-    """Observations that a correction is fitted to, and others that decide what is kept.
-
-    Attributes:
-        known, held: the record as each sees it.
-        known_rows, held_rows: rows of each.
-        out, fitted: names of the receivers of ``held``, which ``known`` has not seen, and of those that it has; empty
-            where rows are held out instead.
-    """
+    """Observations that a correction is fitted to, ``known``, and ``held`` ones that decide what is kept."""
 
     known: Record
     known_rows: IntArray
     held: Record
     held_rows: IntArray
-    out: tuple[str, ...] = ()
-    fitted: tuple[str, ...] = ()
+    out: tuple[str, ...] = ()  # names of the receivers of ``held``; none where rows are held out instead
+    fitted: tuple[str, ...] = ()  # names of the receivers of ``known``
 
     def units(self, score: FloatArray) -> FloatArray:
         """Independent scores: those of rows, or the mean of each receiver that is held out."""
@@ -302,11 +258,7 @@ class _Parts(NamedTuple):
 
 
 def _parts(record: Record, split: Split) -> _Parts:
-    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those.
-
-    Raises:
-        InputError: too few training rows.
-    """
+    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those."""
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
     if split.held_receivers and len(trained) > 3:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])

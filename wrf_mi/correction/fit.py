@@ -1,11 +1,10 @@
-"""Rounds of choices and least squares over the rows of one misfit."""
+"""Parameters and choices of a stage, their prior, and least squares over the rows of one misfit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,75 +13,58 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tracing.material_parameters import EXPONENT, PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
-from .bodies import Bodies
-from .doubts import Doubts
+from .choices import ABSENT, ABSENT_VALUES, Choice, material_places
 from .frame import rigid_motions, scene_entries
-from .least_squares import Noise, Prior, Solution, left_out_residuals, minimised, solve
+from .least_squares import Noise, Prior, left_out_residuals, minimised, posterior_covariance
 from .misfit import Misfit
-from .options import FRAME, MATERIALS, PLANES, CorrectionOptions, OnStage
+from .options import FRAME, FRAME_SD, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
-from .search import (
-    ABSENT,
-    ABSENT_VALUES,
-    Choice,
-    choose,
-    joint_choices,
-    material_choices,
-    material_places,
-    shift_choices,
-)
 
 LEAST_PATHS = 10
 """Fewest paths of a surface or plane that is changed."""
-ROUNDS = 3
-"""Largest number of rounds: planes that are off hide the right material, and conversely."""
-ROUND_STEPS = 3
-"""Largest number of least-squares steps between choices."""
 STILL_ABSENT = 0.1
 """Susceptibility up to which a surface that was chosen to be absent is, after least squares."""
 REFINING_STEPS = 3
 """Largest number of least-squares steps of one plane while shifts are compared."""
+UNKNOWN = Noise(1.0, 1.0)
+"""Noise before any least squares."""
 
 
 @dataclass(frozen=True)
-class Known:
-    """Choices of a stage.
+class State:
+    """Parameters of a stage, and the choices that led to them.
 
     Attributes:
-        stage: the stage.
+        stage: the stage, its parts joined by "+".
+        vector: parameters [p].
         mean: means of the parameters' prior [p].
         materials: material of each surface that was chosen, by its name.
+        noise: noise of the residuals after the last least squares.
     """
 
     stage: str
+    vector: FloatArray
     mean: FloatArray
     materials: Mapping[str, str]
+    noise: Noise = UNKNOWN
 
-    def with_material(self, choice: Choice, material: str, vector: FloatArray) -> Known:
+    def changed(self, choice: Choice, material: str, vector: FloatArray) -> State:
         """With the material of a choice, whose constants a vector [p] has; least squares stay near them."""
         mean = self.mean.copy()
         mean[choice.material] = vector[choice.material]
-        return Known(self.stage, mean, {**self.materials, choice.what: material})
-
-
-class Found(NamedTuple):
-    """Least squares and the choices before."""
-
-    solution: Solution
-    known: Known
-
-    @property
-    def vector(self) -> FloatArray:
-        """Parameters [p]."""
-        return self.solution.vector
-
-
-def _title(stage: str) -> str:
-    return f"{stage.replace('+', ', ')}: choices"
+        return replace(self, vector=vector, mean=mean, materials={**self.materials, choice.what: material})
 
 
 class Fit:
-    """Choice and least squares over the rows of one misfit."""
+    """Least squares over the rows of one misfit.
+
+    Args:
+        misfit: residuals of the rows.
+        options: options of the correction.
+        on_stage: called as the fit goes on.
+        supposed: names of objects that the stated scene lacks.
+        bodies: names of the objects of each box.
+    """
 
     def __init__(
         self,
@@ -93,17 +75,16 @@ class Fit:
         bodies: Sequence[frozenset[str]] = (),
     ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
+        objects = [name.partition("/")[0] for name in misfit.sides[0].slabs.names]
+        of_bodies = [np.flatnonzero([thing in body for thing in objects]) for body in bodies]
+        self.bodies = [slabs for slabs in of_bodies if len(slabs) > 1]
         names = misfit.sides[0].slabs.names
-        own = [[slab for slab, name in enumerate(names) if name.partition("/")[0] in body] for body in bodies]
-        self.bodies = [np.array(slabs) for slabs in own if len(slabs) > 1]
-        self.supposed = {name: slab for slab, name in enumerate(names) if name.partition("/")[0] in supposed}
+        self.supposed = {name: slab for slab, name in enumerate(names) if objects[slab] in supposed}
         self.stated = misfit.start.copy()
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
-        planes, slabs = misfit.counts()
-        # Entries by their places in `Misfit.planes` and `Misfit.slabs`.
-        self.planes, self.slabs = (np.flatnonzero(count >= LEAST_PATHS) for count in (planes, slabs))
-        self.slabs = self.slabs[np.argsort(-slabs[self.slabs], kind="stable")]
-        self.planes = self.planes[np.argsort(-planes[self.planes], kind="stable")]
+        # Entries by their places in `Misfit.planes` and `Misfit.slabs`, those with most paths first.
+        ranked = [(np.argsort(-count, kind="stable"), count) for count in misfit.counts()]
+        self.planes, self.slabs = (order[count[order] >= LEAST_PATHS] for order, count in ranked)
         self.prior_deviation = np.ones(len(self.stated))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)
@@ -122,8 +103,12 @@ class Fit:
             if len(known):
                 pair = (values[known].reshape(-1, *model.shape) for values in (whole, misfit.observed))
                 missing.setdefault(side.gain_name, []).append(model.missing_gain(*pair))
-        for name, found in missing.items():
-            self.stated[misfit.parts[name].start] += np.mean(found)
+        for name, gains in missing.items():
+            self.stated[misfit.parts[name].start] += np.mean(gains)
+
+    def start(self, stage: str) -> State:
+        """The scene as stated, without the faces that it lacks."""
+        return State(stage, self.stated, self.stated, dict.fromkeys(self.supposed, ABSENT))
 
     def free(self, kept: str) -> IntArray:
         """Entries of the vector that a stage changes: those of surfaces and planes that enough paths meet."""
@@ -139,98 +124,27 @@ class Fit:
                 moved = entries.reshape(-1, size)[self.planes].ravel()
                 free.append(moved if PLANES in parts or FRAME in parts else entries[:0])
             else:
-                free.append(entries)
+                free.append(entries if kept else entries[:0])
         return np.sort(np.concatenate(free))
 
     def prior(self, mean: FloatArray, free: IntArray) -> Prior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
         covariance = np.diag(np.square(self.prior_deviation[free]))
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            deviation = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
             _, among, which = np.intersect1d(free, self.misfit.plane_entries, return_indices=True)
             motions = self.misfit.motions[which]
-            covariance[np.ix_(among, among)] += (motions * deviation**2) @ motions.T
+            covariance[np.ix_(among, among)] += (motions * FRAME_SD**2) @ motions.T
         return Prior(mean[free], np.linalg.inv(covariance))
 
-    def absent(self, known: Known, vector: FloatArray) -> frozenset[int]:
-        """Surfaces that are left out of the scene of a vector [p], by their numbers in the scene."""
-        names = self.misfit.sides[0].slabs.names
-        taken = [slab for slab, name in enumerate(names) if known.materials.get(name) == ABSENT]
-        thin = {slab for slab in taken if vector[material_places(self.misfit, slab)[0]] < np.log(STILL_ABSENT)}
-        absent = thin.union(set(self.supposed.values()).intersection(taken))
-        return frozenset(self.misfit.slabs[sorted(absent)].tolist())
-
-    def all_parts(self) -> dict[str, Found]:
-        """Results by the names of their parts: with materials alone, and with planes."""
-        parts, frame = self.options.parts, [part for part in (PLANES, FRAME) if part in self.options.parts]
-        stages = ["+".join(parts)]
-        if MATERIALS in parts and frame:
-            stages.insert(0, "+".join(part for part in parts if part not in frame))
-        return {stage: self._alternate(stage) for stage in stages}
-
-    def _alternate(self, stage: str) -> Found:
-        """Rounds of choices and least squares, until a round changes no choice; then doubtful surfaces once more."""
-        choices, title = self._choices(stage), _title(stage)
-        known = Known(stage, self.stated, dict.fromkeys(self.supposed, ABSENT))
-        vector, known, _ = self.chosen(known, self.stated, choices, f"{title}, round 1")
-        found = self._rounds(self.solved(vector, known), choices, range(2, ROUNDS + 1))
-        found = Bodies(self, choices, title).settled(found)
-        return Doubts(self, choices, title).settled(found)
-
-    def _rounds(self, found: Found, choices: Sequence[Choice], numbers: Iterable[int]) -> Found:
-        """Rounds of choices and least squares, until a round changes no choice."""
-        for number in numbers:
-            what = f"{_title(found.known.stage)}, round {number}"
-            vector, known, changed = self.chosen(found.known, found.vector, choices, what)
-            if not changed:
-                break
-            found = self.solved(vector, known)
-        return found
-
-    def continued(self, found: Found, by: Fit) -> Found:
-        """Rounds of choices and least squares from what a fit to other paths has found."""
-        found = self.carried_over(found, by)
-        choices, stage = self._choices(found.known.stage), found.known.stage
-        found = Found(self.solve(stage, found.vector, found.known.mean), found.known)
-        found = self._rounds(found, choices, range(1, ROUNDS + 1))
-        return Doubts(self, choices, _title(stage)).with_other_materials(found)
-
-    def _choices(self, stage: str) -> list[Choice]:
-        """Choices of a stage."""
-        parts, options, misfit = stage.split("+"), self.options, self.misfit
-        shifts, materials = list[Choice](), list[Choice]()
-        if SHIFT in misfit.parts and (PLANES in parts or FRAME in parts):
-            alone, common = PLANES in parts, FRAME in parts
-            sd_m = float(np.hypot(options.shift_sd_m * alone, options.frame_sd_m * common))
-            shifts = shift_choices(misfit, self.planes, sd_m, self.frequency_hz)
-        if MATERIALS in parts:
-            materials = material_choices(misfit, self.slabs, self.frequency_hz)
-        return joint_choices(materials, shifts, misfit.plane_of_slab, self.supposed)
-
-    def chosen(
-        self, known: Known, start: FloatArray, choices: Sequence[Choice], what: str
-    ) -> tuple[FloatArray, Known, bool]:
-        """Vector and materials that choices find from ``start``, and whether one has changed."""
-        vector, taken = choose(self, start, choices, self._progress(what))
-        for choice in choices:
-            if choice.what in taken and choice.material.size:
-                known = known.with_material(choice, taken[choice.what], vector)
-        return vector, known, bool(taken)
-
-    def solved(self, vector: FloatArray, known: Known) -> Found:
-        """A few least-squares steps from a vector [p]."""
-        return Found(self.solve(known.stage, vector, known.mean, ROUND_STEPS), known)
-
-    def cost(self, found: Found, noise: Noise) -> float:
+    def cost(self, state: State, noise: Noise) -> float:
         """Negative logarithm of likelihood and prior, without its constant."""
-        free = self.free(found.known.stage)
-        prior = self.prior(found.known.mean, free)
-        return noise.cost(self.misfit.residual(found.vector)) + prior.cost(found.vector[free])
+        free = self.free(state.stage)
+        return noise.cost(self.misfit.residual(state.vector)) + self.prior(state.mean, free).cost(state.vector[free])
 
-    def planes_cost(self, vector: FloatArray) -> float:
-        """Cost of planes by their prior, in which they share the motions of the frame."""
+    def trial_cost(self, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
+        """Negative logarithm of the likelihood of a vector [p] and of the planes' prior, without its constant."""
         free, prior = self._planes_prior
-        return prior.cost(vector[free])
+        return noise.cost(trials.residual(vector)) + prior.cost(vector[free])
 
     @cached_property
     def _planes_prior(self) -> tuple[IntArray, Prior]:
@@ -241,8 +155,9 @@ class Fit:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
         expected = vector[places].copy()
         if FRAME in self.options.parts and SHIFT in self.misfit.parts:
-            here = dict(zip(self.misfit.plane_entries, self.misfit.motions @ self._motion(vector, places), strict=True))
-            expected = np.array([here.get(place, value) for place, value in zip(places, expected, strict=True)])
+            by_frame = vector.copy()
+            by_frame[self.misfit.plane_entries] = self.misfit.motions @ self._motion(vector, places)
+            expected = by_frame[places]
         return expected
 
     def _motion(self, vector: FloatArray, without: IntArray) -> FloatArray:
@@ -250,84 +165,66 @@ class Fit:
         planes, motions = self.misfit.plane_entries, self.misfit.motions
         known = np.isin(planes, np.setdiff1d(self.free(PLANES), without))
         weight = known / np.square(self.prior_deviation[planes])
-        before = np.repeat([self.options.frame_sd_m, self.options.frame_sd_rad], 3)
-        information = motions.T @ (weight[:, None] * motions) + np.diag(before**-2.0)
+        information = motions.T @ (weight[:, None] * motions) + np.diag(FRAME_SD**-2.0)
         return np.asarray(np.linalg.solve(information, motions.T @ (weight * vector[planes])), float)
 
-    def of_scene(self, found: Found) -> dict[str, FloatArray]:
+    def absent(self, state: State) -> frozenset[int]:
+        """Surfaces that a state leaves out of the scene, by their numbers there."""
+        names = self.misfit.sides[0].slabs.names
+        chosen = [slab for slab, name in enumerate(names) if state.materials.get(name) == ABSENT]
+        thin = {slab for slab in chosen if state.vector[material_places(self.misfit, slab)[0]] < np.log(STILL_ABSENT)}
+        absent = thin.union(set(self.supposed.values()).intersection(chosen))
+        return frozenset(self.misfit.slabs[sorted(absent)].tolist())
+
+    def of_scene(self, state: State) -> dict[str, FloatArray]:
         """Parameters by name for all planes and surfaces of the scene: planes that no path meets move with the frame,
         their materials are as stated.
         """
-        misfit, parameters = self.misfit, self.misfit.of_scene(found.vector)
-        if FRAME in found.known.stage.split("+"):
+        misfit, parameters = self.misfit, self.misfit.of_scene(state.vector)
+        if FRAME in state.stage.split("+"):
             surfaces = misfit.sides[0].surfaces
             count = len(surfaces.normal)
-            moved = rigid_motions(surfaces) @ self._motion(found.vector, misfit.plane_entries[:0])
-            moved[scene_entries(misfit.planes, count)] = found.vector[misfit.plane_entries]
+            moved = rigid_motions(surfaces) @ self._motion(state.vector, misfit.plane_entries[:0])
+            moved[scene_entries(misfit.planes, count)] = state.vector[misfit.plane_entries]
             parameters |= {SHIFT: moved[:count], TILT: moved[count:].reshape(count, 2)}
         return parameters
 
-    def carried_over(self, found: Found, by: Fit) -> Found:
-        """What a fit to other paths, which meet other surfaces, has found: vector and means of this fit's entries."""
-        vector, mean = map(self.misfit.vector_of, (by.of_scene(found), by.misfit.of_scene(found.known.mean)))
-        return Found(replace(found.solution, vector=vector), replace(found.known, mean=mean))
+    def carried_over(self, state: State, by: Fit) -> State:
+        """A state of a fit to other paths, which meet other surfaces: vector and means of this fit's entries."""
+        vector, mean = map(self.misfit.vector_of, (by.of_scene(state), by.misfit.of_scene(state.mean)))
+        return replace(state, vector=vector, mean=mean)
 
     def refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         places = places[np.isin(places, self.free("+".join(self.options.parts)))]
-        misfit, vector, mean = self.misfit, start.copy(), start.copy()
-        planes = misfit.plane_entries
+        mean, planes = start.copy(), self.misfit.plane_entries
         mean[planes] = self.stated[planes]
+        jacobian = lambda vector: trials.jacobian(vector, places)  # noqa: E731
+        return minimised(trials.residual, jacobian, start, places, self.prior(mean, places), REFINING_STEPS)[0]
 
-        def whole(part: FloatArray) -> FloatArray:
-            vector[places] = part
-            return vector
-
-        found, _ = minimised(
-            lambda part: trials.residual(whole(part)),
-            lambda part: trials.jacobian(whole(part), places),
-            start[places],
-            self.prior(mean, places),
-            REFINING_STEPS,
-        )
-        return whole(found)
-
-    def _progress(self, what: str) -> Callable[[int, int], None]:
-        return lambda done, of: self.on_stage(what, done / max(of, 1))
-
-    def solve(self, stage: str, start: FloatArray, mean: FloatArray, most_steps: int | None = None) -> Solution:
-        """Least squares of a stage's entries, in at most ``most_steps`` steps; the whole vector."""
-        free, misfit = self.free(stage), self.misfit
-        prior = self.prior(mean, free)
-        what = f"least squares of {len(free)} parameters"
+    def solved(self, state: State, most_steps: int | None = None) -> State:
+        """Least squares of a stage's entries from a state, in at most ``most_steps`` steps."""
+        free, misfit = self.free(state.stage), self.misfit
         steps = self.options.steps if most_steps is None else min(most_steps, self.options.steps)
 
-        def whole(part: FloatArray) -> FloatArray:
-            vector = start.copy()
-            vector[free] = part
-            return vector
+        def jacobian(vector: FloatArray) -> NDArray[np.float32]:
+            return near(misfit, vector).jacobian(vector, free)
 
-        done = 0
+        def on_step(step: int) -> None:
+            self.on_stage(f"least squares of {len(free)} parameters", step / steps)
 
-        def jacobian(part: FloatArray) -> NDArray[np.float32]:
-            def column(place: int) -> None:
-                self.on_stage(what, min((done + place / max(len(free), 1)) / (steps + 1), 1.0))
-
-            return near(misfit, whole(part)).jacobian(whole(part), free, column)
-
-        def on_step(step: int, cost: float) -> None:
-            nonlocal done
-            done = step
-
-        found = solve(lambda part: misfit.residual(whole(part)), jacobian, start[free], prior, steps, on_step)
-        vector = whole(found.vector)
+        prior = self.prior(state.mean, free)
+        vector, residual = minimised(misfit.residual, jacobian, state.vector, free, prior, steps, on_step)
         others = np.setdiff1d(misfit.plane_entries, free)
-        if FRAME in stage.split("+"):  # too few paths meet them
+        if FRAME in state.stage.split("+"):  # too few paths meet them
             vector[others] = self.expected(vector, others)
-        return replace(found, vector=vector)
+        return replace(state, vector=vector, noise=Noise.of(residual))
 
-    def left_out_residuals(self, stage: str, solution: Solution) -> FloatArray:
-        """Residuals [n_rx * rows, values] of each row by a fit to the others, see `left_out_residuals`."""
-        free, vector = self.free(stage), solution.vector
-        derivative = near(self.misfit, vector).jacobian(vector, free)
-        return left_out_residuals(derivative, self.misfit.residual(vector), solution.covariance, solution.noise)
+    def uncertainty(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations of a state's free entries, and residuals [n_rx * rows, values] of each row by a fit to
+        the others (`left_out_residuals`).
+        """
+        free, residual = self.free(state.stage), self.misfit.residual(state.vector)
+        derivative = near(self.misfit, state.vector).jacobian(state.vector, free)
+        covariance = posterior_covariance(derivative, residual, self.prior(state.mean, free), state.noise)
+        return np.sqrt(np.diag(covariance)), left_out_residuals(derivative, residual, covariance, state.noise)

@@ -7,7 +7,6 @@ import numpy as np
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tracing.surfaces import Surfaces
-from ..tracing.walls import plane_centres
 
 
 def rigid_motions(surfaces: Surfaces) -> FloatArray:
@@ -17,7 +16,7 @@ def rigid_motions(surfaces: Surfaces) -> FloatArray:
     columns and the rotation vector w in rad in the last. A plane n . x = d with the centre p and the axes a, b is
     shifted by n . (t + w x (p - c)) and tilted by a . (w x n), b . (w x n), to first order in w.
     """
-    centre = plane_centres(surfaces)[0]
+    centre = surfaces.plane_centres_m
     middle = centre.mean(axis=0) if len(centre) else np.zeros(3)
     normal, axes = surfaces.normal, surfaces.axes
     # n . (w x r) = w . (r x n), a . (w x n) = w . (n x a)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 
 FREEDOM = 4.0
 """Degrees of freedom of the rows' distribution: a row of ten times the median squared error weighs a quarter."""
@@ -105,75 +106,66 @@ class Prior:
         return float(away @ self.precision @ away) / 2
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Most probable parameters [p], their covariance [p, p] (inverse of the Fisher information and the prior's
-    precision), and the noise of the residuals.
-    """
-
-    vector: FloatArray
-    covariance: FloatArray
-    noise: Noise
-
-
-def solve(
-    residual: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray], NDArray[np.floating]],
-    start: FloatArray,
-    prior: Prior,
-    steps: int,
-    on_step: Callable[[int, float], None] = lambda step, cost: None,
-) -> Solution:
-    """Most probable parameters, as `minimised`, with their covariance."""
-    vector, found = minimised(residual, jacobian, start, prior, steps, on_step)
-    noise = Noise.of(found)
-    information, _ = _normal(jacobian(vector), found, noise)
-    return Solution(vector, np.asarray(np.linalg.inv(information + prior.precision), float), noise)
-
-
 def minimised(
     residual: Callable[[FloatArray], FloatArray],
     jacobian: Callable[[FloatArray], NDArray[np.floating]],
     start: FloatArray,
+    free: IntArray,
     prior: Prior,
     steps: int,
-    on_step: Callable[[int, float], None] = lambda step, cost: None,
+    on_step: Callable[[int], None] = lambda step: None,
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise of its beginning has it.
 
     Args:
         residual: residuals [rows, values] of parameters [p], model minus observation; NaN without observation.
-        jacobian: their derivatives [p, rows, values], or 0 without observation.
+        jacobian: their derivatives by the free parameters [k, rows, values], or 0 without observation.
         start: parameters [p].
-        prior: prior of the parameters.
+        free: indices [k] of the parameters that change.
+        prior: prior of these parameters.
         steps: largest number of steps.
-        on_step: called with the number of a step, from 1, and the cost after it.
+        on_step: called with the number of a step, from 0, before it.
 
     Returns:
-        Parameters [p] and their residuals.
+        Most probable parameters [p] and their residuals.
     """
-    vector, damping = np.asarray(start, float), FIRST_DAMPING
-    found = residual(vector)
-    for step in range(1, steps + 1):
-        noise = Noise.of(found)
-        before = noise.cost(found) + prior.cost(vector)
-        information, slope = _normal(jacobian(vector), found, noise)
+    vector, damping = np.array(start, float), FIRST_DAMPING
+    present = residual(vector)
+    for step in range(steps):
+        on_step(step)
+        noise = Noise.of(present)
+        before = noise.cost(present) + prior.cost(vector[free])
+        information, slope = _normal(jacobian(vector), present, noise)
         whole = information + prior.precision
-        downhill = -slope - prior.precision @ (vector - prior.mean)
+        downhill = -slope - prior.precision @ (vector[free] - prior.mean)
         for _ in range(TRIALS):
-            there = vector + np.linalg.solve(whole + damping * np.diag(np.diag(whole)), downhill)
-            tried = residual(there)
-            after = noise.cost(tried) + prior.cost(there)
+            trial = vector.copy()
+            trial[free] += np.linalg.solve(whole + damping * np.diag(np.diag(whole)), downhill)
+            tried = residual(trial)
+            after = noise.cost(tried) + prior.cost(trial[free])
             if after < before:
                 break
             damping *= HARDER
         else:
             break
-        vector, found, damping = there, tried, max(damping / HARDER, LEAST_DAMPING)
-        on_step(step, after)
+        vector, present, damping = trial, tried, max(damping / HARDER, LEAST_DAMPING)
         if before - after < CONVERGED:
             break
-    return vector, found
+    return vector, present
+
+
+def posterior_covariance(
+    derivative: NDArray[np.floating], residual: FloatArray, prior: Prior, noise: Noise
+) -> FloatArray:
+    """Covariance [p, p] of parameters: inverse of the Fisher information and the prior's precision.
+
+    Args:
+        derivative: derivatives [p, rows, values] at the solution.
+        residual: residuals [rows, values] there.
+        prior: prior of the parameters.
+        noise: noise of the solution.
+    """
+    return np.asarray(np.linalg.inv(_normal(derivative, residual, noise)[0] + prior.precision), float)
 
 
 def left_out_residuals(

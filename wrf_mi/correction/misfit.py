@@ -7,10 +7,10 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -28,22 +28,39 @@ from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from ..tracing import TraceOptions
+from ..tracing.corrected_scene import MovedSearch
 from ..tracing.instrument_parameters import instrument_parameters
-from ..tracing.material_parameters import PREFIX, SlabMaterials
-from ..tracing.moved_scene import MovedSearch
+from ..tracing.material_parameters import PREFIX, QUANTITIES
 from ..tracing.plane_parameters import SHIFT, TILT
 from ..tracing.solve import Prepared
 from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField, TracedOptions
-from ..tracing.walls import plane_centres
+from ..tracing.traced_field import TracedField
 from .frame import rigid_motions, scene_entries
-from .options import PATTERNS, CorrectionOptions
+from .options import CorrectionOptions
 
 LATTICE = (12, 40)
 """Most elevations and azimuths of the lattice of directions."""
 FLOOR = 0.5
 """Share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels."""
+
+
+class PathTable(NamedTuple):
+    """The n paths of a misfit.
+
+    Attributes:
+        entry: place of each path among the entries of its side's `wrf_mi.tracing.traced_field.TracedPaths` [n].
+        side: number of its side [n], ascending.
+        row: its row of `Misfit.residual` [n], ascending in a side.
+        plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.
+        reflects: whether it is reflected there [n, depth].
+    """
+
+    entry: IntArray
+    side: IntArray
+    row: IntArray
+    plane: IntArray
+    slab: IntArray
+    reflects: NDArray[np.bool_]
 
 
 class Misfit:
@@ -52,11 +69,9 @@ class Misfit:
     Args:
         record: measurements of any task.
         rows: rows that are compared.
-        scene: scene of `wrf_mi.tracing.open_scene`, at the record's carrier or, of several, at the one at which
-            parameters of materials hold.
-        options: options of the traced side.
-        wanted: whether a parameter of `TracedField.parameters` is an entry of the vector, by its name.
-        prepared: shared state of the scene.
+        prepared: shared state of the scene, at the record's carrier or, of several, at the one at which parameters of
+            materials hold.
+        options: options of the search, and which parameters of `TracedField.parameters` are entries of the vector.
         searched: where paths are searched; None: in the scene as stated.
         surfaces: numbers of planes and of surfaces of the scene that have parameters though no path meets them; all
             others have none. None: all have parameters.
@@ -64,6 +79,7 @@ class Misfit:
     Attributes:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
             parameters are entries of the vector.
+        tables: materials and planes of the scene.
         sides: traced side of each of these at each carrier, receiver by receiver.
         models: receiver models of the sides.
         places: entries of ``observed`` of each side.
@@ -79,10 +95,8 @@ class Misfit:
         self,
         record: Record,
         rows: IntArray,
-        scene: Any,
-        options: TracedOptions,
-        wanted: Callable[[str], bool],
-        prepared: Prepared | None = None,
+        prepared: Prepared,
+        options: CorrectionOptions,
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
@@ -92,8 +106,8 @@ class Misfit:
         seen = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in seen]
         self._image = task.image
-        shared = prepared or Prepared(scene)
-        self._tables = shared.tables(options.materials)
+        traced = options.traced
+        self.tables = prepared.tables(traced.materials)
         shape = record.observation.shape[2:]
         size, whole_size = (1, 1), (1, 1)
         if task.image:
@@ -107,8 +121,8 @@ class Misfit:
         self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in zip(seen, self.receivers, strict=True):
-            given = record.tx_pos_m[rows], receiver, options, shared, heading, carriers
-            sides += traced_fields(scene, *given, searched=searched)
+            given = record.tx_pos_m[rows], receiver, traced, prepared, heading, carriers
+            sides += traced_fields(prepared.scene, *given, searched=searched)
             for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
                 here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 self.models.append(RECEIVERS[form.receiver].make(here, receiver))
@@ -117,15 +131,15 @@ class Misfit:
         # The same order of entries whichever receivers are seen.
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
-            self._instruments |= instrument_parameters(receiver, options.gain, options.pattern_degree)
-        self.planes, self.slabs = np.arange(len(shared.surfaces.normal)), np.arange(len(self._tables.slabs.names))
+            self._instruments |= instrument_parameters(receiver, traced.pattern_degree)
+        self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
             self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
-            tables = self._tables.select(shared.surfaces, self.planes, self.slabs)
+            tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
             sides = [side.select(tables, self.planes, self.slabs) for side in sides]
         self.sides = sides
         every = {name: value for name, value in sides[0].parameters().items() if name.startswith((PREFIX, SHIFT, TILT))}
-        values = {name: value for name, value in (every | self._instruments).items() if wanted(name)}
+        values = {name: value for name, value in (every | self._instruments).items() if options.changes(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
@@ -135,16 +149,6 @@ class Misfit:
         self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
         self._gains = [_recorded_gain(side) for side in self.sides]
 
-    @property
-    def scene_slabs(self) -> SlabMaterials:
-        """Stated materials of all surfaces of the scene."""
-        return self._tables.slabs
-
-    @cached_property
-    def centre_m(self) -> FloatArray:
-        """Centres of the planes, [k, 3] in metres."""
-        return plane_centres(self.sides[0].surfaces)[0][self.planes]
-
     @cached_property
     def motions(self) -> FloatArray:
         """Derivatives of `plane_entries` by a rigid motion of the scene [3 k, 6] (`rigid_motions`)."""
@@ -153,7 +157,7 @@ class Misfit:
 
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
-        stated = self._tables.slabs.parameters(thickness=True, exponent=True) | self._tables.planes.parameters()
+        stated = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
         found = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
         for name in stated.keys() & found.keys():
             every = stated[name].astype(float)
@@ -188,11 +192,6 @@ class Misfit:
     def several_carriers(self) -> bool:
         """Whether rows of several carriers tell how conductivities depend on the frequency."""
         return len({side.frequency_hz for side in self.sides}) > 1
-
-    @property
-    def carriers(self) -> int:
-        """Number of sides of each receiver."""
-        return len(self.sides) // len(self.receivers)
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
@@ -237,48 +236,43 @@ class Misfit:
             found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
         return found / self.unit[:, None] - self.observed
 
-    def entries(self) -> list[IntArray]:
-        """Places of each side's paths among the entries of its `wrf_mi.tracing.traced_field.TracedPaths`."""
-        return [np.flatnonzero(side.exists) for side in self.sides]
+    @cached_property
+    def paths(self) -> PathTable:
+        """Rows, sides and interactions of all paths, side by side."""
+        depth = max(len(side.chains.levels) for side in self.sides)
+        entries = [np.flatnonzero(side.exists) for side in self.sides]
+        sides = zip(self.sides, self.places, entries, strict=True)
+        row = [places[exists // (len(side.exists) // len(places))] for side, places, exists in sides]
+        met = zip(*(side.chains.met(depth) for side in self.sides), strict=True)
+        number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
+        return PathTable(np.concatenate(entries), number, np.concatenate(row), *map(np.concatenate, met))
 
-    def gains(self, vector: FloatArray, entries: Sequence[IntArray]) -> NDArray[np.complex128]:
-        """Gains of some paths of a vector, side by side, without exp(-j k length).
+    def gains(self, vector: FloatArray, which: IntArray) -> NDArray[np.complex128]:
+        """Gains of a vector [p], without exp(-j k length), of the paths ``which`` of `paths`, ascending."""
+        params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
+        for number in np.unique(paths.side[which]):
+            of_side = paths.side[which] == number
+            real, imaginary = self._gains[number](params, to_uint(paths.entry[which[of_side]]))
+            result[of_side] = np.asarray(real) + 1j * np.asarray(imaginary)
+        return result
 
-        Args:
-            vector: parameters [p].
-            entries: paths of each side, of `entries`.
-        """
-        params, found = self._device(vector), [np.zeros(0, complex)]
-        for gain, places in zip(self._gains, entries, strict=True):
-            if len(places):
-                real, imaginary = gain(params, to_uint(places))
-                found.append(np.asarray(real) + 1j * np.asarray(imaginary))
-        return np.concatenate(found)
-
-    def unit_signals(self, vector: FloatArray, entries: Sequence[IntArray]) -> list[NDArray[np.complex128]]:
-        """Signals [paths, elements] of some paths of each side at an array's elements, for gains of one.
-
-        Args:
-            vector: parameters [p].
-            entries: paths of each side, of `entries`.
-        """
-        params, found = self._device(vector), list[NDArray[np.complex128]]()
-        for side, model, places in zip(self.sides, self.models, entries, strict=True):
+    def unit_signals(self, vector: FloatArray) -> NDArray[np.complex128]:
+        """Signals [paths, elements] of all paths of a vector [p] at an array's elements, for gains of one."""
+        params, signals = self._device(vector), list[NDArray[np.complex128]]()
+        for number, (side, model) in enumerate(zip(self.sides, self.models, strict=True)):
             assert isinstance(model, ArrayReceiver)
-            signals = np.zeros((len(places), len(model.elements_m)), complex)
-            if len(places):
-                with dr.suspend_grad():
-                    traced = side(params, entries=to_uint(places))
-                    one = dr.ones(type(traced.length_m), len(places))
-                    alone = replace(traced, gain=(one, dr.zeros(type(one), len(places))))
-                    real, imaginary = model.elements(alone, type(one))
-                signals = (np.asarray(real) + 1j * np.asarray(imaginary)).reshape(signals.shape)
-            found.append(signals)
-        return found
+            entry = self.paths.entry[self.paths.side == number]
+            if not len(entry):
+                continue
+            with dr.suspend_grad():
+                traced = side(params, entries=to_uint(entry))
+                one = dr.ones(type(traced.length_m), len(entry))
+                alone = replace(traced, gain=(one, dr.zeros(type(one), len(entry))))
+                real, imaginary = model.elements(alone, type(one))
+            signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
+        return np.concatenate(signals)
 
-    def jacobian(
-        self, vector: FloatArray, columns: IntArray, on_column: Callable[[int], None] = lambda place: None
-    ) -> NDArray[np.float32]:
+    def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
         """Derivatives [columns, n_rx * rows, values] of `residual`, 0 where nothing was received."""
         slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
@@ -286,7 +280,6 @@ class Misfit:
             direction = self._device(np.eye(1, len(vector), column)[0])
             for tangent, places in zip(self._tangents, self.places, strict=True):
                 slopes[place, places] = tangent(params, direction).numpy().reshape(len(places), -1)
-            on_column(place)
         slopes /= self.unit[:, None].astype(np.float32)
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return slopes
@@ -305,28 +298,22 @@ class Misfit:
             found[places] = task.score(values.reshape(truth.shape), truth)
         return found
 
+    def accept(self, vector: FloatArray) -> None:
+        """Nothing, as residuals are exact at all vectors (`wrf_mi.correction.path_sum.PathSum.accept`)."""
+
     @property
     def plane_entries(self) -> IntArray:
         """Entries of the vector that are the planes' shifts, then their tilts; none where planes are not parameters."""
         parts = [self.parts[name] for name in (SHIFT, TILT) if name in self.parts]
         return np.concatenate([np.zeros(0, np.int64), *(np.arange(part.start, part.stop) for part in parts)])
 
-    @property
-    def plane_of_slab(self) -> dict[str, int]:
-        """Plane of each slab, the surface of an object, by its name."""
-        return {name: int(name.rpartition("/")[2]) for name in self.sides[0].slabs.names}
-
     def counts(self) -> tuple[IntArray, IntArray]:
         """Number of paths that each plane of ``planes`` reflects, and that meet each slab of ``slabs``, over all
         receivers.
         """
-        planes, slabs = np.zeros(len(self.planes), np.int64), np.zeros(len(self.slabs), np.int64)
-        for side in self.sides:
-            for level in side.chains.levels:
-                reflects, passes = (np.asarray(mask) & side.exists for mask in (level.reflects, level.transmits))
-                np.add.at(planes, np.asarray(level.plane)[reflects], 1)
-                np.add.at(slabs, np.asarray(level.material)[reflects | passes], 1)
-        return planes, slabs
+        paths = self.paths
+        reflecting, met = paths.plane[paths.reflects], paths.slab[paths.slab >= 0]
+        return np.bincount(reflecting, minlength=len(self.planes)), np.bincount(met, minlength=len(self.slabs))
 
 
 def _met_surfaces(
@@ -336,15 +323,14 @@ def _met_surfaces(
 
     Of furniture of 100,000 facets, the paths of some rows meet hundreds.
     """
-    used_planes, used_slabs = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
-    used_planes[planes], used_slabs[slabs] = True, True
-    for side in sides:
-        for level in side.chains.levels:
-            met = (np.asarray(level.reflects) | np.asarray(level.transmits)) & side.exists
-            used_planes[np.asarray(level.plane)[met]] = True
-            used_slabs[np.asarray(level.material)[met]] = True
-    used_planes[:1], used_slabs[:1] = True, True  # Dr.Jit gathers from no empty array
-    return np.flatnonzero(used_planes), np.flatnonzero(used_slabs)
+    used = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
+    for mask, further, column in zip(used, (planes, slabs), (0, 1), strict=True):
+        mask[further] = True
+        for side in sides:
+            numbers = side.chains.met(len(side.chains.levels))[column]
+            mask[numbers[numbers >= 0]] = True
+        mask[:1] = True  # Dr.Jit gathers from no empty array
+    return np.flatnonzero(used[0]), np.flatnonzero(used[1])
 
 
 def _recorded_gain(side: TracedField) -> Recorded:
@@ -363,13 +349,3 @@ def _stride(length: int, most: int) -> int:
     """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
     found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
     return found if 3 * (length // found) >= most else 1
-
-
-def search_options(options: CorrectionOptions) -> TracedOptions:
-    """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
-    trace = TraceOptions(
-        transmission=True, max_depth=options.depth, max_reflections=options.reflections, rays=options.rays
-    )
-    degree = options.pattern_degree if PATTERNS in options.parts else 0
-    whole: dict[str, Any] = {"materials": "surface", "thickness": True, "exponent": True, "planes": True}
-    return TracedOptions(trace, degree, faint=options.faint, **whole)

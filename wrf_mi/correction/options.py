@@ -6,24 +6,38 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
 from ..tracing.instrument_parameters import TX_PATTERN
-from ..tracing.material_parameters import EXPONENT, PREFIX
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS
+from ..tracing.material_parameters import EXPONENT, PREFIX, QUANTITIES
+from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
 from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
 PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS)
 """What a correction may change."""
-EXPONENT_SD = 0.3
-"""Standard deviation of the exponent of a conductivity with the frequency; ITU-R P.2040 has 0.16 to 1.34 for building
-materials other than metal."""
-FLAT = 10.0
-"""Standard deviation of the logarithm of a gain, and of its phase in rad: no prior knowledge."""
+DEVIATIONS = {
+    "permittivity": 0.7,  # of the logarithm of permittivity - 1
+    "conductivity": 1.4,  # of logarithms, too
+    "thickness": 0.35,
+    EXPONENT: 0.3,  # ITU-R P.2040 has 0.16 to 1.34 for building materials other than metal
+    "gain": 10.0,  # of its logarithm, and of its phase in rad: no prior knowledge
+    "position": 0.02,  # metres
+    "turn": 0.02,  # rad
+    "pattern": 0.1,
+}
+"""Standard deviations of parameters before the correction, by the last part of their names."""
+TILT_SD_RAD = 0.005
+"""Standard deviation of a plane's tilts."""
+FRAME_SD = np.repeat([0.05, 0.02], 3)
+"""Standard deviations of the common displacement of all planes against the devices, metres, and rotation, rad."""
+HELD = 0.01
+"""Share of the deviations of planes that remains where they move with the frame alone."""
 
 OnStage = Callable[[str, float], None]
 """``on_stage(what, share)``: what is done, and the share of it that is done, 0 to 1."""
@@ -43,14 +57,6 @@ class CorrectionOptions(CheckedSettings):
         steps: largest number of least-squares steps.
         pattern_degree: degree of the antennas' patterns, where they are changed.
         shift_sd_m: standard deviation of a plane's position before the correction, metres.
-        tilt_sd_rad: standard deviation of a plane's tilts, rad.
-        frame_sd_m: standard deviation of the common displacement of all planes against the devices, metres.
-        frame_sd_rad: standard deviation of their common rotation, rad.
-        material_sd: standard deviation of the logarithm of a material's permittivity - 1; its conductivity has twice,
-            its thickness half of it.
-        pose_sd_m: standard deviation of a receiver's position, metres.
-        pose_sd_rad: standard deviation of a receiver's orientation, rad.
-        pattern_sd: standard deviation of a pattern's coefficient.
     """
 
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
@@ -62,13 +68,6 @@ class CorrectionOptions(CheckedSettings):
     steps: Annotated[int, NOT_NEGATIVE] = 8
     pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 2
     shift_sd_m: Positive = 0.02
-    tilt_sd_rad: Positive = 0.005
-    frame_sd_m: Positive = 0.05
-    frame_sd_rad: Positive = 0.02
-    material_sd: Positive = 0.7
-    pose_sd_m: Positive = 0.02
-    pose_sd_rad: Positive = 0.02
-    pattern_sd: Positive = 0.1
 
     def __post_init__(self) -> None:
         """Check ranges and parts.
@@ -84,6 +83,13 @@ class CorrectionOptions(CheckedSettings):
         if not self.parts:
             raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
 
+    @property
+    def traced(self) -> TracedOptions:
+        """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
+        trace = TraceOptions(transmission=True, max_depth=self.depth, max_reflections=self.reflections, rays=self.rays)
+        degree = self.pattern_degree if PATTERNS in self.parts else 0
+        return TracedOptions(trace, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES)
+
     def changes(self, name: str) -> bool:
         """Whether a parameter of `wrf_mi.tracing.traced_field.TracedField` is changed."""
         if name.startswith(PREFIX):
@@ -96,21 +102,10 @@ class CorrectionOptions(CheckedSettings):
 
     def deviation(self, name: str) -> float:
         """Standard deviation of the entries of a parameter before the correction; of planes without the frame's."""
-        scale = {"permittivity": 1.0, "conductivity": 2.0, "thickness": 0.5}
-        last = name.rpartition(".")[2]
-        if last == EXPONENT:
-            return EXPONENT_SD
-        if name.startswith(PREFIX):
-            return self.material_sd * scale[last]
-        tight = PLANES not in self.parts
-        found = {
-            SHIFT: self.shift_sd_m * (0.01 if tight else 1),
-            TILT: self.tilt_sd_rad * (0.01 if tight else 1),
-            "gain": FLAT,
-            "position": self.pose_sd_m,
-            "turn": self.pose_sd_rad,
-        }
-        return found.get(name, found.get(last, self.pattern_sd))
+        of_planes = {SHIFT: self.shift_sd_m, TILT: TILT_SD_RAD}
+        if name in of_planes:
+            return of_planes[name] * (1 if PLANES in self.parts else HELD)
+        return DEVIATIONS["pattern" if name == TX_PATTERN else name.rpartition(".")[2]]
 
 
 DEFAULTS = CorrectionOptions()

@@ -28,19 +28,13 @@ from ..core.files import atomic_folder, write_atomically, write_figure
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
-from ..tracing.corrected_scene import (
-    material_constants,
-    material_exponents,
-    moved_triangles,
-    write_corrected_scene,
-)
-from ..tracing.material_parameters import SURFACE, name_of, slabs_of_faces
+from ..tracing.corrected_scene import moved_triangles, write_corrected_scene
+from ..tracing.material_parameters import QUANTITIES, SURFACE, name_of
 from ..tracing.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
 from .frame import rigid_motion, scene_entries
 from .options import FRAME, MATERIALS
-from .search import CONSTANTS, QUANTITIES
 
 PAGE, PICTURE = "correction.md", "correction.png"
 SUPPORTED = 0.5
@@ -68,11 +62,11 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     with atomic_folder(Path(folder), replace=replace) as part:
         write_corrected_scene(
             part,
-            correction.scene,
-            correction.scene_parameters,
+            correction.misfit.sides[0].scene,
+            correction.fit.of_scene(correction.state),
             grouping="surface",
             kinds=correction.kinds,
-            absent=correction.absent,
+            absent=correction.fit.absent(correction.state),
             replace=True,
         )
         write_atomically(part / FILE, json.dumps(facts, indent=1, default=_plain) + "\n")
@@ -89,13 +83,13 @@ def _facts(correction: Correction) -> dict[str, Any]:
     """Everything that the page states."""
     misfit, task = correction.misfit, task_of(correction.misfit.record)
     changed = np.zeros(len(correction.vector), bool)
-    changed[correction.free] = True
+    changed[correction.fit.free(correction.kept)] = True
     values, parameters = misfit.named(correction.vector), {}
     for name, part in misfit.parts.items():
         parameters[name] = {
             "value": values[name].ravel().tolist(),
             "sd": correction.deviation[part].tolist(),
-            "sd_before": correction.prior[part].tolist(),
+            "sd_before": correction.fit.prior_deviation[part].tolist(),
             "changed": changed[part].tolist(),
         }
     scores = {
@@ -111,7 +105,7 @@ def _facts(correction: Correction) -> dict[str, Any]:
         **correction.facts,
         DATA: correction.data and correction.data.facts(),
         "frame": _frame(correction),
-        "surfaces": len(misfit.scene_slabs.names),
+        "surfaces": len(misfit.tables.slabs.names),
         "planes": _planes(correction),
         "materials": _materials(correction),
         "parameters": parameters,
@@ -137,8 +131,8 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
     shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
     turned = correction.vector[tilt].reshape(count, 2)
     turned_sd = correction.deviation[tilt].reshape(count, 2)
-    free = np.isin(np.arange(shift.start, shift.stop), correction.free)
-    ratio = correction.deviation[shift] / correction.prior[shift]
+    free = np.isin(np.arange(shift.start, shift.stop), correction.fit.free(correction.kept))
+    ratio = correction.deviation[shift] / correction.fit.prior_deviation[shift]
     return [
         {
             "objects": sorted(objects[plane]),
@@ -158,28 +152,28 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
     """Each surface that paths meet: paths, constants before and after, standard deviations of their logarithms."""
     misfit, slabs = correction.misfit, correction.misfit.sides[0].slabs
     paths = misfit.counts()[1]
-    before = material_constants(slabs, {})
-    after = material_constants(slabs, correction.parameters) if correction.kept else before
-    exponent = material_exponents(slabs, correction.parameters if correction.kept else {})
-    quantities = QUANTITIES if misfit.several_carriers else CONSTANTS
+    fitted = slabs.fitted(misfit.named(correction.vector)) if correction.kept else slabs
+    before, after = slabs.table, fitted.table
+    changed, absent = correction.fit.free(correction.kept), correction.fit.absent(correction.state)
+    quantities = QUANTITIES if misfit.several_carriers else QUANTITIES[:3]
     parts = [misfit.parts.get(name_of(SURFACE, quantity)) for quantity in quantities]
     found = []
     for index, name in enumerate(slabs.names):
         places = [part.start + index for part in parts if part is not None]
-        free = bool(places) and places[0] in correction.free
+        free = bool(places) and places[0] in changed
         sd = correction.deviation[places] if free else None
         found.append(
             {
                 "surface": name.partition("/")[0],
                 "paths": int(paths[index]),
-                "first_choice": correction.materials.get(name),
-                "absent": misfit.slabs[index] in correction.absent,
+                "first_choice": correction.state.materials.get(name),
+                "absent": misfit.slabs[index] in absent,
                 "permittivity": [float(before[index, 0]), float(after[index, 0])],
                 "conductivity": [float(before[index, 1]), float(after[index, 1])],
                 "thickness_m": [float(before[index, 2]), float(after[index, 2])],
-                "conductivity_exponent": [float(slabs.exponent[index]), float(exponent[index])],
+                "conductivity_exponent": [float(slabs.exponent[index]), float(fitted.exponent[index])],
                 "sd_log": None if sd is None else sd.tolist(),
-                "measured": None if sd is None else (sd / correction.prior[places] <= SUPPORTED).tolist(),
+                "measured": None if sd is None else (sd / correction.fit.prior_deviation[places] <= SUPPORTED).tolist(),
             }
         )
     return found
@@ -192,7 +186,10 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
         return None
     surfaces, places = misfit.sides[0].surfaces, misfit.plane_entries
     change, precision = np.zeros((2, 3 * len(surfaces.normal)))
-    entries, free = scene_entries(misfit.planes, len(surfaces.normal)), np.isin(places, correction.free)
+    entries, free = (
+        scene_entries(misfit.planes, len(surfaces.normal)),
+        np.isin(places, correction.fit.free(correction.kept)),
+    )
     change[entries] = correction.vector[places]
     precision[entries[free]] = 1 / np.square(correction.deviation[places[free]])
     motion, sd = rigid_motion(surfaces, change, precision)
@@ -245,7 +242,7 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         lines.append("")
     fitted = [one for one in facts["materials"] if one["sd_log"] is not None]
     if fitted:
-        several, hz = correction.misfit.several_carriers, float(correction.scene.frequency[0])
+        several, hz = correction.misfit.several_carriers, correction.fit.frequency_hz
         law = " At another carrier f it is multiplied by (f / f0)^d." if several else ""
         text = f"Conductivities hold at the carrier f0 = {hz / 1e9:.6g} GHz.{law} A constant in parentheses is not"
         lines += ["## Materials", "", f"{text} identified."]
@@ -285,20 +282,19 @@ def _with_sd(value: float, sd: float) -> str:
 
 def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list[str]:
     """The change of the material of each face, a key of `CHANGES`."""
-    side = correction.misfit.sides[0]
-    slab_of_face = slabs_of_faces(side.scene, side.surfaces, "surface")[1]
     of_slab = [AS_STATED] * facts["surfaces"]
     for index, one in zip(correction.misfit.slabs, facts["materials"], strict=True):
         if one["sd_log"] is not None:
             of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
-    return [of_slab[slab] if slab >= 0 else AS_STATED for slab in slab_of_face]
+    return [of_slab[slab] if slab >= 0 else AS_STATED for slab in correction.misfit.tables.slab_of_face]
 
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     """The scene coloured by the shifts of its planes, or where none moved by its materials, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
-    triangles = moved_triangles(surfaces, correction.scene_parameters)
-    shift = np.zeros(len(surfaces.normal)) + 1e3 * correction.scene_parameters.get(SHIFT, 0.0)
+    parameters = correction.fit.of_scene(correction.state)
+    triangles = moved_triangles(surfaces, parameters)
+    shift = np.zeros(len(surfaces.normal)) + 1e3 * parameters.get(SHIFT, 0.0)
     figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
     above = [correction.kinds.get(name) == "ceiling" for name in surfaces.names]

@@ -16,8 +16,7 @@ from ..core.antenna import UPRIGHT
 from ..core.files import atomic_file
 from ..datasets.folder_files import CsvTable, read_csv, write_csv
 from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
-from ..tracing.effects import without_effect
-from ..tracing.options import stated_kinds
+from ..tracing.options import stated_kinds, without_effect
 from .format import ExportOptions
 from .source import Source
 

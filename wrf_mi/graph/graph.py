@@ -35,9 +35,9 @@ from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
 from ..tracing.field_calculator import Complex
+from ..tracing.instrument_parameters import receiver_pose
 from ..tracing.options import FACTOR
 from ..tracing.polarization import check_polarization
-from ..tracing.pose import receiver_pose
 from ..tracing.solve import Prepared
 from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_carriers import traced_fields
@@ -213,7 +213,7 @@ class Graph:
         if self.scene is None:
             return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
         t = self.traced
-        options = TracedOptions(t.options, t.pattern_degree, 1.0, self.tx_antenna, t.materials, t.moves_planes, t.faint)
+        options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
         given = tx_pos_m, self.receivers[receiver], options, self._prepared, tx_heading_rad, carriers_hz, params
         sides = traced_fields(self.scene, *given)
         if self.surface:

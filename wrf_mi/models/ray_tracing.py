@@ -38,8 +38,8 @@ from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
 from ..tracing.corrected_scene import check_materials, write_corrected_scene
-from ..tracing.effects import without_effect
 from ..tracing.offsets import Offsets, fit_offsets
+from ..tracing.options import without_effect
 from ..tracing.polarization import warn_of_cross_polarization
 from ..tracing.result import join_traces
 from ..tracing.solve import PAIRS_TOGETHER

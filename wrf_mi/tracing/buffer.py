@@ -1,4 +1,4 @@
-"""Conversion of plain arrays to and from Sionna RT's ``PathsBuffer``, and its image method.
+"""Conversion of plain arrays to and from Sionna RT's ``PathsBuffer``, its image method and its random search.
 
 Sionna RT's path solver has three stages: a search for candidates, the image method that makes exact paths of them, and
 the field calculator. This module alone sets attributes of ``PathsBuffer`` that have no setter; the version is pinned.
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from .options import TraceOptions
 from .surfaces import Surfaces
 
 SPECULAR, TRANSMISSION = 1, 4
@@ -21,6 +22,9 @@ SPECULAR, TRANSMISSION = 1, 4
 
 ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
 """Fields of `Legs` with a value, or a row, for each path."""
+SLOTS_PER_CHUNK = 1 << 22
+"""Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
+for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
 WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 """Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
 
@@ -70,6 +74,15 @@ def specular_legs(
 ) -> Legs:
     """Legs of an exhaustive search without diffraction."""
     return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
+
+
+def point_array(points: FloatArray) -> Any:
+    """Points [n, 3] as Mitsuba's ``Point3f``."""
+    import mitsuba as mi
+
+    from ..backend.device import to_vectors
+
+    return to_vectors(points, mi.Point3f)
 
 
 def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
@@ -128,20 +141,6 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
     return Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
 
 
-def exact_paths(mi_scene: Any, buffer: Any, sources_m: Any, targets_m: Any) -> Any:
-    """Sionna RT's image method: the buffer, with the candidates that are unobstructed paths as valid ones."""
-    from sionna.rt.path_solvers.image_method import ImageMethod
-
-    return ImageMethod()(
-        scene=mi_scene,
-        paths=buffer,
-        diffraction=buffer.diffracting_wedges is not None,
-        diffraction_lit_region=True,
-        src_positions=sources_m,
-        tgt_positions=targets_m,
-    )
-
-
 def join(parts: list[Legs], depth: int) -> Legs:
     """Concatenate legs; an empty list gives no paths of that depth."""
     if not parts:
@@ -154,3 +153,53 @@ def join(parts: list[Legs], depth: int) -> Legs:
         zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
         wedge[name] = np.concatenate([part.wedge.get(name, zero) for part, zero in zip(parts, zeros, strict=True)])
     return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)
+
+
+def sampled_paths(
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions, rays: int
+) -> Legs:
+    """Paths with at least one diffuse reflection or diffraction from a source [3] to each target [n, 3], metres.
+
+    Source 0, target 0..n-1; vertices are in single precision.
+    """
+    import drjit as dr
+    from sionna.rt.path_solvers.image_method import ImageMethod
+    from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+    step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
+    parts = []
+    for start in range(0, len(targets_m), step):
+        batch = targets_m[start : start + step]
+        ends = point_array(source_m[None]), point_array(batch)
+        dr.make_opaque(*ends)
+        buffer = SBDeterministicCandidateGenerator()(
+            mi_scene=scene.mi_scene,
+            src_positions=ends[0],
+            tgt_positions=ends[1],
+            samples_per_src=rays,
+            max_num_paths_per_src=rays * options.max_depth * len(batch),
+            max_depth=options.max_depth,
+            los=False,
+            specular_reflection=options.reflection,
+            diffuse_reflection=options.scattering,
+            refraction=options.transmission,
+            diffraction=options.diffraction,
+            edge_diffraction=options.diffraction,
+            seed=options.seed,
+        )
+        buffer.schedule()
+        dr.eval()
+        buffer.shrink()
+        buffer = ImageMethod()(
+            scene=scene.mi_scene,
+            paths=buffer,
+            diffraction=buffer.diffracting_wedges is not None,
+            diffraction_lit_region=True,
+            src_positions=ends[0],
+            tgt_positions=ends[1],
+        )
+        found = from_buffer(buffer, surfaces)
+        types = found.interactions
+        found = found.select(((types != 0) & (types != SPECULAR) & (types != TRANSMISSION)).any(axis=1))
+        parts.append(replace(found, target=found.target + start))
+    return join(parts, options.max_depth)

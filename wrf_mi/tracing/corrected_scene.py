@@ -1,17 +1,25 @@
-"""Scene folder with planes and materials as training has changed them, which Sionna RT opens."""
+"""Scenes with planes and materials as training has changed them: as a folder, and for the search of paths.
+
+Planes that move take paths with them (`wrf_mi.tracing.plane_parameters`), but edges that move uncover some paths and
+hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated one,
+so that paths found there are paths of the stated scene with these parameters.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
+from ..backend.device import on_device, to_tensor
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
@@ -19,19 +27,11 @@ from ..scene.folder import plain_name, write_scene
 from ..scene.materials import CARRIER, THICKNESS_M, Materials
 from ..scene.materials import EXPONENT as LAW
 from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
-from .material_parameters import (
-    EXPONENT,
-    SURFACE,
-    MaterialGrouping,
-    SlabMaterials,
-    name_of,
-    read_materials,
-    slabs_of_faces,
-)
+from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
 from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
-from .surfaces import Surfaces, scene_surfaces
-from .walls import moved_planes, plane_centres
+from .solve import Prepared
+from .surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
 
 FLAT = 0.2
 """Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
@@ -43,8 +43,6 @@ UNCHANGED = 1e-4
 """Relative change of a constant below which a material keeps its name: less than any measurement supports."""
 ODD_IN_FILES, ODD_IN_MATERIALS = r"[^\w.-]", r"[^A-Za-z0-9_]"
 """Characters of other scenes' names that those of surfaces and materials of a scene folder do not have."""
-QUANTITIES = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
-"""Trainable constants of a slab, and the least value of each (`wrf_mi.tracing.material_parameters`)."""
 
 
 def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
@@ -94,22 +92,12 @@ def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tup
     shift, tilt = shift if shift.size else np.zeros(count), tilt if tilt.size else np.zeros((count, 2))
     if shift.shape != (count,) or tilt.shape != (count, 2):
         raise ValueError(f"planes_at: shifts {shift.shape} and tilts {tilt.shape} of a scene of {count} planes")
-    change = np.column_stack([shift, tilt])
-    return moved_planes(surfaces.normal, surfaces.axes, plane_centres(surfaces)[0], change)
+    return surfaces.moved_planes(shift, tilt)
 
 
 def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArray) -> tuple[IntArray, IntArray]:
-    """Of the planes at each of ``count`` corners, the largest first, those that are not parallel to what the larger
-    ones span.
-
-    Args:
-        pairs: corner and plane [n, 2].
-        count: number of corners c.
-        area: area of each plane [q].
-        normal: unit normals [q, 3].
-
-    Returns:
-        Planes [c, 3] and their numbers [c].
+    """Planes [count, 3] at each corner, the largest first, that are not parallel to what larger ones span, and their
+    numbers [count]; of ``pairs`` of corner and plane [n, 2], and areas [q] and normals [q, 3] of the planes.
     """
     corner, plane = pairs[np.lexsort((pairs[:, 1], -area[pairs[:, 1]], pairs[:, 0]))].T
     first = np.searchsorted(corner, np.arange(count + 1))
@@ -137,25 +125,6 @@ def check_materials(scene: Any) -> None:
     for name, thing in scene.objects.items():
         if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
-
-
-def material_constants(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Relative permittivity, conductivity in S/m and thickness in metres of n slabs, [n, 3], from ``parameters`` where
-    they have them.
-    """
-    values = np.stack([slabs.permittivity, slabs.conductivity, slabs.thickness_m], axis=1).astype(float)
-    for column, (quantity, least) in enumerate(QUANTITIES.items()):
-        for index, name in enumerate([SURFACE] if slabs.grouping == "surface" else slabs.names):
-            if (found := parameters.get(name_of(name, quantity))) is not None:
-                rows = slice(None) if name == SURFACE else slice(index, index + 1)
-                values[rows, column] = least + np.exp(np.ravel(np.asarray(found, float)))
-    return values
-
-
-def material_exponents(slabs: SlabMaterials, parameters: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Exponents of the conductivities of n slabs [n], from ``parameters`` where they have them."""
-    found = parameters.get(name_of(SURFACE, EXPONENT)) if slabs.grouping == "surface" else None
-    return slabs.exponent if found is None else np.asarray(found, float).ravel()
 
 
 def write_corrected_scene(
@@ -197,9 +166,10 @@ def write_corrected_scene(
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
     slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
-    fitted, exponent = material_constants(slabs, parameters), material_exponents(slabs, parameters)
+    corrected = slabs.fitted(parameters)
+    fitted, exponent = corrected.table, corrected.exponent
     # As stated, or as parameters state it: metal has a permittivity of 1, of whose logarithm less one there is none.
-    stated = [material_constants(slabs, start) for start in ({}, slabs.parameters(thickness=True))]
+    stated = [slabs.table, slabs.fitted(slabs.parameters(QUANTITIES)).table]
     changed: NDArray[np.bool_] = np.all(
         [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated], axis=0
     )
@@ -270,3 +240,63 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
 
 def _rounded(value: float) -> float:
     return float(f"{value:.5g}")
+
+
+@dataclass(frozen=True)
+class MovedSearch:
+    """Where paths are searched for the scene as stated.
+
+    Attributes:
+        prepared: shared state of traces in the moved scene.
+        parameters: parameters of the traced fields, Dr.Jit tensors by name, by which faint paths are told.
+    """
+
+    prepared: Prepared
+    parameters: Mapping[str, Any]
+
+
+def moved_search(
+    copy: Any, stated: Surfaces, parameters: Mapping[str, NDArray[Any]], absent: Collection[int] = ()
+) -> MovedSearch:
+    """Move the planes of a scene in place, for the search of paths there.
+
+    Args:
+        copy: ``sionna.rt.Scene`` with the objects of the stated one, which may have been moved before; nothing else
+            may use it.
+        stated: surfaces of the scene as stated.
+        parameters: parameters of `wrf_mi.tracing.traced_field.TracedField` by name, those of planes among them.
+        absent: slabs of surfaces, in the order of their parameters, that no ray shall meet.
+
+    Raises:
+        ValueError: parameters of a scene with another number of planes.
+    """
+    triangles = moved_triangles(stated, parameters)
+    left_out = np.isin(slabs_of_faces(copy, stated, "surface")[1], list(absent))
+    triangles[left_out] = triangles[left_out][:, :1]  # no ray meets a point
+    _move(copy, stated, triangles)
+    normal, offset = planes_at(stated, parameters)
+    flat = np.einsum("fcx,fax->fca", triangles, stated.axes[stated.plane])
+    low, high = plane_bounds(stated.plane, flat, len(normal))
+    face = np.where(left_out[stated.face], largest_face(stated.plane, trimesh.triangles.area(triangles)), stated.face)
+    surfaces = replace(
+        stated,
+        shape_ids=np.array([shape_id(copy.objects[name].mi_mesh) for name in stated.names], np.uint32),
+        triangles=triangles,
+        normal=normal,
+        offset=offset,
+        face=face,
+        low=low,
+        high=high,
+    )
+    return MovedSearch(Prepared(copy, surfaces), {name: to_tensor(values) for name, values in parameters.items()})
+
+
+def _move(scene: Any, stated: Surfaces, triangles: FloatArray) -> None:
+    """Give the faces of a scene other corners [f, 3, 3], which they no longer share."""
+    parameters = scene.mi_scene_params
+    for number, name in enumerate(stated.names):
+        mesh = scene.objects[name].mi_mesh.id()
+        corners = triangles[stated.first_face[number] : stated.first_face[number + 1]].reshape(-1)
+        parameters[f"{mesh}.vertex_positions"] = on_device(corners, mi.Float)
+        parameters[f"{mesh}.faces"] = on_device(np.arange(len(corners) // 3), mi.UInt32)
+    parameters.update()

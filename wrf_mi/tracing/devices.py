@@ -31,15 +31,10 @@ PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Refuse antennas inside a solid object; warn of those outside the scene.
-
-    Args:
-        surfaces: surfaces of the scene.
-        positions_m: positions [n, 3], metres.
-        names: names of the antennas in messages, such as ``transmitter 3``.
+    """Refuse antennas at positions [n, 3], metres, inside a solid object; warn of those outside the scene.
 
     Raises:
-        InputError: the first antenna inside a solid object.
+        InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
     """
     thing = solid_around(surfaces, positions_m)
     if (thing >= 0).any():
@@ -63,18 +58,11 @@ def clear_m(surfaces: Surfaces) -> float:
 
 
 def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
-    """Move antennas that are mounted on a surface before it, so that they have a side.
+    """Move antennas at positions [n, 3] that are mounted on a surface before it, so that they have a side.
 
     Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where no
     path arrives, or inside a cabinet. Outer walls, with all of the scene on one side, and solids have a right side, to
     which antennas up to `BEHIND_M` behind are moved; at other sheets an antenna keeps its side.
-
-    Args:
-        surfaces: surfaces of the scene.
-        positions_m: positions [n, 3], metres.
-
-    Returns:
-        Corrected positions [n, 3].
     """
     moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)
     for point, plane in _pairs_near(surfaces, moved):

@@ -10,21 +10,29 @@ Vectors are lists of three Dr.Jit arrays, complex numbers pairs (re, im).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
-from scipy.constants import speed_of_light
+from numpy.typing import NDArray
+from scipy.constants import epsilon_0, speed_of_light
 
+from ..backend.device import columns_on_device
 from ..core import Antenna
+from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
+from ..core.types import IntArray
 from ..gaussians.footprint import Pose, cross, dot, tangent_basis
-from .slab import slab
+from .buffer import SPECULAR, TRANSMISSION
+from .surfaces import Surfaces
 
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
 
+Float64: Any = dr.float64_array_t(mi.Float)
 Vector = list[Any]
 Complex = tuple[Any, Any]
 Tables = tuple[Any, Any, Any, Any]
@@ -72,22 +80,23 @@ class Chains:
         """Select the paths of an unsigned integer array of indices."""
         return dr.gather(Chains, self, index)
 
+    def met(self, depth: int) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
+        """Planes and materials that the p paths meet at up to ``depth`` interactions [p, depth], -1 for none, and
+        whether they are reflected there; without place holders.
+        """
+        exists = np.flatnonzero(self.exists.numpy() > 0)
+        plane, material = np.full((2, len(exists), depth), -1)
+        reflects = np.zeros((len(exists), depth), bool)
+        for k, level in enumerate(self.levels):
+            reflects[:, k] = np.asarray(level.reflects)[exists]
+            is_met = reflects[:, k] | np.asarray(level.transmits)[exists]
+            for column, numbers in ((plane, level.plane), (material, level.material)):
+                column[is_met, k] = np.asarray(numbers)[exists[is_met]]
+        return plane, material, reflects
 
-@dataclass
-class EvaluatedPaths:
-    """Geometry and gain of q paths.
 
-    Attributes:
-        gain: lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length).
-        length_m: unfolded length, metres.
-        departure: unit vectors leaving the transmitter, in its frame (rotated by its heading).
-        arrival: unit vectors from the receiver towards the incoming wave, in the receiver's frame.
-    """
-
-    gain: Complex  # two float arrays [q]
-    length_m: Any  # float [q]
-    departure: Vector  # three float arrays [q]
-    arrival: Vector  # three float arrays [q]
+EvaluatedPaths = tuple[Complex, Any, Vector, Vector]
+"""Gain, length, departure and arrival of q paths, see `evaluate_paths`."""
 
 
 def evaluate_paths(
@@ -108,8 +117,13 @@ def evaluate_paths(
         rx_antenna: antenna of the receiver.
         tx_antenna: antenna of the transmitters.
 
+    Returns:
+        Gain lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length);
+        unfolded length, metres; unit vectors leaving the transmitter, in its frame (rotated by its heading), and from
+        the receiver towards the incoming wave, in the receiver's frame.
+
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
-    and 5.3; slabs as `wrf_mi.tracing.slab`.
+    and 5.3; slabs as `slab`.
     """
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
@@ -140,9 +154,8 @@ def evaluate_paths(
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
     taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
-    return EvaluatedPaths(
-        (dot(taken, real) * loss, dot(taken, imaginary) * loss), length, departure, pose.to_local(arrival)
-    )
+    gain = dot(taken, real) * loss, dot(taken, imaginary) * loss
+    return gain, length, departure, pose.to_local(arrival)
 
 
 def _interact(
@@ -173,15 +186,87 @@ def _interact(
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
-    """Real field vectors of an antenna with derivatives, see `wrf_mi.core.Antenna.field`.
+    """Real field vectors of an antenna, three arrays [q] in the world's frame, with derivatives.
 
-    Args:
-        antenna: pattern and polarisation.
-        direction: unit vectors, three arrays [q] of any float type, world frame.
-        axes: the antenna's x, y and z axis in the world's frame.
-
-    Returns:
-        Three arrays [q], world frame.
+    As `wrf_mi.core.Antenna.field`, of unit vectors ``direction`` and the antenna's axes x, y and z in that frame.
     """
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
+
+
+def chains_of(
+    surfaces: Surfaces, types: NDArray[np.uint8], face: IntArray, material: IntArray, sources: Sequence[FloatArray]
+) -> Chains:
+    """Chains of p paths with interactions ``types`` at faces, of materials by their indices, all [p, depth].
+
+    ``sources``: five columns [p], coordinates of each path's transmitter, cosine and sine of its heading.
+    """
+    depth = types.shape[1] if types.any() else 0
+    types, face = types[:, :depth], face[:, :depth]
+    plane, used, index = np.append(surfaces.plane, 0)[face], types != 0, material[:, :depth].astype(np.uint32)
+    # All columns of a type by one copy: each copy is a kernel of its own.
+    normal, offset = surfaces.normal[plane] * used[..., None], surfaces.offset[plane] * used
+    columns = [column for k in range(depth) for column in (*normal[:, k].T, offset[:, k])]
+    numbers = columns_on_device([*columns, *sources, np.ones(len(types))], Float64)
+    kinds = [types[:, k] == kind for k in range(depth) for kind in (SPECULAR, TRANSMISSION)]
+    masks = columns_on_device(kinds, mi.Bool)
+    indices = columns_on_device([table[:, k] for k in range(depth) for table in (index, plane)], mi.UInt32)
+    levels = [
+        Level(numbers[4 * k : 4 * k + 3], numbers[4 * k + 3], *masks[2 * k : 2 * k + 2], *indices[2 * k : 2 * k + 2])
+        for k in range(depth)
+    ]
+    *place, exists = numbers[4 * depth :]
+    return Chains(place[:3], tuple(place[3:]), exists, levels)
+
+
+@dataclass
+class SlabCoefficients:
+    """Complex reflection and transmission coefficients of p passages, TE and TM."""
+
+    reflected_te: Any
+    reflected_tm: Any
+    transmitted_te: Any
+    transmitted_tm: Any
+
+
+def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, frequency_hz: Any) -> SlabCoefficients:
+    """Reflection at and transmission through a homogeneous slab in air.
+
+    With the complex relative permittivity eta = eps_r - j sigma / (2 pi f eps_0), for the time factor exp(+j omega t),
+    and s = sqrt(eta - sin^2 theta), the Fresnel coefficients of one face are
+
+        r_TE = (cos theta - s) / (cos theta + s),   r_TM = (eta cos theta - s) / (eta cos theta + s)
+
+    and those of a slab of thickness d, with q = 2 pi d s / lambda,
+
+        R = r (1 - exp(-2 j q)) / (1 - r^2 exp(-2 j q)),   T = (1 - r^2) exp(-j q) / (1 - r^2 exp(-2 j q)).
+
+    R refers to the front face. T includes the phase of the way through the slab; that of the same way through air is
+    not subtracted. A perfect conductor has r_TE = -1 and r_TM = +1. Sionna RT's ``itu_coefficients_single_layer_slab``
+    has the same equations, in float32 for any input; here in the type of ``cosine``. Differentiable in all Dr.Jit
+    arguments.
+
+    Args:
+        cosine: cosine of the angle of incidence theta, a Dr.Jit array of either float type, [p].
+        permittivity: relative permittivity eps_r, [p].
+        conductivity: sigma, S/m, [p].
+        thickness_m: d, metres, [p].
+        frequency_hz: carrier frequency f, a number or an array of the same type.
+
+    Source: ITU-R P.2040-3, equations 37, 43 and 44.
+    """
+    kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)
+    j = kind(0, 1)
+    eta = permittivity - j * (conductivity / (2 * np.pi * frequency_hz * epsilon_0))
+    root = dr.sqrt(eta - (1 - cosine * cosine))
+    te = (cosine - root) / (cosine + root)
+    tm = (eta * cosine - root) / (eta * cosine + root)
+    once = dr.exp(-j * (2 * np.pi * frequency_hz / speed_of_light) * thickness_m * root)
+    twice = once * once
+    through_te, through_tm = (1 / (1 - r * r * twice) for r in (te, tm))
+    return SlabCoefficients(
+        te * (1 - twice) * through_te,
+        tm * (1 - twice) * through_tm,
+        (1 - te * te) * once * through_te,
+        (1 - tm * tm) * once * through_tm,
+    )

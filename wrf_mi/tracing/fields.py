@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.antenna import MountedAntenna
-from .buffer import SPECULAR, TRANSMISSION, Legs, to_buffer
-from .image_method import image_sources
+from .buffer import SPECULAR, TRANSMISSION, Legs, point_array, to_buffer
+from .images import image_sources
 from .options import TraceOptions
 from .surfaces import Surfaces
 
@@ -65,15 +65,6 @@ def sionna_orientation(to_world: ArrayLike) -> FloatArray:
         return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
 
 
-def point_array(points: FloatArray) -> Any:
-    """Points [n, 3] as Mitsuba's ``Point3f``."""
-    import mitsuba as mi
-
-    from ..backend.device import to_vectors
-
-    return to_vectors(points, mi.Point3f)
-
-
 def field_of(
     scene: Any,
     buffer: Any,
@@ -81,17 +72,14 @@ def field_of(
     rays: int,
     loop_mode: Literal["symbolic", "evaluated"] = "symbolic",
 ) -> tuple[Any, Any]:
-    """Complex gains of paths as Dr.Jit arrays, differentiable in the materials with ``loop_mode="evaluated"``.
+    """Complex gains [p] of paths as Dr.Jit arrays, without the phase exp(-j k length).
 
     Args:
         scene: ``sionna.rt.Scene``.
         buffer: p paths from source to target, from `wrf_mi.tracing.buffer.to_buffer`; may be used again.
         ends: sources and targets.
         rays: number of rays shot per source, for diffuse reflections.
-        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster and has no derivatives.
-
-    Returns:
-        Real and imaginary part, ``mi.Float`` [p], without the phase exp(-j k length).
+        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
     """
     import drjit as dr
     import mitsuba as mi

@@ -12,7 +12,7 @@ object in a plane. The thickness is an optional parameter.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -34,8 +34,16 @@ LEAST_CONDUCTIVITY = 1e-6
 PREFIX, EXPONENT = "material.", "exponent"
 SURFACE = "surface"
 """In place of a material's name: parameters [n] of all surfaces."""
+QUANTITIES = ("permittivity", "conductivity", "thickness", EXPONENT)
+"""Constants of a material that may be parameters."""
+TRAINED = QUANTITIES[:2]
+"""Those that are by default."""
+LEAST = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
+"""Least value of the constants whose parameter is the logarithm of what they are above it."""
 COLUMNS = ("permittivity", "conductivity", "thickness_m", "reflected", "exponent")
 """Constants of `SlabMaterials`, each an array."""
+ATTRIBUTE = {"thickness": "thickness_m"}
+"""Names of constants in `SlabMaterials` that differ from those of parameters."""
 MaterialGrouping = Literal["named", "surface"]
 """Whether each named material, or each surface, has a permittivity and a conductivity."""
 
@@ -74,23 +82,35 @@ class SlabMaterials:
         columns = {name: getattr(self, name)[slabs] for name in COLUMNS}
         return replace(self, names=tuple(self.names[slab] for slab in slabs), **columns)
 
-    def parameters(self, thickness: bool = False, exponent: bool = False) -> dict[str, NDArray[np.float32]]:
-        """Parameters x, y and, with the thickness, z, and the exponent d: of each material [1], or of all surfaces
-        [n].
-        """
+    def parameters(self, quantities: Sequence[str] = TRAINED) -> dict[str, NDArray[np.float32]]:
+        """Parameters of some of `QUANTITIES`: of each material [1], or of all surfaces [n]."""
         values = {
             "permittivity": np.log(np.maximum(self.permittivity - 1, LEAST_SUSCEPTIBILITY)),
             "conductivity": np.log(np.maximum(self.conductivity, LEAST_CONDUCTIVITY)),
+            "thickness": np.log(self.thickness_m),
+            EXPONENT: self.exponent,
         }
-        if thickness:
-            values["thickness"] = np.log(self.thickness_m)
-        if exponent:
-            values[EXPONENT] = self.exponent
-        columns = {quantity: column.astype(np.float32) for quantity, column in values.items()}
+        columns = {quantity: values[quantity].astype(np.float32) for quantity in quantities}
         if self.grouping == "surface":
             return {name_of(SURFACE, quantity): column for quantity, column in columns.items() if len(column)}
         each = [(name, k, quantity) for k, name in enumerate(self.names) for quantity in columns]
         return {name_of(name, quantity): columns[quantity][k : k + 1] for name, k, quantity in each}
+
+    def fitted(self, parameters: Mapping[str, NDArray[Any]]) -> SlabMaterials:
+        """Materials with the constants of ``parameters``, where these have any."""
+        columns = {quantity: getattr(self, ATTRIBUTE.get(quantity, quantity)).astype(float) for quantity in QUANTITIES}
+        for quantity, column in columns.items():
+            for index, name in enumerate([SURFACE] if self.grouping == "surface" else self.names):
+                if (parameter := parameters.get(name_of(name, quantity))) is not None:
+                    value = np.ravel(np.asarray(parameter, float))
+                    rows = slice(None) if name == SURFACE else slice(index, index + 1)
+                    column[rows] = LEAST[quantity] + np.exp(value) if quantity in LEAST else value
+        return replace(self, **{ATTRIBUTE.get(quantity, quantity): column for quantity, column in columns.items()})
+
+    @property
+    def table(self) -> FloatArray:
+        """Relative permittivity, conductivity in S/m and thickness in metres [n, 3]."""
+        return np.stack([self.permittivity, self.conductivity, self.thickness_m], axis=1).astype(float)
 
     def constants(self, float_type: Any) -> list[Any]:
         """Stated permittivity, conductivity, thickness, reflected share and exponent, [n] each, on the device."""
@@ -108,28 +128,28 @@ class SlabMaterials:
             frequency_ratio: frequency over that at which the scene and parameters state the conductivity.
         """
 
-        def table(
-            quantity: str, constant: FloatArray, given: Any, least: float = 0.0, inverse: Callable[[Any], Any] = dr.exp
-        ) -> Any:
-            float_type: Any = type(given)
+        def column(quantity: str) -> Any:
+            attribute = ATTRIBUTE.get(quantity, quantity)
+            constant = stated[COLUMNS.index(attribute)]
+            float_type: Any = type(constant)
+
+            def value(parameter: Any) -> Any:
+                x = float_type(parameter.array)
+                return LEAST[quantity] + dr.exp(x) if quantity in LEAST else x
+
             if self.grouping == "surface":
                 whole = parameters.get(name_of(SURFACE, quantity))
-                return given if whole is None else least + inverse(float_type(whole.array))
-            found = [parameters.get(name_of(name, quantity)) for name in self.names]
-            if all(parameter is None for parameter in found):
-                return given
-            entries = []
-            for value, parameter in zip(constant, found, strict=True):
-                fixed = float_type(float(value))
-                entries.append(fixed if parameter is None else least + inverse(float_type(parameter.array)))
-            return dr.concat(entries)
+                return constant if whole is None else value(whole)
+            each = [parameters.get(name_of(name, quantity)) for name in self.names]
+            if all(parameter is None for parameter in each):
+                return constant
+            pairs = zip(getattr(self, attribute), each, strict=True)
+            return dr.concat([float_type(float(one)) if p is None else value(p) for one, p in pairs])
 
-        conductivity = table("conductivity", self.conductivity, stated[1])
+        conductivity = column("conductivity")
         if frequency_ratio != 1:
-            exponent = table(EXPONENT, self.exponent, stated[4], inverse=lambda value: value)
-            conductivity = conductivity * dr.exp(exponent * math.log(frequency_ratio))
-        permittivity = table("permittivity", self.permittivity, stated[0], 1.0)
-        return permittivity, conductivity, table("thickness", self.thickness_m, stated[2]), stated[3]
+            conductivity = conductivity * dr.exp(column(EXPONENT) * math.log(frequency_ratio))
+        return column("permittivity"), conductivity, column("thickness"), stated[COLUMNS.index("reflected")]
 
 
 def read_materials(scene: Any) -> SlabMaterials:
@@ -147,15 +167,9 @@ def read_materials(scene: Any) -> SlabMaterials:
 
 
 def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
-    """The slabs of a scene, and the slab of each face.
+    """The slabs of a ``sionna.rt.Scene``, by named material or by surface, and the index of each face's slab [f].
 
-    Args:
-        scene: a ``sionna.rt.Scene``.
-        surfaces: its faces [f].
-        grouping: slabs of named materials or of surfaces.
-
-    Returns:
-        The slabs, and the index of each face's slab [f]; -1 where its material is not a slab.
+    The index is -1 where the face's material is not a slab.
     """
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]

@@ -154,18 +154,20 @@ def conductivity_exponent(material: Any, frequency_hz: float) -> float:
 
 def itu_exponent(name: str, frequency_hz: float) -> float:
     """`conductivity_exponent` of a material of ITU-R P.2040; 0 outside its range."""
-    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-
-    ranges = ITU_MATERIALS_PROPERTIES[name].items()
-    known = [float(values[3]) for (low, high), values in ranges if low <= frequency_hz / 1e9 <= high]
-    return known[0] if known else 0.0
+    return next((float(values[3]) for values in _itu_constants_at(name, frequency_hz)), 0.0)
 
 
 def in_itu_range(name: str, frequency_hz: float) -> bool:
     """Whether ITU-R P.2040 has a material, e.g. ``"concrete"``, at a frequency, so that Sionna RT knows it."""
+    return bool(_itu_constants_at(name, frequency_hz))
+
+
+def _itu_constants_at(name: str, frequency_hz: float) -> list[tuple[float, ...]]:
+    """Constants a, b, c and d of a material in the ranges that hold a frequency."""
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    return any(low <= frequency_hz / 1e9 <= high for low, high in ITU_MATERIALS_PROPERTIES[name])
+    ranges = ITU_MATERIALS_PROPERTIES[name].items()
+    return [values for (low, high), values in ranges if low <= frequency_hz / 1e9 <= high]
 
 
 def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:

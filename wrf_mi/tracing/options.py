@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -88,6 +88,9 @@ class TraceOptions:
 
 DEFAULTS = TraceOptions()
 
+FURTHER = ("transmission", "diffraction", "scattering")
+"""Kinds of path that are traced only where they are asked for."""
+
 KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
 """Kinds of path in the command's terms."""
 
@@ -102,3 +105,23 @@ def stated_kinds(text: str) -> dict[str, bool]:
     if unknown := [kind for kind in asked if kind not in KINDS]:
         raise InputError(f"kind of path {unknown[0]!r}: unknown; choose from {', '.join(KINDS)}")
     return {kind.replace("-", "_"): kind in asked for kind in KINDS}
+
+
+def without_effect(options: TraceOptions) -> dict[str, str]:
+    """Names of settings that differ from their defaults and change no path, with the reason."""
+    reflects, interacts = options.reflections > 0, options.reflection or any(getattr(options, kind) for kind in FURTHER)
+    by_rays, needs_rays = reflects or options.sampled, "no reflection, diffraction or scattering is traced"
+    reasons = {
+        # A depth of 0 says what such paths have.
+        "max_depth": (options.max_depth > 0 and not interacts, "no path has an interaction"),
+        "max_reflections": (bool(options.max_reflections) and not options.reflection, "no reflection is traced"),
+        "rays": (not by_rays, needs_rays),
+        "seed": (not by_rays, needs_rays),
+        **{kind: (options.max_depth == 0, "max_depth is 0") for kind in FURTHER},
+        "scattering_coefficient": (not options.scattering, "no scattering is traced"),
+        "phase_error": (not by_rays, needs_rays),
+    }
+    if options.max_reflections is not None and options.reflection and options.max_reflections > options.max_depth:
+        reasons["max_reflections"] = True, f"max_depth is {options.max_depth}"
+    changed = {field.name for field in fields(options) if getattr(options, field.name) != getattr(DEFAULTS, field.name)}
+    return {name: reason for name, (idle, reason) in reasons.items() if idle and name in changed}

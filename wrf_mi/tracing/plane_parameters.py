@@ -5,7 +5,7 @@ A plane n . x = d with unit vectors a, b in it and the centroid c of its faces b
     n' = (n + t_a a + t_b b) / abs(n + t_a a + t_b b),   d' = n' . c + s
 
 with the shift s in metres and the tilts t_a, t_b in rad: small tilts are rotations about b and -a through c.
-`wrf_mi.tracing.walls.moved_planes` is the NumPy version.
+`wrf_mi.tracing.surfaces.Surfaces.moved_planes` is the NumPy version.
 
 The chains of surfaces are searched for on the mesh as stated and kept when planes move, as a moved mesh has gaps at its
 corners through which rays leave. Paths follow their planes continuously. Not modelled are paths that appear or vanish
@@ -15,7 +15,7 @@ of 3 m. So, unlike a receiver's position, a shift of a quarter of a wavelength n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,13 +24,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import columns_on_device, on_device
+from ..backend.device import columns_on_device, on_device, to_uint
 from ..core.types import IntArray
-from .field_calculator import Level, Vector
+from .field_calculator import Float64, Level, Vector
+from .material_parameters import MaterialGrouping, SlabMaterials, slabs_of_faces
 from .surfaces import Surfaces
-from .walls import plane_centres
 
-Float64: Any = dr.float64_array_t(mi.Float)
 SHIFT, TILT = "plane.shift", "plane.tilt"
 """Names of the parameters [q] in metres and [q, 2] in rad of the q planes of `Surfaces`, shared by all receivers."""
 
@@ -60,7 +59,7 @@ class PlaneTables:
 
         axes = [columns(surfaces.axes[:, k]) for k in range(2)]
         offset = on_device(surfaces.offset[planes], Float64)
-        return cls(columns(surfaces.normal), offset, columns(plane_centres(surfaces)[0]), axes)
+        return cls(columns(surfaces.normal), offset, columns(surfaces.plane_centres_m), axes)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Parameters of the stated planes: zeros [q] and [q, 2]; none for a scene without planes."""
@@ -93,3 +92,47 @@ class PlaneTables:
             tilted = [dr.gather(Float64, c, *at) for c in normal] if TILT in parameters else level.normal
             result.append(replace(level, normal=tilted, offset_m=dr.gather(Float64, offset, *at)))
         return result
+
+
+@dataclass(frozen=True)
+class SceneTables:
+    """Stated materials and planes.
+
+    Attributes:
+        slabs: materials, or those of each surface.
+        slab_of_face: index of the material of each face [f], -1 where it is no slab.
+        constants: `SlabMaterials.constants`, float64.
+        planes: planes on the device.
+    """
+
+    slabs: SlabMaterials
+    slab_of_face: IntArray
+    constants: list[Any]
+    planes: PlaneTables
+
+    @classmethod
+    def of(cls, scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> SceneTables:
+        """Tables of a ``sionna.rt.Scene`` and its surfaces."""
+        slabs, slab_of_face = slabs_of_faces(scene, surfaces, grouping)
+        return cls(slabs, slab_of_face, slabs.constants(Float64), PlaneTables.of(surfaces))
+
+    def select(self, surfaces: Surfaces, planes: IntArray, slabs: IntArray) -> SceneTables:
+        """Tables of some planes and materials by their numbers, in that order; other faces have no material (-1)."""
+        chosen, number = self.slabs.select(slabs), np.full(len(self.slabs.names) + 1, -1)
+        number[slabs] = np.arange(len(slabs))
+        slab_of_face = number[self.slab_of_face]  # the last one, -1, for faces without a material
+        return SceneTables(chosen, slab_of_face, chosen.constants(Float64), PlaneTables.of(surfaces, planes))
+
+
+def renumbered(levels: Sequence[Level], planes: IntArray, slabs: IntArray) -> list[Level]:
+    """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``, ascending.
+
+    Both have all those that a path meets; interactions that are place holders get any of these numbers.
+    """
+
+    def places(numbers: Any, chosen: IntArray) -> Any:
+        return to_uint(np.minimum(np.searchsorted(chosen, np.asarray(numbers)), len(chosen) - 1))
+
+    return [
+        replace(level, plane=places(level.plane, planes), material=places(level.material, slabs)) for level in levels
+    ]

@@ -28,14 +28,9 @@ TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections
 
 
 def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
-    """Receivers whose median power would grow by `GAIN_DB` if their polarisation were turned by 90 degrees.
+    """Gains in dB, `GAIN_DB` or more, by the names of receivers whose polarisation is turned by 90 degrees.
 
-    Args:
-        traced: paths; those of `SAMPLE` transmitters, evenly spaced, are evaluated.
-        scene: the scene in which they were traced.
-
-    Returns:
-        The gain in dB by the receivers' names.
+    Of the paths of `SAMPLE` transmitters, evenly spaced, in the scene in which they were traced.
     """
     sample = traced.select(np.isin(traced.paths.tx, spread(len(traced.tx_pos_m), SAMPLE)))
     if sample.carriers_hz is not None:  # both at the scene's carrier
@@ -69,14 +64,7 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
 
 
 def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
-    """Trace a few transmitters and warn of cross-polarised receivers.
-
-    Args:
-        scene: ``sionna.rt.Scene``.
-        tx_pos_m: transmitters [n, 3], metres.
-        receivers: receivers with their antennas.
-        tx_antenna: antenna of the transmitters.
-    """
+    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised receivers."""
     few = tx_pos_m[spread(len(tx_pos_m), TRACED)]
     traced = trace_paths(scene, few, receivers, ROUGH, tx_antenna=tx_antenna, check=False)
     warn_of_cross_polarization(traced, scene)

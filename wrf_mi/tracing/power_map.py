@@ -3,12 +3,17 @@
 For a position known to a decimetre ray tracing gives the mean over some wavelengths, so powers are averaged over the
 neighbourhood before they are converted to decibels. The scene is traced once on a grid and needed only then. Where
 positions are exact, edges of shadows are sharper than such means.
+
+Fits of the same scene with other rows trace the same grid. Powers are kept in the user's cache by a digest of all that
+determines them: faces and materials of the scene, carrier, positions, receivers, antennas, options, and the code.
 """
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,14 +21,19 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from ..core import InputError, Receiver, Record
+from ..core import Antenna, InputError, Receiver, Record, receiver_arrays
 from ..core.angles import FloatArray
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.digest import content_digest
+from ..datasets import user_cache
 from ..receivers import rssi_dbm
 from .devices import solid_around
-from .kept_powers import traced_powers
+from .material_parameters import slabs_of_faces
 from .options import TraceOptions
 from .solve import Prepared, trace_paths
 
+FOLDER, POWER = "powers", "power_dbm"
+PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
 MOST_POINTS = 6000
 """Most traced positions; the grid becomes wider for larger scenes."""
 LAYER_M = 0.5
@@ -178,3 +188,31 @@ def _means_outside(
     sampling = [step if np.isfinite(step) else 1.0 for step in steps_m]
     nearest = distance_transform_edt(share[0] < LEAST_SHARE, sampling, return_distances=False, return_indices=True)
     return np.asarray(mean[:, *nearest])
+
+
+def traced_powers(
+    scene: Any,
+    prepared: Prepared,
+    tx_pos_m: FloatArray,
+    receivers: Sequence[Receiver],
+    options: TraceOptions,
+    tx_antenna: Antenna,
+) -> FloatArray:
+    """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
+    slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
+    path = None
+    if (slab_of_face >= 0).all():  # other materials have no digest
+        here = Path(__file__).parent
+        code = {one.name: one for folder in (here, here.parent / "receivers") for one in folder.glob("*.py")}
+        versions = [importlib.metadata.version(name) for name in PACKAGES]
+        faces = prepared.surfaces.triangles, slab_of_face, slabs, float(scene.frequency[0])
+        asked = tx_pos_m, receiver_arrays(receivers), asdict(options), tx_antenna
+        path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
+        if path.exists():
+            return np.asarray(stored_arrays(path)[POWER], float)
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
+    power = np.asarray(rssi_dbm(trace_paths(scene, tx_pos_m, receivers, options, **how).paths), float)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_arrays(path, {POWER: power})
+    return power

@@ -59,18 +59,11 @@ def open_scene(
 def load_scene(
     source: str | Path, material: str | None = None
 ) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
-    """Load a scene in Sionna RT without setting its frequency.
-
-    Args:
-        source: see `open_scene`.
-        material: see `open_scene`.
+    """Load a scene in Sionna RT without setting its frequency, with the arguments and errors of `open_scene`.
 
     Returns:
         A ``sionna.rt.Scene``, thicknesses of its materials in metres, and laws of their conductivities, as
         `set_frequency` takes them.
-
-    Raises:
-        InputError: as `open_scene`, but for materials that are not known at a frequency.
     """
     backend.init()
     path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()

@@ -69,12 +69,8 @@ class _Crossings(NamedTuple):
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
 
-    Args:
-        surfaces: surfaces of the scene.
-        vertices_m: source, points of reflection and target of each path [k, b + 2, 3], metres, float64.
-        plane: plane of each reflection from the source on [k, b], -1 beyond the last.
-        met: the paths, with what rays met away from the points of reflection, and with `UNKNOWN_FACE`.
-        transmission: whether waves pass surfaces.
+    Of k paths with vertices and planes as of `wrf_mi.tracing.visibility.unobstructed`, and what rays met away from the
+    points of reflection, with `UNKNOWN_FACE`.
     """
     met, faces = _with_faces(surfaces, vertices_m, plane, met)
     vertices_m, plane = vertices_m[faces], plane[faces]

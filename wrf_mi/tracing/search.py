@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,9 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from .options import TraceOptions
 from .surfaces import Surfaces
+
+logger = logging.getLogger(__name__)
 
 PAIRS_PER_CHUNK = 1 << 24
 """Pairs of chain and position in a chunk: 64 MiB for each single-precision array."""
@@ -27,6 +32,10 @@ BESIDE = 1e-5
 displaced by `wrf_mi.tracing.images`."""
 MOST_KEPT = 1 << 27
 """Bytes of chains that a process keeps."""
+SECONDS_PER_HIT = 1.2e-7
+"""Of each surface that a ray meets, on two cores; finding duplicates takes most of it (docs/limits.md)."""
+WARN_S, MOST_S = 10.0, 3600.0
+"""Durations from which a search is announced, and refused."""
 Choices = list[tuple[int, ...]]
 """Indices of the hits that reflect, for each time that the rays are shot."""
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
@@ -204,14 +213,9 @@ def _unique_rows(rows: IntArray) -> IntArray:
 def possible(
     surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of chain and target whose points of reflection lie within the bounds of the chain's planes.
+    """Pairs of chain and target [n, 3] whose points of reflection lie within the bounds of the chain's planes.
 
     A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
-
-    Args:
-        surfaces: surfaces of the scene.
-        chains: chains from any sources.
-        targets_m: positions [n, 3], metres.
 
     Yields:
         Indices of chains and of targets, in chunks; in a chunk by the number of reflections.
@@ -250,3 +254,29 @@ def possible(
         chain, target = found // len(targets_m) + start, found % len(targets_m)
         order = np.argsort(length[chain], kind="stable")
         yield chain[order], target[order]
+
+
+def hits(options: TraceOptions, rays: int) -> int:
+    """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere.
+
+    Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
+    (`shoot`), of which there are up to two to the power of the depth.
+    """
+    met = options.max_depth if options.transmission else options.reflections
+    return len(patterns(met, options.reflections, options.transmission)) * rays * met if options.reflections else 0
+
+
+def check_search(options: TraceOptions, rays: int, sources: int) -> None:
+    """Announce a search from a number of sources that takes long.
+
+    Raises:
+        InputError: a search of more than an hour, naming what makes it shorter.
+    """
+    duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
+    if duration_s < WARN_S:
+        return
+    what = f"search for paths with up to {options.reflections} reflections"
+    remedy = f"a smaller --depth (max_depth, {options.max_depth}) or --reflections (max_reflections)"
+    if duration_s > MOST_S:
+        raise InputError(f"{what}: about {duration_s / 3600:.1f} hours; give {remedy}")
+    logger.warning("%s: about %.0f s; faster with %s", what, duration_s, remedy)

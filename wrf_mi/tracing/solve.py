@@ -17,21 +17,18 @@ from ..core import Antenna, InputError, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from .buffer import Legs, join
+from .buffer import Legs, join, sampled_paths
 from .devices import before_surfaces, check_devices, from_behind
-from .estimate import check_search
 from .fields import AT_ANTENNA_M, path_gains, scattering_materials
-from .image_method import image_sources
-from .images import specular_paths
+from .images import image_sources, specular_paths
 from .options import DEFAULTS, MAX_RAYS, TraceOptions
 from .result import TraceResult, device_ends
-from .sampled import sampled_paths
-from .search import ReflectionChains, shoot
+from .search import ReflectionChains, check_search, shoot
 from .surfaces import Surfaces, scene_surfaces
 
 if TYPE_CHECKING:
     from .material_parameters import MaterialGrouping
-    from .scene_tables import SceneTables
+    from .plane_parameters import SceneTables
 
 logger = logging.getLogger(__name__)
 
@@ -63,12 +60,7 @@ class Prepared:
         self._checked: set[bytes] = set()
 
     def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
-        """Refuse antennas inside solids and warn of those near surfaces, each position once.
-
-        Args:
-            tx_pos_m: transmitters as stated [n, 3], metres.
-            receivers: receivers as stated.
-            first_row: number of the first transmitter in error messages, from 0.
+        """Refuse antennas inside solids and warn of those near surfaces, each position once, as stated.
 
         Raises:
             InputError: see `wrf_mi.tracing.devices.check_devices`.
@@ -94,7 +86,7 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .scene_tables import SceneTables
+        from .plane_parameters import SceneTables
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
@@ -124,12 +116,6 @@ class Prepared:
             image = image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:]
             found.append(ReflectionChains(plane, image, np.zeros(len(plane), np.int64)))
         return ReflectionChains.joined(found)
-
-    def specular_paths(
-        self, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
-    ) -> Legs:
-        """Paths from points [s, 3] to targets [n, 3] by chains, see `wrf_mi.tracing.images.specular_paths`."""
-        return specular_paths(self.surfaces, chains, sources_m, targets_m, options)
 
 
 def trace_paths(
@@ -239,7 +225,7 @@ def _search(
             chains, step = shared.chains(some, options, rays), max(1, PAIRS_TOGETHER // len(some))
             for start in range(0, len(targets), step):
                 batch = targets[start : start + step]
-                found = [shared.specular_paths(chains, some, batch, options)]
+                found = [specular_paths(shared.surfaces, chains, some, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
                     for index, source in enumerate(some):
                         legs = sampled_paths(scene, shared.surfaces, source, batch, options, rays)
@@ -279,7 +265,7 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
     best, calm, rays = np.zeros(2), 0, FIRST_RAYS
     while True:
         chains = shared.new_chains(sources, plain, rays, options.seed + rays.bit_length())
-        legs = shared.specular_paths(chains, sources, targets, plain)
+        legs = specular_paths(shared.surfaces, chains, sources, targets, plain)
         found = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
         calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
         best = np.maximum(best, found)
@@ -315,24 +301,14 @@ def _paths(
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
     legs, gain, length = legs.select(order), gain[order], length[order]
     tx, rx, vertices = tx_pos_m[legs.source], rx_pos_m[legs.target], legs.vertices_m
-    # Nearest points that tell a direction: an antenna may be within a sheet that its path passes.
-    first, last = rx, tx
-    for level in range(vertices.shape[1]):
-        for ends, back in ((tx, vertices.shape[1] - 1 - level), (rx, level)):
-            point, used = vertices[:, back], legs.interactions[:, back] != 0
-            used = (used & (np.linalg.norm(np.nan_to_num(point) - ends, axis=1) > AT_ANTENNA_M))[:, None]
-            if ends is tx:
-                first = np.where(used, point, first)
-            else:
-                last = np.where(used, point, last)
     objects = np.where(legs.interactions != 0, surfaces.object_of(np.maximum(legs.face, 0)), -1)
     paths = Paths(
         tx=legs.source,
         rx=legs.target,
         gain=gain,
         length_m=length,
-        departure=_unit(first - tx),
-        arrival=_unit(last - rx),
+        departure=_directions(tx, rx, vertices),
+        arrival=_directions(rx, tx, vertices[:, ::-1]),
         interactions=legs.interactions,
         vertices_m=vertices,
         objects=objects.astype(np.int32),
@@ -343,5 +319,10 @@ def _paths(
     return paths, legs
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+def _directions(ends_m: FloatArray, others_m: FloatArray, points_m: FloatArray) -> FloatArray:
+    """Unit vectors [p, 3] from ends of paths towards the next points [p, depth, 3] (NaN: none), or the other ends."""
+    # Nearest points that tell a direction: an antenna may be within a sheet that its path passes.
+    apart = np.nan_to_num(np.linalg.norm(points_m - ends_m[:, None], axis=2)) > AT_ANTENNA_M
+    nearest = points_m[np.arange(len(points_m)), apart.argmax(axis=1)]
+    way = np.where(apart.any(axis=1)[:, None], nearest, others_m) - ends_m
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))

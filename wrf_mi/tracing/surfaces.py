@@ -140,6 +140,29 @@ class Surfaces:
         return order, np.searchsorted(self.plane[order], np.arange(len(self.normal) + 1))
 
     @cached_property
+    def plane_centres_m(self) -> FloatArray:
+        """Centroids of the planes' faces [q, 3], metres."""
+        area, count = trimesh.triangles.area(self.triangles), len(self.normal)
+        moment = [np.bincount(self.plane, area * c, minlength=count) for c in self.triangles.mean(axis=1).T]
+        centre = np.stack(moment, axis=1) / np.maximum(np.bincount(self.plane, area, count), 1e-30)[:, None]
+        # Faces lie in their plane within a tolerance only; so does their centroid.
+        return centre - self.normal * ((centre * self.normal).sum(axis=1) - self.offset)[:, None]
+
+    def moved_planes(
+        self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
+    ) -> tuple[FloatArray, FloatArray]:
+        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.plane_parameters`.
+
+        Args:
+            shift_m: shifts along the normals [k].
+            tilt: tilts about the centres towards both axes [k, 2], rad.
+            planes: numbers of the planes; by default all.
+        """
+        normal = self.normal[planes] + np.einsum("qa,qad->qd", tilt, self.axes[planes])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return normal, (normal * self.plane_centres_m[planes]).sum(axis=1) + shift_m
+
+    @cached_property
     def planes_on_device(self) -> tuple[Any, ...]:
         """``normal``, ``offset``, both ``axes``, ``low`` and ``high`` of the planes: Dr.Jit vectors [q]."""
         import mitsuba as mi

@@ -13,8 +13,8 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from . import TraceResult, trace_paths
-from .moved_scene import MovedSearch
-from .pose import moved_m
+from .corrected_scene import MovedSearch
+from .instrument_parameters import moved_m
 from .solve import Prepared
 from .traced_field import TracedField, TracedOptions, needs_search
 
@@ -30,29 +30,13 @@ def traced_fields(
     parameters: Mapping[str, Any] | None = None,
     searched: MovedSearch | None = None,
 ) -> list[TracedField]:
-    """Traced fields of the transmitters of each carrier at a receiver.
+    """Traced fields of the transmitters of each carrier at a receiver, in ascending order of the carriers.
 
     Paths are searched once for all carriers, and once at positions that repeat; wavelength and materials of a field are
-    those of its carrier.
-
-    Args:
-        scene: from `wrf_mi.tracing.open_scene`; not changed.
-        tx_pos_m: transmitters [n, 3], world frame, metres.
-        receiver: stated pose.
-        options: options of all fields.
-        prepared: shared state of the scene; the caller checks the antennas (`Prepared.check`).
-        tx_heading_rad: yaw of each transmitter's frame about +z, rad, shape [n]; None: 0.
-        carriers_hz: carrier of each transmitter [n], Hz; None: that of the scene.
-        parameters: Dr.Jit tensors by the names of `TracedField.parameters`: where they move the receiver further than
-            `TracedField.refresh` allows at a carrier, paths are searched from there. None: the stated pose.
-        searched: where paths are searched; None: in the scene as stated.
-
-    Returns:
-        A field for each carrier, ascending, of its transmitters in the given order.
-
-    Raises:
-        ValueError: positions or headings of another shape or not finite.
-        InputError: no transmitter, or a path through a material that is not a slab.
+    those of its carrier. Arguments and errors are those of `TracedField`, and ``carriers_hz``: carrier of each
+    transmitter [n], Hz (None: that of the scene); ``parameters``: Dr.Jit tensors by the names of
+    `TracedField.parameters`, where they move the receiver further than `TracedField.refresh` allows at a carrier, paths
+    are searched from there (None: the stated pose); ``searched``: where paths are searched (None: in the stated scene).
     """
     positions = np.atleast_2d(np.asarray(tx_pos_m, float))
     heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)

@@ -30,27 +30,29 @@ from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from ..gaussians.footprint import Pose
 from ..gaussians.recurrence import times
 from ..receivers.spreads import PathStatistics
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION
-from .devices import BEHIND_M
-from .field_calculator import Chains, Complex, Level, Vector, evaluate_paths
-from .instrument_parameters import TX_PATTERN, gain_name, instrument_parameters, pattern_name
-from .material_parameters import MaterialGrouping
+from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
+from .instrument_parameters import (
+    TX_PATTERN,
+    component,
+    gain_name,
+    instrument_parameters,
+    moved_m,
+    pattern_factor,
+    pattern_name,
+    receiver_pose,
+    spread_pose,
+)
+from .material_parameters import TRAINED, MaterialGrouping
 from .options import FACTOR
-from .path_chains import chains_of
-from .pattern_parameters import pattern_factor
-from .pose import component, moved_m, receiver_pose, spread_pose
+from .plane_parameters import SceneTables, renumbered
 from .result import without_faint
-from .scene_tables import SceneTables, renumbered
 from .solve import Prepared
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
-from .surfaces import Surfaces, scene_surfaces
-
-Float64: Any = dr.float64_array_t(mi.Float)
-
+from .surfaces import Surfaces
 
 SINGLE = 16
 """Numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all."""
@@ -63,27 +65,23 @@ class TracedOptions:
     Attributes:
         trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
         pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
-            `wrf_mi.tracing.pattern_parameters`).
-        gain: initial amplitude factor of all paths, from the channel's units to the instrument's.
+            `wrf_mi.tracing.instrument_parameters`).
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
-        thickness: whether thicknesses of materials are parameters, too.
-        exponent: whether exponents of conductivities with the frequency are parameters, too.
+        constants: constants of materials that are parameters, of `wrf_mi.tracing.material_parameters.QUANTITIES`.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
     pattern_degree: int = 0
-    gain: float = 1.0
     tx_antenna: Antenna = ANTENNA
     materials: MaterialGrouping = "named"
     planes: bool = False
     faint: float = 0.0
-    thickness: bool = False
-    exponent: bool = False
+    constants: tuple[str, ...] = TRAINED
 
     def __post_init__(self) -> None:
         """Check the options of the search.
@@ -135,6 +133,7 @@ class TracedField:
     Attributes:
         frequency_hz: carrier of the paths.
         chains: surfaces that each path meets, planes as stated.
+        interactions: points at which paths meet surfaces, with the planes as stated.
         slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
         surfaces: surfaces of the scene, with the planes of the parameters.
         searches: number of searches so far, without that of ``traced``.
@@ -142,7 +141,7 @@ class TracedField:
 
     Raises:
         ValueError: positions or headings of another shape or not finite.
-        InputError: paths of other devices, or through a material that is not a slab.
+        InputError: paths through a material that is not a slab.
     """
 
     def __init__(
@@ -159,29 +158,19 @@ class TracedField:
         present: Mapping[str, Any] | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
-        if self.tx_pos_m.ndim != 2 or self.tx_pos_m.shape[1] != 3 or not np.isfinite(self.tx_pos_m).all():
-            raise ValueError(f"TracedField: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [n, 3]")
         heading = np.zeros(len(self.tx_pos_m)) if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
         if heading.shape != (len(self.tx_pos_m),) or not np.isfinite(heading).all():
             raise ValueError(f"TracedField: tx_heading_rad has shape {heading.shape}; give finite [n]")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
-        self._prepared, self._present = prepared, present or {}
+        self._shared, self._checks, self._present = prepared or Prepared(scene), prepared is None, present or {}
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
         self._stated_hz = float(scene.frequency[0])
         self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
         self.searches = 0
-        self.surfaces: Surfaces = prepared.surfaces if prepared else scene_surfaces(scene)
+        self.surfaces: Surfaces = self._shared.surfaces
         here = receiver.position_m if searched_at_m is None else searched_at_m
-        if traced is not None and not (
-            _placed_as(self.tx_pos_m, traced.tx_pos_m)
-            and _placed_as(here[None], np.stack([device.position_m for device in traced.receivers]))
-        ):
-            n, m = len(traced.tx_pos_m), len(traced.receivers)
-            text = f"paths of {n} transmitters to {m} receivers, not of these {len(self.tx_pos_m)} to {receiver.name}"
-            raise InputError(f"{text}; trace these")
-        kind = options.materials
-        self._set_tables(prepared.tables(kind) if prepared else SceneTables.of(scene, self.surfaces, kind))
+        self._set_tables(self._shared.tables(options.materials))
         if traced is None:
             self.search(here)
         else:
@@ -208,13 +197,8 @@ class TracedField:
 
     @property
     def gain_name(self) -> str:
-        """Name of the parameter [2]: logarithm of the instrument's amplitude, and its phase in rad."""
+        """See `wrf_mi.tracing.instrument_parameters.gain_name`."""
         return gain_name(self.receiver)
-
-    @property
-    def pattern_name(self) -> str:
-        """Name of the parameter [2, c] of the receiver's pattern, see `wrf_mi.tracing.pattern_parameters`."""
-        return pattern_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
@@ -225,18 +209,14 @@ class TracedField:
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
-        values = self.slabs.parameters(self.options.thickness, self.options.exponent)
-        values |= instrument_parameters(self.receiver, self.options.gain, self.options.pattern_degree)
+        values = self.slabs.parameters(self.options.constants)
+        values |= instrument_parameters(self.receiver, self.options.pattern_degree)
         if self.options.planes:
             values |= self._planes.parameters()
         return values
 
     def refresh(self, parameters: Mapping[str, Any]) -> bool:
-        """Search for paths again if the receiver is too far from the position of the last search.
-
-        Returns:
-            Whether paths were searched.
-        """
+        """Search for paths again if the receiver is too far from the position of the last search; whether it was."""
         here = moved_m(self.receiver, parameters)
         if not needs_search(here, self.searched_at_m, self.frequency_hz):
             return False
@@ -264,28 +244,28 @@ class TracedField:
             batch, each = dr.width(entries), 1
         if chosen is not None:
             chains = chains.select(chosen)
-        chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
-        tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
-        pose = spread_pose(receiver_pose(self.receiver, parameters, Float64), batch * each)
-        antennas = self.receiver.antenna, self.options.tx_antenna
-        paths = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
+        paths = self._evaluated(chains, parameters)
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
         dr.eval(paths)
-        amplitude, phase = Float64(np.log(self.options.gain)), Float64(0)
+        gain, length_m, departure, arrival = paths
         if self.gain_name in parameters:
             amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
-        sine, cosine = dr.sincos(phase)
-        gain = times(paths.gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
-        for name, direction in ((self.pattern_name, paths.arrival), (TX_PATTERN, paths.departure)):
+            sine, cosine = dr.sincos(phase)
+            gain = times(gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
+        for name, direction in ((pattern_name(self.receiver), arrival), (TX_PATTERN, departure)):
             if name in parameters:
                 gain = times(gain, pattern_factor(parameters[name], direction))
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
-        return TracedPaths(gain, paths.length_m, paths.arrival, batch, each)
+        return TracedPaths(gain, length_m, arrival, batch, each)
 
-    def pose(self, parameters: Mapping[str, Any], float_type: Any = mi.Float) -> Pose:
-        """Corrected pose of the receiver, for Gaussians."""
-        return receiver_pose(self.receiver, parameters, float_type)
+    def _evaluated(self, chains: Chains, parameters: Mapping[str, Any]) -> EvaluatedPaths:
+        """Paths with the given parameters but those of antennas and gain."""
+        chains = replace(chains, levels=self._planes.move(chains.levels, parameters))
+        tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
+        pose = spread_pose(receiver_pose(self.receiver, parameters, Float64), dr.width(chains.exists))
+        antennas = self.receiver.antenna, self.options.tx_antenna
+        return evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
 
     def statistics(self, parameters: Mapping[str, Any]) -> PathStatistics:
         """Statistics of each transmitter's paths with the given parameters but the instrument's gain."""
@@ -296,11 +276,6 @@ class TracedField:
         world = np.stack([part.numpy() for part in arrival], axis=-1) @ self.receiver.to_world.T
         transmitter = np.repeat(np.arange(len(self)), self._each)
         return PathStatistics.of_paths(transmitter, len(self), power, length_m.numpy(), world)
-
-    @property
-    def interactions(self) -> Interactions:
-        """Points at which paths meet surfaces, as found with the planes as stated."""
-        return self._met
 
     def select(self, tables: SceneTables, planes: IntArray, slabs: IntArray) -> TracedField:
         """The same paths with parameters of some planes and materials alone, all those that paths meet among them.
@@ -320,20 +295,14 @@ class TracedField:
         """Let Gaussians on the surfaces change paths, by the parameter `wrf_mi.tracing.options.FACTOR`."""
         self._gaussians = gaussians
         count = len(self) * self._each
-        self._weights = PathWeights.of(gaussians, self._met, self._path_of_met, count)
+        self._weights = PathWeights.of(gaussians, self.interactions, self._path_of_met, count)
 
     def search(self, here_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
+        how: dict[str, Any] = {"prepared": self._shared, "tx_antenna": self.options.tx_antenna}
         receiver = replace(self.receiver, position_m=here_m)
         found = trace_paths(
-            self.scene,
-            self.tx_pos_m,
-            receiver,
-            self.options.trace,
-            prepared=self._prepared,
-            tx_antenna=self.options.tx_antenna,
-            check=self._prepared is None,
-            gains=False,
+            self.scene, self.tx_pos_m, receiver, self.options.trace, check=self._checks, gains=False, **how
         )
         self._take(found, here_m)
         self.searches += 1
@@ -359,7 +328,7 @@ class TracedField:
         self._each, self.searched_at_m = each, np.array(here_m, float)
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
-        self._met = Interactions(vertices_m[met], normal)
+        self.interactions = Interactions(vertices_m[met], normal)
         self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
         if self._gaussians is not None:
             self.attach(self._gaussians)
@@ -378,19 +347,11 @@ class TracedField:
         return [*self.tx_pos_m[tx].T, np.cos(heading), np.sin(heading)]
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
-        """Amplitudes of paths, with the present parameters.
-
-        Raises:
-            InputError: one that is not a number.
-        """
+        """Amplitudes of paths, with the present parameters."""
         if not dr.width(chains.exists):
             return np.zeros(0)
-        pose = spread_pose(receiver_pose(self.receiver, self._present, Float64), dr.width(chains.exists))
-        tables = self.slabs.tables(self._present, self._constants, self.frequency_hz / self._stated_hz)
-        antennas = self.receiver.antenna, self.options.tx_antenna
         with dr.suspend_grad():
-            chains = replace(chains, levels=self._planes.move(chains.levels, self._present))
-            real, imaginary = evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas).gain
+            real, imaginary = self._evaluated(chains, self._present)[0]
             power = real * real + imaginary * imaginary
         amplitude: FloatArray = np.sqrt(power.numpy())
         if not np.isfinite(amplitude).all():
@@ -411,8 +372,3 @@ class TracedField:
 def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
     """Whether a receiver is further than a quarter of a wavelength from where paths were searched, both [3], metres."""
     return bool(np.linalg.norm(here_m - searched_at_m) > speed_of_light / frequency_hz / 4)
-
-
-def _placed_as(stated_m: FloatArray, traced_m: FloatArray) -> bool:
-    """Whether positions of a trace [n, 3] are those of stated antennas, which the trace may have moved by 1 cm."""
-    return stated_m.shape == traced_m.shape and np.allclose(stated_m, traced_m, rtol=0, atol=2 * BEHIND_M)

@@ -31,8 +31,6 @@ class RayTracer:
 
     Attributes:
         scene: the ``sionna.rt.Scene``, at the instrument's carrier.
-        instrument: receivers and their reports.
-        options: kinds of path, depth, rays.
 
     Raises:
         InputError: a scene that cannot be opened.

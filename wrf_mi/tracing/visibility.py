@@ -139,15 +139,10 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
 
 
 def clusters(vertices_m: FloatArray, plane: IntArray, apart_m: float) -> IntArray:
-    """Number of reflections at the end of each leg that no distance tells apart, `MOST_CLUSTERED` at most.
+    """Number of reflections at the end of each leg [n, b + 1] that no distance tells apart, `MOST_CLUSTERED` at most.
 
-    Args:
-        vertices_m: see `unobstructed`, [n, b + 2, 3].
-        plane: plane of each reflection [n, b], -1 beyond the last.
-        apart_m: distance above which rays tell points of reflection apart, metres.
-
-    Returns:
-        Shape [n, b + 1]; 0 for the leg that ends at the target.
+    0 for the leg that ends at the target. For vertices and planes as of `unobstructed`; rays tell points apart that are
+    more than ``apart_m`` from each other.
     """
     number = (plane >= 0).astype(np.int64)
     for level in reversed(range(plane.shape[1] - 1)):
