@@ -14,7 +14,7 @@ import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ LEAST_SHARE = 1e-3
 class PowerMap:
     """Local mean of traced power on a grid [n_rx, x, y, z], dBm for 0 dBm sent; one layer serves all heights."""
 
+    exact: ClassVar[Literal[False]] = False
     x_m: FloatArray
     y_m: FloatArray
     z_m: FloatArray
@@ -78,6 +79,8 @@ class TracedPower:
     def know(self, position_m: FloatArray, traced_dbm: FloatArray) -> None:
         """Keep powers [n_rx, k] at positions [k, 3], as of `traced_dbm`."""
         self._known |= {row.tobytes(): power for row, power in zip(position_m, traced_dbm.T, strict=True)}
+
+    exact: ClassVar[Literal[True]] = True
 
     @property
     def power_dbm(self) -> FloatArray:

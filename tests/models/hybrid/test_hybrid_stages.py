@@ -27,6 +27,8 @@ TRACE = TraceOptions(max_depth=2, rays=1 << 12)
 QUICK = ("steps=60",)
 FLOAT32_GREY = 1e-4
 """Of greys that a batch of transmitters and a single one give: sums in single precision."""
+CLEAR_DB = 0.3
+"""Of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows."""
 CLEAR_GREY = 0.05
 """Gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows."""
 
@@ -131,8 +133,16 @@ def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str
     assert names[0] == "mean"
     assert names[-1] == "residual"
     assert ("field" in names) == (task == "csi")  # powers of uncertain positions have none
-    if task == "rssi":  # traced at exact positions in a scene that is close to the true one
-        assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
+    again = wrf_mi.open_run(run.folder, record)
+    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
+
+
+def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, Path], tmp_path: Path) -> None:
+    """Local means are off by the ripple of two paths and more, 1 to 3 dB at 920 MHz."""
+    record, split = measured(scenes, "rssi")
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["true"], split=split)
+    assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
+    assert run.metrics["abs_error_db"]["median"] < CLEAR_DB
     again = wrf_mi.open_run(run.folder, record)
     assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
 

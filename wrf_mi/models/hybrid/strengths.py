@@ -37,6 +37,8 @@ SPACING_M, SMOOTH_M = 0.25, 0.3
 REACH = STRENGTHS.depth, STRENGTHS.reflections
 """Interactions of a path at most, and reflections among them."""
 DEFAULT = StrengthSettings()
+SEARCH_ROWS = 30
+"""Least number of rows by which hyperparameters about an exact mean are searched."""
 NEVER = 2**31
 """`StrengthSettings.search_rows` above any number of rows."""
 
@@ -124,7 +126,9 @@ def _chosen(
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
         exact = _traced(problem)
         mean = exact if scores(problem, exact).mean() > best.mean() else None
-    fitted = fit_fold(_with(DEFAULT, mean), problem, fold, labelled(session, "held-out rows"))[0]
+    # Hyperparameters start from those of fading, which an exact mean has not.
+    settings = DEFAULT if mean is None else StrengthSettings(search_rows=SEARCH_ROWS)
+    fitted = fit_fold(_with(settings, mean), problem, fold, labelled(session, "held-out rows"))[0]
     assert isinstance(fitted, FittedStrengths)
     hyperparameters = asdict(fitted.strengths.field.hyperparameters)
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}

@@ -156,8 +156,8 @@ class Strengths(Fitted):
             **field_arrays(field.hyperparameters, "knob."),
         }
         if prior.traced is not None:
-            arrays |= field_arrays(getattr(prior.traced, "local", prior.traced), "map.")
-            if hasattr(prior.traced, "traced_dbm"):
+            arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
+            if prior.traced.exact:
                 arrays["exact.traced_dbm"] = prior.traced.traced_dbm(stops.poses.position_m)
         return {name: np.asarray(value) for name, value in arrays.items()}
 
@@ -240,7 +240,9 @@ def fit_strengths(
         return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
 
     ratio, widen = np.ones((2, len(values)))
-    shift, facts = SKEW_DB, {"rows": float(len(rows))}
+    # Traces at exact positions have no fades left in what they do not predict.
+    skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
+    shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
         if len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(join, factor=WIDER))
@@ -253,7 +255,7 @@ def fit_strengths(
         on_progress("strengths: held-out rows", 0.8)
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
         residual = values - mean
-        shift, ratio = shift_of(residual, SKEW_DB), fit.ratio
+        shift, ratio = shift_of(residual, skew_db), fit.ratio
         widen = widening(residual - shift, std)
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
