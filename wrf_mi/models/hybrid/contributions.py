@@ -17,6 +17,9 @@ from ..model import Fitted, Inputs, PredictAll, Problem
 from .paths import FittedPaths
 from .scene_side import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, SceneSide
 
+OFFSET_ROWS = 400
+"""Most training rows whose traces tell the offset of a receiver."""
+
 
 def by_stage(problem: Problem, split: Split, side: SceneSide, kept: Collection[str]) -> dict[str, PredictAll]:
     """Predictions of the stages up to each but the last.
@@ -58,7 +61,8 @@ def _traced(problem: Problem, split: Split) -> PredictAll:
     tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
     offsets = None
     if task_of(record).in_decibel:
-        rows = split.all_train
+        every = split.all_train
+        rows = every[:: -(-len(every) // OFFSET_ROWS)]
         offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])
 
     def predict(inputs: Inputs) -> NDArray[np.generic]:

@@ -17,13 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ...parallel.threads import on_threads
 from ...tasks.scores import REAL_90
 from .kriging_equations import KrigingSystem
 from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
@@ -31,9 +32,12 @@ from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
 
+Result = TypeVar("Result")
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
 
+THREADED_ROWS = 1000
+"""Rows of all receivers from which these are computed on threads."""
 JITTER = 1e-9
 """Noise added to coincident inputs, as a share of the field's variance."""
 DEGREES = 4.0
@@ -57,6 +61,11 @@ RATIO = (0.5, 2.0)
 """Bounds of the ratio of a receiver's noise to that of all."""
 COVERED = 0.9
 """Share of residuals that calibrated intervals cover."""
+
+
+def _of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:
+    """Results of ``work(part)``, on threads where so many rows take longer than to start these."""
+    return on_threads(work, parts) if rows > THREADED_ROWS else [work(part) for part in parts]
 
 
 @dataclass(frozen=True)
@@ -90,7 +99,11 @@ class PooledProcess:
 
     def _solve(self, parts: Sequence[Part]) -> None:
         kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
-        self._systems = [KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis) for p in parts]
+
+        def system(p: Part) -> KrigingSystem:
+            return KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis)
+
+        self._systems = _of_each(system, parts, sum(len(p.value) for p in parts))
         pairs = list(zip(self._systems, parts, strict=True))
         self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
@@ -112,13 +125,16 @@ class PooledProcess:
         The expected squared residual, posterior variance of the field included, is compared with the squared scale
         ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
         """
-        parts = []
-        for part, system, weights, scale in zip(self._parts, self._systems, self._weights, variance, strict=True):
+
+        def reweighted(receiver: int) -> Part:
+            part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
+            scale = variance[receiver]
             precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
             residual = part.variance * weights
             square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
-            parts.append(replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1)))
-        return parts
+            return replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1))
+
+        return _of_each(reweighted, range(len(variance)), sum(len(scale) for scale in variance))
 
 
 @dataclass(frozen=True)
@@ -215,11 +231,18 @@ class Fit:
         std = mean.copy()
         for stops, out in self._folds:
             field = Field(self._prior, hyperparameters, self.ratio, stops, rounds)
-            for receiver in range(len(mean)):
-                received = out[np.isfinite(self._measured.value_dbm[receiver, out])]
-                if len(received):
-                    value, variance = field.predict(self._measured.poses.take(received), receiver)
-                    mean[receiver, received], std[receiver, received] = value, np.sqrt(variance)
+            received = [out[np.isfinite(values[out])] for values in self._measured.value_dbm]
+            if self._prior.traced is not None and self._prior.traced.exact:
+                self._prior.traced.traced_dbm(self._measured.poses.take(out).position_m)  # traced here, not on threads
+
+            def predicted(
+                receiver: int, field: Field = field, received: list[IntArray] = received
+            ) -> tuple[FloatArray, FloatArray]:
+                return field.predict(self._measured.poses.take(received[receiver]), receiver)
+
+            found = _of_each(predicted, range(len(mean)), sum(map(len, received)))
+            for receiver, (value, variance) in enumerate(found):
+                mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(variance)
         return mean, std
 
     def _residual(self, hyperparameters: Hyperparameters) -> FloatArray:
