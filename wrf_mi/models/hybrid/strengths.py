@@ -27,7 +27,7 @@ from ...tracing.polarization import check_polarization
 from ...tracing.power_map import PowerMap, TracedPower, power_tracer, trace_map
 from ...tracing.solve import Prepared
 from .. import MODELS
-from ..held_out import HeldOut, fit_fold, held_out_predictions, hold_out, labelled
+from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
 from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, inside, write_reports
@@ -39,6 +39,8 @@ REACH = STRENGTHS.depth, STRENGTHS.reflections
 DEFAULT = StrengthSettings()
 SEARCH_ROWS = 30
 """Least number of rows by which hyperparameters about an exact mean are searched."""
+HELD = "held"
+"""Folder of the predictions of held-out rows."""
 NEVER = 2**31
 """`StrengthSettings.search_rows` above any number of rows."""
 
@@ -89,12 +91,11 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
             inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
             write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
             shutil.rmtree(session.folder / SCENE)
-        settings = StrengthSettings(**choice["hyperparameters"], search_rows=NEVER)
         mean = _traced(inner) if choice["exact"] else None
-        entry, place = _with(settings, mean), inside(session, "held")
-        unseen = held_out_predictions(entry, inner, fold, held, place, "paths")
+        # The search goes on from what was found without the held-out rows.
+        settings = replace(_searched(mean), **choice["hyperparameters"])
         fitted = fit_in_scene(inner, split, session, settings, mean)
-        fitted.unseen = unseen
+        fitted.unseen = held_out_predictions(IN_SCENE, inner, fold, held, inside(session, HELD), "paths")
     fitted.stages = tuple(reports)
     return fitted
 
@@ -126,12 +127,21 @@ def _chosen(
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
         exact = _traced(problem)
         mean = exact if scores(problem, exact).mean() > best.mean() else None
-    # Hyperparameters start from those of fading, which an exact mean has not.
-    settings = DEFAULT if mean is None else StrengthSettings(search_rows=SEARCH_ROWS)
-    fitted = fit_fold(_with(settings, mean), problem, fold, labelled(session, "held-out rows"))[0]
-    assert isinstance(fitted, FittedStrengths)
-    hyperparameters = asdict(fitted.strengths.field.hyperparameters)
+    fits: list[FittedStrengths] = []
+
+    def fit_kept(problem: Problem, split: Split, session: Session) -> FittedStrengths:
+        fits.append(fit_in_scene(problem, split, session, _searched(mean), mean))
+        return fits[-1]
+
+    shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
+    held_out_predictions(replace(IN_SCENE, fit=fit_kept), problem, fold, held, inside(session, HELD), "paths")
+    hyperparameters = asdict(fits[0].strengths.field.hyperparameters)
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
+
+
+def _searched(mean: TracedPower | None) -> StrengthSettings:
+    """Settings of a search: it starts from hyperparameters of fading, which an exact mean has not."""
+    return DEFAULT if mean is None else StrengthSettings(search_rows=SEARCH_ROWS)
 
 
 def _traced(problem: Problem) -> TracedPower:
