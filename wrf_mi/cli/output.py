@@ -56,7 +56,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         print(f"{share}, CRPS {metrics['crps']:.3g}")
     print(
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
-        f"{metrics['ms_per_sample']:.2g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
+        f"{metrics['ms_per_sample']:.3g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
     )
     if line := unbeaten(metrics):
         print(line)
@@ -70,7 +70,7 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
     if not reports:
         return
     scores = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f")
-    columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".2g")
+    columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".3g")
     print(f"{'stage, mean ' + label:<24}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for one in reports:
         cells = [f"{one[key]:{form}}" if one.get(key) is not None else "" for key, _, form in columns]

@@ -127,7 +127,8 @@ def correct_scene(
     options = options or default_options(record)
     if task.in_decibel and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
-    split = _at_most(split, options.rows)
+    # An image of each receiver and row has some hundred values: as many images as one receiver's rows tell as much.
+    split = _at_most(split, max(1, options.rows // (len(record.receivers) if task.image else 1)))
     carrier_hz = scene_carrier(record, split.all_train)
     completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
     with completed as (place, boxes):

@@ -51,7 +51,8 @@ class CorrectionOptions(CheckedSettings):
         parts: parts that may change, of `PARTS`.
         depth: largest number of interactions of a path, transmissions included.
         reflections: largest number of reflections among them.
-        rows: most training rows that are compared; of more, a random subset, seeded by the split.
+        rows: most training rows that are compared, of images over all receivers; of more, a random subset, seeded by
+            the split.
         rays: number of rays that search from each receiver.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
         steps: largest number of least-squares steps.

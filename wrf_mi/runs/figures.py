@@ -252,13 +252,14 @@ def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = 
         where, scores = [order.index(one["stage"]) for one in left], [one["held_out"] for one in left]
         axes.scatter(where, scores, facecolors="none", edgecolors=color, zorder=3)
         for one in reports:
-            costs = [f"{one[key]:.2g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if one.get(key)]
+            costs = [f"{one[key]:.3g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if one.get(key)]
             score = one["held_out"] if one["held_out"] is not None else one.get("test")
             if costs and score is not None:
                 at = order.index(one["stage"]), score
                 text = ", ".join(costs)
                 axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
     axes.set_xticks(range(len(order)), order)
+    axes.set_xlim(-0.2, len(order) - 0.5)  # the last label lies beside its point
     axes.set_ylabel(f"mean {label}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
