@@ -40,6 +40,13 @@ def test_traced_power_asks_for_each_position_once_and_falls_back_to_the_local_me
     np.testing.assert_allclose(power(where[::-1], 1), [-70.0, -1.0])
     np.testing.assert_allclose(power.at(receivers[:1])(where, 0), [-1.0, -70.0])
     assert asked == [2]
+    predicted, other = power.at(receivers).of_predictions(where[:1]), where[1:]
+    for receiver in (0, 1):
+        np.testing.assert_allclose(predicted(where[:1], receiver), [(-1.0, -0.5)[receiver]])
+    assert asked == [2]
+    for receiver in (0, 1, 1):  # the last one is a prediction anew, and not from memory
+        np.testing.assert_allclose(predicted(other, receiver), [(-70.0, -1.5)[receiver]])
+    assert asked == [2, 1, 1]
 
 
 def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -219,14 +219,14 @@ def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: d
     They are the mean score of test rows and the milliseconds of a prediction by the stages up to each; of many test
     rows `MOST_OF_STAGES`, evenly spaced, are scored.
     """
-    predictions = part.fitted.by_stage(part.split)
-    if not predictions:
+    reports = [dict(one) for one in part.fitted.facts().get("stages", [])]
+    kept = [one for one in reports if one["kept"]]
+    if not kept:
         return {}
+    predictions = part.fitted.by_stage(part.split)
     task, rows = TASKS[record.task], arrays["row"]
     some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
     truth = arrays["truth"][:, some]
-    reports = [dict(one) for one in part.fitted.facts()["stages"]]
-    kept = [one for one in reports if one["kept"]]
     for one in kept:
         if one["stage"] in predictions:
             predict = predictions[one["stage"]]

@@ -38,8 +38,6 @@ MOST_POINTS = 6000
 """Most traced positions; the grid becomes wider for larger scenes."""
 LAYER_M = 0.5
 """Greatest distance of the grid's layers over the transmitter's heights."""
-MOST_KNOWN = 50_000
-"""Positions whose traced power is kept in memory: 6 MB for 16 receivers."""
 SAME_HEIGHT_M = 0.02
 LEAST_SHARE = 1e-3
 """Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
@@ -72,15 +70,18 @@ class TracedPower:
         names: names of the receivers.
     """
 
+    exact: ClassVar[Literal[True]] = True
+
     def __init__(self, local: PowerMap, trace: Callable[[FloatArray], FloatArray], names: Sequence[str] = ()) -> None:
         self.local, self._trace, self._names = local, trace, tuple(names)
+        self._unkept = trace  # without what another one keeps
         self._known: dict[bytes, FloatArray] = {}
+        self._keeps = True
+        self._last: tuple[FloatArray, FloatArray, set[int]] | None = None
 
     def know(self, position_m: FloatArray, traced_dbm: FloatArray) -> None:
         """Keep powers [n_rx, k] at positions [k, 3], as of `traced_dbm`."""
         self._known |= {row.tobytes(): power for row, power in zip(position_m, traced_dbm.T, strict=True)}
-
-    exact: ClassVar[Literal[True]] = True
 
     @property
     def power_dbm(self) -> FloatArray:
@@ -88,27 +89,41 @@ class TracedPower:
         return self.local.power_dbm
 
     def traced_dbm(self, position_m: FloatArray) -> FloatArray:
-        """Power [n_rx, m] at positions [m, 3], each traced once for all receivers."""
+        """Power [n_rx, m] at positions [m, 3], each traced once for all receivers and kept for further fits."""
         keys = [row.tobytes() for row in position_m]
         new = [place for place, key in enumerate(keys) if key not in self._known]
-        if new:
-            if len(self._known) > MOST_KNOWN:
-                self._known = {key: self._known[key] for key in keys if key in self._known}
-            self.know(position_m[new], self._trace(position_m[new]))
-        return np.stack([self._known[key] for key in keys], axis=1)
+        power = dict(zip([keys[place] for place in new], self._trace(position_m[new]).T, strict=True)) if new else {}
+        if self._keeps:
+            self._known |= power
+        known = self._known | power
+        return np.stack([known[key] for key in keys], axis=1)
 
     def __call__(self, position_m: FloatArray, receiver: int) -> FloatArray:
         """Power in dBm at positions [m, 3]."""
         if not len(position_m):
             return np.zeros(0)
-        traced = self.traced_dbm(np.ascontiguousarray(position_m))[receiver]
+        # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
+        last = None if self._keeps else self._last
+        if last is None or receiver in last[2] or not np.array_equal(last[0], position_m):
+            last = position_m, self.traced_dbm(np.ascontiguousarray(position_m)), set()
+        last[2].add(receiver)
+        self._last, traced = last, last[1][receiver]
         return np.where(np.isnan(traced), self.local(position_m, receiver), traced)
+
+    def of_predictions(self, position_m: FloatArray) -> TracedPower:
+        """The power for predictions, which keeps nothing but what is known at some positions [k, 3]."""
+        other = TracedPower(self.local, self._unkept, self._names)
+        other.know(position_m, self.traced_dbm(position_m))
+        other._keeps = False
+        return other
 
     def at(self, receivers: Sequence[Receiver]) -> TracedPower:
         """The power at some of the receivers."""
         some = [self._names.index(receiver.name) for receiver in receivers]
         local = replace(self.local, power_dbm=self.local.power_dbm[some])
-        return TracedPower(local, lambda position_m: self.traced_dbm(position_m)[some])
+        part = TracedPower(local, lambda position_m: self.traced_dbm(position_m)[some])
+        part._unkept = lambda position_m: self._unkept(position_m)[some]
+        return part
 
 
 Traced = PowerMap | TracedPower

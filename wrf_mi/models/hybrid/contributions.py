@@ -31,16 +31,16 @@ def by_stage(problem: Problem, split: Split, side: SceneSide, kept: Collection[s
         kept: stages that are used.
     """
     predictions: dict[str, PredictAll] = {}
-    if MEAN in kept:
+    earlier = [stage for stage in STAGES if stage in kept][:-1]
+    if MEAN in earlier:
         predictions[MEAN] = _traced(problem, split)
     if side.problem.scene != problem.scene:
-        predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in kept}
+        predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
     if isinstance(side, FittedPaths):
-        if SURFACES in kept:
+        if SURFACES in earlier:
             predictions[SURFACES] = _of_all(side.graph.without_gaussians() if FIELD in kept else side)
-        if FIELD in kept:
+        if FIELD in earlier:
             predictions[FIELD] = _of_all(side)
-    predictions.pop([stage for stage in STAGES if stage in kept][-1], None)
     return predictions
 
 

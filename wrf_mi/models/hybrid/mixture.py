@@ -52,7 +52,7 @@ def averaged(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: Int
     Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
     """
     scores = [score(np.broadcast_to(one, (len(rows), count)), rows) for one in np.eye(count)]
-    means = [_means(values, unit[rows]) for values in scores]
+    means = [unit_means(values, unit[rows]) for values in scores]
     best = max(means, key=np.mean)
     alike = np.array([not improves(best, one, True, DOUBT) for one in means])
     return constant(_selected(score, rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
@@ -121,12 +121,12 @@ def choose(
     best = next(iter(forms))
     for name in forms:
         errors = DOUBT if best == SINGLE else 1.0
-        if improves(_means(found[name], unit), _means(found[best], unit), True, errors):
+        if improves(unit_means(found[name], unit), unit_means(found[best], unit), True, errors):
             best = name
     return best, forms[best](score, distance_m, unit, every, count)
 
 
-def _means(values: FloatArray, unit: IntArray) -> FloatArray:
+def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
     """Mean value of each unit."""
     _, number = np.unique(unit, return_inverse=True)
     return np.asarray(np.bincount(number, values) / np.bincount(number))

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from .. import MODELS
 from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
+from .mixture import unit_means
 from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
@@ -105,28 +106,27 @@ def _chosen(
 ) -> dict[str, Any]:
     """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
     record = stated.record
-    _, unit = np.unique(held.receiver if split.held_receivers else held.row, return_inverse=True)
+    unit = held.receiver if split.held_receivers else held.row
 
-    def scores(problem: Problem, mean: TracedPower | None = None) -> FloatArray:
+    def score(problem: Problem, mean: TracedPower | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
         entry, place = _with(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
         means = held_out_predictions(entry, problem, fold, held, place, "mean").mean
         shutil.rmtree(place.folder)
         of_row = task_of(record).mixtures(means[None], held.observed(record))
-        values = of_row(np.ones((len(held), 1)), np.arange(len(held)))
-        return np.asarray(np.bincount(unit, values) / np.bincount(unit))
+        return float(unit_means(of_row(np.ones((len(held), 1)), np.arange(len(held))), unit).mean())
 
-    problem, best = inner, scores(inner)
+    problem, best = inner, score(inner)
     if inner is not stated:
         # The correction has gained as a trace, but may add nothing to kriging, which knows the level around each row.
-        before = scores(stated)
-        if before.mean() >= best.mean():
+        before = score(stated)
+        if before >= best:
             problem, best = stated, before
     mean = None
     if record.tx_heading_rad is None:
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
         exact = _traced(problem)
-        mean = exact if scores(problem, exact).mean() > best.mean() else None
+        mean = exact if score(problem, exact) > best else None
     fits: list[FittedStrengths] = []
 
     def fit_kept(problem: Problem, split: Split, session: Session) -> FittedStrengths:
@@ -165,17 +165,22 @@ def fit_in_scene(
     session.report("tracing a map", 0.0)
     record = problem.record
     power = _local_mean(problem) if mean is None else mean.at(record.receivers)
-    return FittedStrengths(fit_strengths(record, problem.rows(split), power, settings, session.report), problem)
+    fitted = fit_strengths(record, problem.rows(split), power, settings, session.report)
+    if power.exact:
+        field = fitted.field
+        field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))
+    return FittedStrengths(fitted, problem)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
     """The kriging that `FittedStrengths.arrays` described."""
     inner = in_scene(problem, folder)
 
-    def trace(position_m: FloatArray) -> FloatArray:
-        return power_tracer(inner.opened_scene, inner.record, *REACH)(position_m)
+    @cache
+    def tracer() -> Callable[[FloatArray], FloatArray]:  # the scene is opened where something is traced
+        return power_tracer(inner.opened_scene, inner.record, *REACH)
 
-    return FittedStrengths(Strengths.from_arrays(arrays, trace), inner)
+    return FittedStrengths(Strengths.from_arrays(arrays, lambda position_m: tracer()(position_m)), inner)
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:

@@ -171,8 +171,10 @@ class Strengths(Fitted):
             traced = from_field_arrays(PowerMap, arrays, "map.")
             if "exact.traced_dbm" in arrays:
                 assert trace is not None
+                positions_m = arrays["stop.position_m"]
                 traced = TracedPower(traced, trace)
-                traced.know(arrays["stop.position_m"], arrays["exact.traced_dbm"])
+                traced.know(positions_m, arrays["exact.traced_dbm"])
+                traced = traced.of_predictions(positions_m)
         transmit_dbm, frequency_hz = map(float, arrays["base"])
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
