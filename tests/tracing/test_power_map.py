@@ -26,27 +26,27 @@ def test_map_is_linear_between_its_points() -> None:
 def test_traced_power_asks_for_each_position_once_and_falls_back_to_the_local_mean() -> None:
     axis = np.array([0.0, 2.0])
     local = PowerMap(axis, axis, np.array([1.0]), np.stack([np.full((2, 2, 1), -50.0), np.full((2, 2, 1), -70.0)]))
-    asked: list[int] = []
+    asked: list[tuple[int, int]] = []
 
-    def trace(position_m: np.ndarray) -> np.ndarray:
-        asked.append(len(position_m))
+    def trace(position_m: np.ndarray, places: np.ndarray | None) -> np.ndarray:
         power = np.stack([-position_m[:, 0], -2 * position_m[:, 0]])
         power[1, position_m[:, 1] > 1] = np.nan  # without a path
+        power = power if places is None else power[places]
+        asked.append(power.shape)
         return power
 
-    power, where = TracedPower(local, trace, ["r0", "r1"]), np.array([[0.5, 0.0, 1.0], [1.5, 2.0, 1.0]])
-    receivers = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in ("r1", "r0")]
+    power, where = TracedPower(local, trace, np.arange(2), {}), np.array([[0.5, 0.0, 1.0], [1.5, 2.0, 1.0]])
     np.testing.assert_allclose(power(where, 0), [-0.5, -1.5])
     np.testing.assert_allclose(power(where[::-1], 1), [-70.0, -1.0])
-    np.testing.assert_allclose(power.at(receivers[:1])(where, 0), [-1.0, -70.0])
-    assert asked == [2]
-    predicted, other = power.at(receivers).of_predictions(where[:1]), where[1:]
+    np.testing.assert_allclose(power.at(np.array([1]))(where, 0), [-1.0, -70.0])
+    assert asked == [(2, 2)]
+    predicted = power.at(np.array([1, 0])).of_predictions(where[:1])
     for receiver in (0, 1):
         np.testing.assert_allclose(predicted(where[:1], receiver), [(-1.0, -0.5)[receiver]])
-    assert asked == [2]
-    for receiver in (0, 1, 1):  # the last one is a prediction anew, and not from memory
-        np.testing.assert_allclose(predicted(other, receiver), [(-70.0, -1.5)[receiver]])
-    assert asked == [2, 1, 1]
+    assert asked == [(2, 2)]
+    for receiver in (0, 1, 1):  # each time anew, and for this receiver alone
+        np.testing.assert_allclose(predicted(where, receiver), [(-1.0, -70.0), (-0.5, -1.5)][receiver])
+    assert asked == [(2, 2), (1, 1), (1, 1), (1, 1)]
 
 
 def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -25,6 +25,7 @@ from ..core import Antenna, InputError, Receiver, Record, receiver_arrays
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
+from ..core.types import IntArray
 from ..datasets import user_cache
 from ..receivers import rssi_dbm
 from .devices import solid_around
@@ -61,27 +62,28 @@ class PowerMap:
         return np.asarray(grid(np.stack(inside, axis=-1)))
 
 
+Tracer = Callable[[FloatArray, IntArray | None], FloatArray]
+"""Power [k, m] in dBm at positions [m, 3] of k receivers, by their places, or of all; NaN: the local mean is better."""
+
+
 class TracedPower:
     """Power traced at each position itself, and the local mean where no path arrives and inside solids.
 
     Args:
-        local: local means.
-        trace: ``trace(position_m)``: power [n_rx, m] in dBm at positions [m, 3], NaN where the local mean is asked for.
-        names: names of the receivers.
+        local: local means at n_rx receivers.
+        trace: tracer.
+        places: places of these receivers among those of the tracer [n_rx].
+        known: powers at all receivers of the tracer by position.
+        keeps: whether a new position is traced for all receivers and kept, as further fits ask for it again; otherwise
+            it is traced for the receiver that is asked for.
     """
 
     exact: ClassVar[Literal[True]] = True
 
-    def __init__(self, local: PowerMap, trace: Callable[[FloatArray], FloatArray], names: Sequence[str] = ()) -> None:
-        self.local, self._trace, self._names = local, trace, tuple(names)
-        self._unkept = trace  # without what another one keeps
-        self._known: dict[bytes, FloatArray] = {}
-        self._keeps = True
-        self._last: tuple[FloatArray, FloatArray, set[int]] | None = None
-
-    def know(self, position_m: FloatArray, traced_dbm: FloatArray) -> None:
-        """Keep powers [n_rx, k] at positions [k, 3], as of `traced_dbm`."""
-        self._known |= {row.tobytes(): power for row, power in zip(position_m, traced_dbm.T, strict=True)}
+    def __init__(
+        self, local: PowerMap, trace: Tracer, places: IntArray, known: dict[bytes, FloatArray], keeps: bool = True
+    ) -> None:
+        self.local, self._trace, self._places, self._known, self._keeps = local, trace, places, known, keeps
 
     @property
     def power_dbm(self) -> FloatArray:
@@ -89,62 +91,54 @@ class TracedPower:
         return self.local.power_dbm
 
     def traced_dbm(self, position_m: FloatArray) -> FloatArray:
-        """Power [n_rx, m] at positions [m, 3], each traced once for all receivers and kept for further fits."""
+        """Power [n_rx, m] at positions [m, 3], each traced once and kept."""
         keys = [row.tobytes() for row in position_m]
         new = [place for place, key in enumerate(keys) if key not in self._known]
-        power = dict(zip([keys[place] for place in new], self._trace(position_m[new]).T, strict=True)) if new else {}
-        if self._keeps:
-            self._known |= power
-        known = self._known | power
-        return np.stack([known[key] for key in keys], axis=1)
+        if new:
+            traced = self._trace(position_m[new], None).T
+            self._known |= dict(zip([keys[place] for place in new], traced, strict=True))
+        return np.stack([self._known[key][self._places] for key in keys], axis=1)
 
     def __call__(self, position_m: FloatArray, receiver: int) -> FloatArray:
         """Power in dBm at positions [m, 3]."""
         if not len(position_m):
             return np.zeros(0)
-        # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
-        last = None if self._keeps else self._last
-        if last is None or receiver in last[2] or not np.array_equal(last[0], position_m):
-            last = position_m, self.traced_dbm(np.ascontiguousarray(position_m)), set()
-        last[2].add(receiver)
-        self._last, traced = last, last[1][receiver]
-        return np.where(np.isnan(traced), self.local(position_m, receiver), traced)
+        new = np.array([not self._keeps and row.tobytes() not in self._known for row in position_m])
+        power = np.empty(len(position_m))
+        if new.any():
+            power[new] = self._trace(position_m[new], self._places[[receiver]])[0]
+        if not new.all():
+            power[~new] = self.traced_dbm(position_m[~new])[receiver]
+        return np.where(np.isnan(power), self.local(position_m, receiver), power)
 
     def of_predictions(self, position_m: FloatArray) -> TracedPower:
         """The power for predictions, which keeps nothing but what is known at some positions [k, 3]."""
-        other = TracedPower(self.local, self._unkept, self._names)
-        other.know(position_m, self.traced_dbm(position_m))
-        other._keeps = False
-        return other
+        self.traced_dbm(position_m)
+        known = {row.tobytes(): self._known[row.tobytes()] for row in position_m}
+        return TracedPower(self.local, self._trace, self._places, known, keeps=False)
 
-    def at(self, receivers: Sequence[Receiver]) -> TracedPower:
-        """The power at some of the receivers."""
-        some = [self._names.index(receiver.name) for receiver in receivers]
-        local = replace(self.local, power_dbm=self.local.power_dbm[some])
-        part = TracedPower(local, lambda position_m: self.traced_dbm(position_m)[some])
-        part._unkept = lambda position_m: self._unkept(position_m)[some]
-        return part
+    def at(self, places: IntArray) -> TracedPower:
+        """Power at some of the receivers, which shares what is known."""
+        local = replace(self.local, power_dbm=self.local.power_dbm[places])
+        return TracedPower(local, self._trace, self._places[places], self._known, self._keeps)
 
 
 Traced = PowerMap | TracedPower
 """Mean of signal strengths."""
 
 
-def power_tracer(
-    scene: Any, record: Record, max_depth: int, max_reflections: int
-) -> Callable[[FloatArray], FloatArray]:
+def power_tracer(scene: Any, record: Record, max_depth: int, max_reflections: int) -> Tracer:
     """Function of `TracedPower` that traces a scene for a record's receivers."""
     options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
     prepared = Prepared(scene)
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
 
-    def trace(position_m: FloatArray) -> FloatArray:
-        power = np.full((len(record.receivers), len(position_m)), np.nan)
+    def trace(position_m: FloatArray, places: IntArray | None) -> FloatArray:
+        receivers = record.receivers if places is None else [record.receivers[place] for place in places]
+        power = np.full((len(receivers), len(position_m)), np.nan)
         outside = solid_around(prepared.surfaces, position_m) < 0
         if outside.any():
-            power[:, outside] = rssi_dbm(
-                trace_paths(scene, position_m[outside], record.receivers, options, **how).paths
-            )
+            power[:, outside] = rssi_dbm(trace_paths(scene, position_m[outside], receivers, options, **how).paths)
         return power
 
     return trace

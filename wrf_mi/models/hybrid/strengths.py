@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Split
-from ...core.angles import FloatArray
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.files import write_atomically
 from ...correction.options import STRENGTHS
 from ...tasks import task_of
 from ...tracing.polarization import check_polarization
-from ...tracing.power_map import PowerMap, TracedPower, power_tracer, trace_map
+from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ...tracing.solve import Prepared
 from .. import MODELS
 from ..held_out import HeldOut, held_out_predictions, hold_out
@@ -44,6 +43,8 @@ HELD = "held"
 """Folder of the predictions of held-out rows."""
 NEVER = 2**31
 """`StrengthSettings.search_rows` above any number of rows."""
+ExactMean = Callable[[Sequence[Receiver]], TracedPower]
+"""Power at positions themselves for some receivers of a problem; fits share what was traced."""
 
 
 class FittedStrengths(SceneSide):
@@ -108,7 +109,7 @@ def _chosen(
     record = stated.record
     unit = held.receiver if split.held_receivers else held.row
 
-    def score(problem: Problem, mean: TracedPower | None = None) -> float:
+    def score(problem: Problem, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
         entry, place = _with(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
         means = held_out_predictions(entry, problem, fold, held, place, "mean").mean
@@ -139,15 +140,19 @@ def _chosen(
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
 
 
-def _searched(mean: TracedPower | None) -> StrengthSettings:
+def _searched(mean: ExactMean | None) -> StrengthSettings:
     """Settings of a search: it starts from hyperparameters of fading, which an exact mean has not."""
     return DEFAULT if mean is None else StrengthSettings(search_rows=SEARCH_ROWS)
 
 
-def _traced(problem: Problem) -> TracedPower:
-    """Power at positions themselves, which fits of a problem share."""
-    trace = power_tracer(problem.opened_scene, problem.record, *REACH)
-    return TracedPower(_local_mean(problem), trace, names=[receiver.name for receiver in problem.record.receivers])
+def _traced(problem: Problem) -> ExactMean:
+    trace, names = power_tracer(problem.opened_scene, problem.record, *REACH), _names(problem.record.receivers)
+    power = TracedPower(_local_mean(problem), trace, np.arange(len(names)), {})
+    return lambda receivers: power.at(np.array([names.index(name) for name in _names(receivers)]))
+
+
+def _names(receivers: Sequence[Receiver]) -> list[str]:
+    return [receiver.name for receiver in receivers]
 
 
 def _local_mean(problem: Problem) -> PowerMap:
@@ -159,12 +164,12 @@ def fit_in_scene(
     split: Split,
     session: Session,
     settings: StrengthSettings = DEFAULT,
-    mean: TracedPower | None = None,
+    mean: ExactMean | None = None,
 ) -> FittedStrengths:
     """`fit` without the correction, about a mean of all receivers; None: about the local mean."""
     session.report("tracing a map", 0.0)
     record = problem.record
-    power = _local_mean(problem) if mean is None else mean.at(record.receivers)
+    power = _local_mean(problem) if mean is None else mean(record.receivers)
     fitted = fit_strengths(record, problem.rows(split), power, settings, session.report)
     if power.exact:
         field = fitted.field
@@ -177,10 +182,12 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
     inner = in_scene(problem, folder)
 
     @cache
-    def tracer() -> Callable[[FloatArray], FloatArray]:  # the scene is opened where something is traced
+    def tracer() -> Tracer:  # the scene is opened where something is traced
         return power_tracer(inner.opened_scene, inner.record, *REACH)
 
-    return FittedStrengths(Strengths.from_arrays(arrays, lambda position_m: tracer()(position_m)), inner)
+    return FittedStrengths(
+        Strengths.from_arrays(arrays, lambda position_m, places: tracer()(position_m, places)), inner
+    )
 
 
 def check(problem: Problem, splits: Sequence[Split]) -> None:
@@ -210,5 +217,5 @@ IN_SCENE: Model = replace(TRACED_STRENGTHS, fit=fit_in_scene)
 """The same in a scene that is corrected already."""
 
 
-def _with(settings: StrengthSettings, mean: TracedPower | None) -> Model:
+def _with(settings: StrengthSettings, mean: ExactMean | None) -> Model:
     return replace(IN_SCENE, fit=partial(fit_in_scene, settings=settings, mean=mean))

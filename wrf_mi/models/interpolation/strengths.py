@@ -7,7 +7,6 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,7 @@ from .strength_fit import Field, Fit, PriorMean, shift_of, widening
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
-    from ...tracing.power_map import Traced
+    from ...tracing.power_map import Traced, Tracer
 
 HEADINGS = 8
 """Headings over which the prediction is averaged where the heading is unknown."""
@@ -162,7 +161,7 @@ class Strengths(Fitted):
         return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, trace: Callable[[FloatArray], FloatArray] | None = None) -> Strengths:
+    def from_arrays(cls, arrays: Arrays, trace: Tracer | None = None) -> Strengths:
         """The model that `arrays` stored; ``trace`` of `wrf_mi.tracing.power_map.TracedPower`, if that is its mean."""
         traced: Traced | None = None
         if "map.power_dbm" in arrays:
@@ -172,9 +171,9 @@ class Strengths(Fitted):
             if "exact.traced_dbm" in arrays:
                 assert trace is not None
                 positions_m = arrays["stop.position_m"]
-                traced = TracedPower(traced, trace)
-                traced.know(positions_m, arrays["exact.traced_dbm"])
-                traced = traced.of_predictions(positions_m)
+                power_dbm = arrays["exact.traced_dbm"].T
+                known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
+                traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
         transmit_dbm, frequency_hz = map(float, arrays["base"])
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
