@@ -165,13 +165,18 @@ def correct_scene(
     stated = fit_of(parts.held, parts.held_rows).misfit
     unseen = dict.fromkeys(chosen, stated)
     scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}
+    judged = {"": parts.units(scores[""])}
     for stage, (state, by) in chosen.items():
-        if _moves(stage):
+        scores[stage] = stated.scores(_vector_at(parts, stated, state, by))
+        judged[stage] = parts.units(scores[stage])
+        # Other paths make good planes better. They do not mend those that fit training rows alone, and finding them
+        # takes as long as all that was done before.
+        if _moves(stage) and _last_is_best(judged, task.higher_is_better):
             again = fit_of(parts.known, parts.known_rows, state, by)
             state, by = chosen[stage] = Moves(again, stage).continued(state, by), again
             unseen[stage] = fit_of(parts.held, parts.held_rows, state, by).misfit
-        scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
-    judged = {key: parts.units(score) for key, score in scores.items()}
+            scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
+            judged[stage] = parts.units(scores[stage])
     kept = _kept(judged, task.higher_is_better)
     best = chosen[kept] if kept else None
     final = fit_of(record, split.all_train, *(best or ()))
@@ -292,6 +297,12 @@ def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
         if known > 1 and improves(score, scores[kept], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
             kept = stage
     return kept
+
+
+def _last_is_best(scores: Mapping[str, FloatArray], higher_is_better: bool) -> bool:
+    """Whether no stage has a better mean than the last, over what is known of both."""
+    *before, last = scores.values()
+    return all(improves(last, score, higher_is_better, errors=0.0) for score in before)
 
 
 def _kinds(scene: str | Path) -> dict[str, Kind]:

@@ -141,10 +141,11 @@ class Fit:
         free = self.free(state.stage)
         return noise.cost(self.misfit.residual(state.vector)) + self.prior(state.mean, free).cost(state.vector[free])
 
-    def trial_cost(self, trials: Misfit | PathSum, noise: Noise, vector: FloatArray) -> float:
-        """Negative logarithm of the likelihood of a vector [p] and of the planes' prior, without its constant."""
+    def trial_costs(self, trials: Misfit | PathSum, noise: Noise, vectors: Sequence[FloatArray]) -> list[float]:
+        """Negative logarithms of the likelihood of vectors [p] and of the planes' prior, without its constant."""
         free, prior = self._planes_prior
-        return noise.cost(trials.residual(vector)) + prior.cost(vector[free])
+        costs = noise.costs(trials.mean_squares(np.stack(vectors)))
+        return [float(cost) + prior.cost(vector[free]) for cost, vector in zip(costs, vectors, strict=True)]
 
     @cached_property
     def _planes_prior(self) -> tuple[IntArray, Prior]:

@@ -61,7 +61,11 @@ class Noise:
 
     def cost(self, residual: FloatArray) -> float:
         """Negative logarithm of the likelihood of residuals [rows, values]."""
-        return float((FREEDOM + self.values) / 2 * np.log1p(self._excess(residual)).sum())
+        return float(self.costs(np.square(residual).mean(axis=1)))
+
+    def costs(self, mean_squares: FloatArray) -> FloatArray:
+        """The same of means of each row's squared residuals [..., rows], NaN without observation: [...]."""
+        return np.asarray((FREEDOM + self.values) / 2 * np.log1p(self._excess(mean_squares)).sum(axis=-1))
 
     def weights(self, residual: FloatArray) -> FloatArray:
         """Weights [rows] of squared residuals: (FREEDOM + n_eff) / FREEDOM / s^2 at most, 0 without observation.
@@ -69,11 +73,12 @@ class Noise:
         They are divided by values per independent value: sums over all values are then sums over independent ones.
         """
         share = self.values / residual.shape[1] / self.variance
-        seen = np.isfinite(residual).all(axis=1)
-        return np.where(seen, share * (FREEDOM + self.values) / FREEDOM / (1 + self._excess(residual)), 0)
+        mean = np.square(residual).mean(axis=1)
+        weight = share * (FREEDOM + self.values) / FREEDOM / (1 + self._excess(mean))
+        return np.where(np.isfinite(mean), weight, 0)
 
-    def _excess(self, residual: FloatArray) -> FloatArray:
-        mean = np.where(np.isfinite(residual).all(axis=1), np.square(residual).mean(axis=1), 0)
+    def _excess(self, mean_squares: FloatArray) -> FloatArray:
+        mean = np.where(np.isfinite(mean_squares), mean_squares, 0)
         return np.asarray(self.values * mean / (FREEDOM * self.variance))
 
 

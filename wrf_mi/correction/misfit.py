@@ -236,6 +236,10 @@ class Misfit:
             found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
         return found / self.unit[:, None] - self.observed
 
+    def mean_squares(self, vectors: FloatArray) -> FloatArray:
+        """Means of each row's squares of `residual` at vectors [v, p], [v, n_rx * rows]."""
+        return np.stack([np.square(self.residual(vector)).mean(axis=1) for vector in vectors])
+
     @cached_property
     def paths(self) -> PathTable:
         """Rows, sides and interactions of all paths, side by side."""

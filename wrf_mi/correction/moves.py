@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import itemgetter
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
+from ..parallel.threads import on_threads
 from ..tracing.plane_parameters import SHIFT
 from .choices import ABSENT, Choice, joint_choices, material_choices, shift_choices
 from .fit import Fit, State
@@ -105,14 +107,18 @@ class Moves:
     def _chosen(self, state: State, choices: Sequence[Choice], what: str) -> tuple[State, bool]:
         """Coordinate descent over choices, in sweeps until none changes; and whether one has."""
         fit, vector, chosen = self.fit, state.vector.copy(), dict[str, str]()
+        last = 0  # the choice that was changed last, or the first
         for sweep in range(SWEEPS):
             trials = near(fit.misfit, vector)
             noise, changed = Noise.of(trials.residual(vector)), False
             for number, choice in enumerate(choices):
+                if sweep and not changed and number >= last:
+                    break  # the alternatives of the others were tried beside what is chosen now
                 fit.on_stage(what, (sweep + number / len(choices)) / SWEEPS)
                 least, name, other = self._alternatives(trials, noise, choice, vector)[0]
-                if least < fit.trial_cost(trials, noise, vector) - GAIN:
+                if least < fit.trial_costs(trials, noise, [vector])[0] - GAIN:
                     chosen[choice.what], vector, changed = name.partition(",")[0], other, True
+                    last = number
                     trials.accept(other)
             if not changed:
                 break
@@ -130,12 +136,12 @@ class Moves:
         Of a material and a shift together, the best of some shifts, or with ``of_materials`` those of each material and
         the plane where it is, are compared after least squares, too.
         """
-        tried, expected = list[Alternative](), self.fit.expected(vector, choice.places)
-        for name, values in choice.values.items():
-            other = vector.copy()
+        expected = self.fit.expected(vector, choice.places)
+        vectors = np.tile(vector, (len(choice.values), 1))
+        for other, values in zip(vectors, choice.values.values(), strict=True):
             other[choice.places] = np.where(np.isnan(values), expected, values)
-            tried.append((self.fit.trial_cost(trials, noise, other), name, other))
-        tried.sort(key=itemgetter(0))
+        costs = self.fit.trial_costs(trials, noise, list(vectors))
+        tried = sorted(zip(costs, choice.values, vectors, strict=True), key=itemgetter(0))
         if choice.joint:
             # A plane that is tilted, too, fits at the right shift only once its tilts do.
             groups = dict[str, list[tuple[str, FloatArray]]]()  # by material or by shift
@@ -149,9 +155,11 @@ class Moves:
                     in_place[choice.plane] = vector[choice.plane]
                     few.append((material, in_place))
             places = choice.places if trials is self.fit.misfit else choice.plane
-            for name, other in few:
-                better = self.fit.refined(trials, other, places)
-                tried.append((self.fit.trial_cost(trials, noise, better), name, better))
+            work = partial(self.fit.refined, trials, places=places)
+            starts = [other for _, other in few]
+            better = on_threads(work, starts) if isinstance(trials, PathSum) else [work(start) for start in starts]
+            costs = self.fit.trial_costs(trials, noise, better)
+            tried += zip(costs, [name for name, _ in few], better, strict=True)
         return sorted(tried, key=itemgetter(0))
 
     def _boxes(self, state: State) -> State:
@@ -175,7 +183,7 @@ class Moves:
                 for face in faces:
                     if face.what in shifts:
                         vector = self._alternatives(trials, state.noise, shifts[face.what], vector)[0][2]
-                alternatives.append((fit.trial_cost(trials, state.noise, vector), material, vector))
+                alternatives.append((fit.trial_costs(trials, state.noise, [vector])[0], material, vector))
             _, material, vector = min(alternatives, key=itemgetter(0))
             changed = [face for face in faces if state.materials.get(face.what) != material]
             if not changed:
@@ -244,7 +252,7 @@ class Moves:
         """Log-likelihoods without each surface, the higher the less observations tell of it."""
         trials = near(self.fit.misfit, vector)
         noise = Noise.of(trials.residual(vector))
-        return -np.array([noise.cost(trials.residual(self._without(choice, vector))) for choice in choices])
+        return -noise.costs(trials.mean_squares(np.stack([self._without(choice, vector) for choice in choices])))
 
     def _without(self, choice: Choice, vector: FloatArray) -> FloatArray:
         """A vector [p] without the surface of a choice; its plane is where the others let expect it."""

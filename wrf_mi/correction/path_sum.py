@@ -11,7 +11,9 @@ a factor of its sums.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,30 +21,55 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.sparse import coo_array, csr_array
 
-from ..core.angles import FloatArray, pixel_directions
-from ..core.types import SQUARED_MAGNITUDE_EPS, IntArray
-from ..graph.combine import LEAST_POWER, SILENCE, ArrayReceiver, PowerReceiver
-from ..graph.ports import steering
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..graph.combine import ArrayReceiver, PowerReceiver
+from ..parallel.threads import on_threads
 from ..tasks import task_of
 from ..tracing.images import mirrored
 from ..tracing.material_parameters import PREFIX
 from ..tracing.plane_parameters import SHIFT, TILT
+from .signal_reports import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:
     from .misfit import Misfit
 
-Complex = NDArray[np.complex128]
-Slopes = Callable[[Complex, IntArray], FloatArray]
-"""Derivatives of reports by changes of signals, and the places of their rows among those of the reports."""
 MOST_WAVES = 1 << 24
 """Most element signals of paths, of 16 bytes each, that are kept for spectra."""
+TOGETHER = 512
+"""Rows, over all vectors, of which trials are computed at once: their spectra fit into the cache of a processor."""
 STEP = 1e-4
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
 centimetres resonate within a few per cent of their thickness."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Touched:
+    """The n paths that meet one of some planes and surfaces, in the order of `wrf_mi.correction.misfit.PathTable`.
+
+    Attributes:
+        key: identifies the planes and surfaces.
+        paths: these paths [n].
+        rows: their rows, each once and in the order of the paths [k].
+        adding: sums over the paths of each row [k, n].
+        slope: derivatives of their lengths by shifts and tilts [n, 3 q].
+    """
+
+    key: bytes
+    paths: IntArray
+    rows: IntArray
+    adding: csr_array
+    slope: csr_array
+
+    def sums(self, waves: Complex) -> Complex:
+        """Sums [k, ...] of waves [n, ...] over the paths of each row."""
+        # Products of real matrices take a third of the time of `numpy.add.reduceat`.
+        flat = np.ascontiguousarray(waves).reshape(len(waves), int(np.prod(waves.shape[1:]))).view(float)
+        return np.asarray(self.adding @ flat).view(complex).reshape(-1, *waves.shape[1:])
+
+
 class PathSum:
-    """Residuals of a misfit near one vector.
+    """Residuals of a misfit near one vector. Trials may be computed on several threads.
 
     Args:
         misfit: residuals that are such sums (`serves`).
@@ -53,6 +80,7 @@ class PathSum:
         self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
         self._paths, task, self._plane_places = misfit.paths, task_of(misfit.record), misfit.plane_entries
         self._mirrors = np.where(self._paths.reflects, self._paths.plane, -1)
+        self._slope = csr_array((len(self._paths.row), 0))
         if len(self._plane_places):
             length, self._slope = _geometry(misfit, self._mirrors, vector)
         self._unit: Complex | None = None
@@ -68,10 +96,9 @@ class PathSum:
             self._reports, self._k = Channels(), 2 * np.pi * hz[None] / speed_of_light
             self._unit = np.exp(-1j * length[:, None] * self._k)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
-        self._touched: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
-        self._phase: tuple[tuple[bytes, ...], Complex] = (), np.zeros((0, 0), complex)
-        count = len(misfit.planes)
-        self._plane_of = np.concatenate([np.arange(count), np.repeat(np.arange(count), 2)])[: len(self._plane_places)]
+        self._touched: dict[bytes, _Touched] = {}
+        self._unit_of: tuple[bytes, Complex] = b"", np.zeros((0, 0), complex)
+        self._tracing = Lock()  # recordings of Dr.Jit serve one thread at a time
         material = [part for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         places = np.array([np.arange(part.start, part.stop) for part in material], np.int64)
         self._material = places.reshape(len(material), len(misfit.sides[0].slabs.names))
@@ -82,9 +109,10 @@ class PathSum:
         ]
         every = np.arange(len(self._paths.row))
         self._gain = self.misfit.gains(self.at, every)
-        self._waves = self._waves_of(every, self._gain, np.zeros(len(self._plane_places)), ())
-        self._total = self._sums(self._waves, every)
-        self._residual = self._residual_of(self._total * self._factor(self.at), np.arange(len(misfit.observed)))
+        self._waves = self._waves_of(self._every, self._gain[None], np.zeros((1, len(self._plane_places))))[:, 0]
+        self._total = np.zeros((len(misfit.observed), self._waves.shape[1]), complex)
+        self._total[self._every.rows] = self._every.sums(self._waves)
+        self._keep(self._residual_of(self._total * self._factor(self.at), np.arange(len(misfit.observed))))
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
@@ -109,29 +137,53 @@ class PathSum:
         return channels and SHIFT in misfit.parts and carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
-        """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector.
-
-        Reports of rows without a changed path or gain are kept.
-        """
-        touched, rows, waves = self._changed(vector)
-        total = self._total + self._sums(waves - self._waves[touched], touched)
-        factor = self._factor(vector)
-        rows = np.union1d(rows, np.flatnonzero((factor != self._factor(self.at))[:, 0]))
+        """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
+        rows, changed = self._trials(vector[None])
         residual = self._residual.copy()
-        residual[rows] = self._residual_of((total * factor)[rows], rows)
+        residual[rows] = changed[:, 0]
         return residual
+
+    def mean_squares(self, vectors: FloatArray) -> FloatArray:
+        """Means of each row's squares of `residual` at vectors [v, p], [v, n_rx * rows]; on all processors."""
+        means = np.tile(self._mean_squares, (len(vectors), 1))
+        # Several vectors at once: products of few rows take less time than the calls around them.
+        each = max(1, TOGETHER // max(1, len(self._touched_by(self._differs(vectors, self.at)).rows)))
+        parts = [np.arange(first, min(first + each, len(vectors))) for first in range(0, len(vectors), each)]
+
+        def fill(part: IntArray) -> None:
+            rows, changed = self._trials(vectors[part])
+            means[np.ix_(part, rows)] = np.square(changed).mean(axis=2).T
+
+        on_threads(fill, parts)
+        return means
+
+    def _trials(self, vectors: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Rows [k] with a path or gain that a vector of [v, p] changes, and their residuals [k, v, values]."""
+        touched, waves = self._changed(vectors)
+        total = (self._total[touched.rows] - touched.sums(self._waves[touched.paths]))[:, None] + touched.sums(waves)
+        factor, rows = np.stack([self._factor(vector) for vector in vectors], axis=1), touched.rows
+        if (factor != self._factor(self.at)[:, None]).any():
+            rows, every = np.arange(len(factor)), np.repeat(self._total[:, None], len(vectors), axis=1)
+            every[touched.rows] = total
+            total = every
+        flat = (total * factor[rows]).reshape(-1, total.shape[2])
+        residual = self._residual_of(flat, np.repeat(rows, len(vectors)))
+        return rows, residual.reshape(*total.shape[:2], residual.shape[1])
 
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
         return self._reports.report(signal, rows) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+
+    def _keep(self, residual: FloatArray) -> None:
+        self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
 
     def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
         """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; those by materials are
         differences over `STEP`.
         """
-        touched, _, waves = self._changed(vector)
-        present = self._waves.copy()
-        present[touched] = waves
-        total = self._total + self._sums(waves - self._waves[touched], touched)
+        touched, waves = self._changed(vector[None])
+        present, total = self._waves.copy(), self._total.copy()
+        present[touched.paths] = waves[:, 0]
+        total[touched.rows] += touched.sums(waves[:, 0] - self._waves[touched.paths])
         receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
         changes = list[tuple[IntArray, Complex]]()
         for column in columns:
@@ -139,37 +191,41 @@ class PathSum:
                 imaginary, rows = receiver[column]
                 by_gain = (1j if imaginary else 1) if self._unit is not None else (0 if imaginary else 2)
                 changes.append((rows, by_gain * total[rows]))
-            elif column in self._plane_places:
-                slope = self._slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()[:, 0]
-                moved = np.flatnonzero(slope)
-                rows = np.unique(self._paths.row[moved])
-                change = present[moved] * (-1j * slope[moved, None] * self._wavenumber(moved))
-                changes.append((rows, self._sums(change, moved)[rows]))
+                continue
+            there = vector.copy()
+            there[column] += STEP
+            if column in self._plane_places:
+                moved = self._touched_by(self._differs(there[None], vector))
+                slope = moved.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()
+                change = present[moved.paths] * (-1j * slope * self._wavenumber(moved.paths))
             else:
-                there = vector.copy()
-                there[column] += STEP
-                moved, rows, waves = self._changed(there)
+                moved, waves = self._changed(there[None])
                 # Parameters are rounded to single precision, gains are not.
                 step = float(np.float32(there[column])) - float(np.float32(vector[column]))
-                changes.append((rows, self._sums((waves - present[moved]) / step, moved)[rows]))
+                change = (waves[:, 0] - present[moved.paths]) / step
+            changes.append((moved.rows, moved.sums(change)))
         every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
         factor = self._factor(vector)
         slopes = self._reports.slopes((total * factor)[every], every)
         result = np.zeros((len(columns), *self.misfit.observed.shape), np.float32)
-        for by_column, (rows, change) in zip(result, changes, strict=True):
+
+        def fill(number: int) -> None:
+            rows, change = changes[number]
             of_signal = slopes(change * factor[rows], np.searchsorted(every, rows))
-            by_column[rows] = of_signal / self.misfit.unit[rows, None]
+            result[number][rows] = of_signal / self.misfit.unit[rows, None]
+
+        on_threads(fill, range(len(columns)))
         result[:, ~np.isfinite(self.misfit.observed).all(axis=1)] = 0
         return result
 
     def accept(self, vector: FloatArray) -> None:
         """Take a vector as the present one."""
-        residual = self.residual(vector)
-        touched, _, waves = self._changed(vector)
-        self._gain[touched] = self._gain_at(vector, touched)
-        self._total = self._total + self._sums(waves - self._waves[touched], touched)
-        self._waves[touched] = waves
-        self.at, self._residual = np.array(vector, float), residual
+        residual, (touched, waves) = self.residual(vector), self._changed(vector[None])
+        self._gain[touched.paths] = self._gain_at(vector, touched)
+        self._total[touched.rows] += touched.sums(waves[:, 0] - self._waves[touched.paths])
+        self._waves[touched.paths] = waves[:, 0]
+        self.at = np.array(vector, float)
+        self._keep(residual)
         self._gains.clear()
 
     def _factor(self, vector: FloatArray) -> Complex:
@@ -180,55 +236,74 @@ class PathSum:
             factor[places] = np.exp(2 * amplitude if self._unit is None else amplitude + 1j * phase)
         return factor
 
-    def _sums(self, waves: Complex, which: IntArray) -> Complex:
-        """Sums [rows, frequencies or elements] of waves of some paths, in their order; of powers [rows, 1]."""
-        total = np.zeros((len(self.misfit.observed), waves.shape[1]), complex)
-        if len(which):
-            row = self._paths.row[which]
-            first = np.flatnonzero(np.diff(row, prepend=-1))
-            total[row[first]] = np.add.reduceat(waves, first, axis=0)
-        return total
+    @cached_property
+    def _every(self) -> _Touched:
+        return self._of_paths(b"every", np.arange(len(self._paths.row)))
 
-    def _changed(self, vector: FloatArray) -> tuple[IntArray, IntArray, Complex]:
-        """Paths that meet a changed plane or surface, their rows, and their waves."""
-        differs = vector != self.at
-        planes = np.unique(self._plane_of[differs[self._plane_places]])
-        slabs = np.flatnonzero(differs[self._material].any(axis=0))
-        key = planes.tobytes(), slabs.tobytes()
+    def _of_paths(self, key: bytes, paths: IntArray) -> _Touched:
+        row, count = self._paths.row[paths], len(paths)
+        first = np.flatnonzero(np.diff(row, prepend=-1))
+        adding = csr_array((np.ones(count), np.arange(count), np.append(first, count)), (len(first), count))
+        return _Touched(key, paths, row[first], adding, self._slope[paths])
+
+    def _differs(self, vectors: FloatArray, other: FloatArray) -> NDArray[np.bool_]:
+        """Whether a parameter of each plane, then surface, differs in one of the vectors [v, p]."""
+        differs = (vectors != other).any(axis=0)
+        planes = np.zeros(len(self.misfit.planes), bool)
+        if len(self._plane_places):
+            shifts, tilts = np.split(differs[self._plane_places], [len(planes)])
+            planes = shifts | tilts.reshape(-1, 2).any(axis=1)
+        return np.concatenate([planes, differs[self._material].any(axis=0)])
+
+    def _touched_by(self, differs: NDArray[np.bool_]) -> _Touched:
+        key = differs.tobytes()
         if key not in self._touched:
-            met = np.flatnonzero(
-                np.isin(self._mirrors, planes).any(axis=1) | np.isin(self._paths.slab, slabs).any(axis=1)
+            planes, slabs = np.split(differs, [len(self.misfit.planes)])
+            # The last entries are those of the place holder -1.
+            met = np.append(planes, False)[self._mirrors].any(axis=1) | np.append(slabs, False)[self._paths.slab].any(
+                axis=1
             )
-            self._touched[key] = met, np.unique(self._paths.row[met])
-        touched, rows = self._touched[key]
-        shifts = (vector - self._start)[self._plane_places]
-        return touched, rows, self._waves_of(touched, self._gain_at(vector, touched), shifts, key)
+            self._touched[key] = self._of_paths(key, np.flatnonzero(met))
+        return self._touched[key]
+
+    def _changed(self, vectors: FloatArray) -> tuple[_Touched, Complex]:
+        """The n paths that meet a plane or surface that a vector of [v, p] changes, and waves as of `_waves_of`."""
+        touched = self._touched_by(self._differs(vectors, self.at))
+        gain = np.stack([self._gain_at(vector, touched) for vector in vectors])
+        return touched, self._waves_of(touched, gain, (vectors - self._start)[:, self._plane_places])
 
     def _wavenumber(self, which: IntArray) -> FloatArray:
         """Wavenumbers of some paths, [paths or 1, frequencies or 1]."""
         return self._k if len(self._k) == 1 else self._k[which]
 
-    def _waves_of(self, which: IntArray, gain: Complex, shifts: FloatArray, key: tuple[bytes, ...]) -> Complex:
-        """Waves [paths, frequencies or elements] of some paths, which ``key`` identifies, or powers [paths, 1]."""
+    def _waves_of(self, touched: _Touched, gain: Complex, shifts: FloatArray) -> Complex:
+        """Waves [n, v, frequencies or elements] for gains [v, n] and shifts [v, 3 q], or powers [n, v, 1]."""
         if self._unit is None:
-            return (np.abs(gain[:, None]) ** 2).astype(complex)
-        name = (*key, shifts.tobytes())
-        if self._phase[0] != name:  # kept for the next call
-            unit = self._unit[which]
-            if shifts.any():
-                unit = unit * np.exp(-1j * (self._slope[which] @ shifts)[:, None] * self._wavenumber(which))
-            self._phase = name, unit
-        return gain[:, None] * self._phase[1]
+            return (np.abs(gain.T[:, :, None]) ** 2).astype(complex)
+        key, unit = self._unit_of
+        if key != touched.key:  # kept for the next call
+            unit = self._unit[touched.paths]
+            self._unit_of = touched.key, unit
+        if not shifts.any():
+            return gain.T[:, :, None] * unit[:, None]
+        # Alternatives of a material share their shifts.
+        number_of = dict[bytes, int]()
+        which = [number_of.setdefault(row.tobytes(), len(number_of)) for row in shifts]
+        distinct = shifts[np.unique(which, return_index=True)[1]]
+        length = (touched.slope @ distinct.T)[:, :, None]
+        phase = np.exp(-1j * length * self._wavenumber(touched.paths)[:, None])[:, which]
+        return (gain.T[:, :, None] * phase) * unit[:, None]
 
-    def _gain_at(self, vector: FloatArray, touched: IntArray) -> Complex:
+    def _gain_at(self, vector: FloatArray, touched: _Touched) -> Complex:
         materials = self._material.ravel()
         if not (vector != self.at)[materials].any():
-            return self._gain[touched]
+            return self._gain[touched.paths]
         there = self._start.copy()  # angles of all gains are those of the first vector
         there[materials] = vector[materials]
-        key = touched.tobytes(), there[materials].tobytes()
-        if key not in self._gains:
-            self._gains[key] = self.misfit.gains(there, touched)
+        key = touched.key, there[materials].tobytes()
+        with self._tracing:
+            if key not in self._gains:
+                self._gains[key] = self.misfit.gains(there, touched.paths)
         return self._gains[key]
 
 
@@ -268,94 +343,3 @@ def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[Fl
     rows, columns, values = (np.concatenate(each) for each in zip(*slopes, strict=True))
     # Slopes of a plane that reflects a path twice are added.
     return length, coo_array((values, (rows, columns)), (len(point), 3 * count)).tocsr()
-
-
-class Channels:
-    """Reports of signals [n, values] of some rows [n], in ascending order: sums of waves or of powers, times gains.
-
-    Here channels of a single antenna, real and imaginary part in turn.
-    """
-
-    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
-        """Reports [n, values] as those of `Misfit`, before the unit of each row."""
-        return np.ascontiguousarray(signal).view(float)
-
-    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
-        """Derivative of `report` by the signals."""
-        return lambda change, which: self.report(change, rows[which])
-
-
-class Strengths(Channels):
-    """Powers in dB, as `wrf_mi.graph.combine.PowerReceiver` reports them."""
-
-    def __init__(self, misfit: Misfit) -> None:
-        self._floor = np.full((len(misfit.observed), 1), np.nan)
-        for model, places in zip(misfit.models, misfit.places, strict=True):
-            assert isinstance(model, PowerReceiver)
-            self._floor[places] = model.floor
-
-    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
-        """Reports as of `Channels`."""
-        power = signal.real + LEAST_POWER
-        return 10 * np.log10(np.where(power > SILENCE, power + LEAST_POWER, self._floor[rows]))
-
-    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
-        """Derivative as of `Channels`."""
-        power = signal.real + LEAST_POWER
-        weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
-        return lambda change, which: weight[which] * change.real
-
-
-class Spectra(Channels):
-    """Bartlett spectra of element signals, scaled as `wrf_mi.graph.combine.ArrayReceiver.instrument_scale` does."""
-
-    def __init__(self, misfit: Misfit) -> None:
-        self._matrices = list[NDArray[np.complex64]]()
-        self._side = np.zeros(len(misfit.observed), np.int64)
-        for side, (model, places) in enumerate(zip(misfit.models, misfit.places, strict=True)):
-            assert isinstance(model, ArrayReceiver)
-            directions = pixel_directions(model.height, model.width).reshape(-1, 3)
-            matrix = steering(model.elements_m, directions, model.frequency_hz).values
-            self._matrices.append(matrix.astype(np.complex64))
-            self._side[places] = side
-
-    def report(self, signal: Complex, rows: IntArray) -> FloatArray:
-        """Reports as of `Channels`."""
-        return np.asarray(_scaled(_magnitude(self._images(signal, rows)))[0], float)
-
-    def slopes(self, signal: Complex, rows: IntArray) -> Slopes:
-        """Derivative as of `Channels`."""
-        image = self._images(signal, rows)
-        spectrum = _magnitude(image)
-        share, low, high, inverse = _scaled(spectrum)
-        weight = image.conj() / spectrum
-
-        def slope(change: Complex, which: IntArray) -> FloatArray:
-            by_pixel = (weight[which] * self._images(change, rows[which])).real
-            least, most = (np.take_along_axis(by_pixel, end[which], axis=1) for end in (low, high))
-            return np.asarray((by_pixel - least - share[which] * (most - least)) * inverse[which], float)
-
-        return slope
-
-    def _images(self, signal: Complex, rows: IntArray) -> NDArray[np.complex64]:
-        """Element signals of some rows in all directions, complex."""
-        side, single = self._side[rows], signal.astype(np.complex64)
-        if len(self._matrices) == 1:
-            return single @ self._matrices[0]
-        images = np.empty((len(rows), self._matrices[0].shape[1]), np.complex64)
-        for number in np.unique(side):
-            images[side == number] = single[side == number] @ self._matrices[number]
-        return images
-
-
-def _scaled(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
-    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
-    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
-    least = np.take_along_axis(spectrum, low, axis=1)
-    span = np.take_along_axis(spectrum, high, axis=1) - least
-    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
-    return (spectrum - least) * inverse, low, high, inverse
-
-
-def _magnitude(image: NDArray[np.complex64]) -> NDArray[np.float32]:
-    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))

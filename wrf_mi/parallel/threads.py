@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cache
+from threading import local
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -34,7 +35,18 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     return limit
 
 
-def on_threads(work: Callable[[Part], Result], parts: Iterable[Part]) -> list[Result]:
-    """Results of ``work(part)`` in order, a thread for each processor, each with a BLAS of one thread."""
-    with one_blas_thread(), ThreadPoolExecutor(processors()) as pool:
+_thread = local()
+
+
+def on_threads(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Results of ``work(part)`` in order, a thread for each processor, each with a BLAS of one thread.
+
+    Parts of such a part, and a single one, are computed in the thread that asks for them.
+    """
+    if len(parts) < 2 or getattr(_thread, "works", False):
+        return [work(part) for part in parts]
+    with (
+        one_blas_thread(),
+        ThreadPoolExecutor(processors(), initializer=setattr, initargs=(_thread, "works", True)) as pool,
+    ):
         return list(pool.map(work, parts))
