@@ -33,8 +33,8 @@ CONFIG = TracedConfig(depth=2, reflections=2, rays=4096, faint=0.0)
 SIZE = (9, 24)
 SINGLE, SINGLE_DB = 1e-6, 2e-5
 """Of greys in 0..1, and of dB: rounding of single precision."""
-STRENGTH_DB = 1e-3
-"""Gains of the tracer are in single precision."""
+STRENGTH_DB, TRACED = 1e-3, 1e-3
+"""In dB and of greys: gains of the tracer are in single precision."""
 QUICK = ("initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "validate_every=10", "batch=4")
 
 
@@ -74,6 +74,28 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(task: str, tolerance:
         alone = Predictor(None, {}, receivers, *SIZE, graph=single)
         for number in range(2):
             np.testing.assert_allclose(found[number][at], alone(transmitters(12)[at], number), atol=tolerance)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count: int, xml: Path) -> None:
+    """Of several transmitters, and of one, whose report is recorded; both differ from those of certain phases."""
+    instrument = SpectrumInstrument((array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
+    tracer = RayTracer(xml, instrument, OPTIONS)
+    expected = tracer.observe(tracer.trace(transmitters(count)))[0]
+    graph = Graph(None, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
+    certain, predict = (Predictor(None, {}, (array(),), *SIZE, graph=graph, phase_error=sd) for sd in (0.0, 1.0))
+    np.testing.assert_allclose(predict(transmitters(count), 0), expected, rtol=0, atol=TRACED)
+    assert np.abs(certain(transmitters(count), 0) - expected).max() > 0.05
+
+
+def test_gaussians_count_in_each_draw_of_the_paths_phases(xml: Path) -> None:
+    """With phases that are as good as certain the expectation is the report itself, beside Gaussians, too."""
+    field, params = true_field("wrf-gs+")
+    graph = Graph(field, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
+    certain, nearly = (Predictor(field, params, (array(),), *SIZE, graph=graph, phase_error=sd) for sd in (0.0, 1e-9))
+    for count in (1, 5):
+        reports = [predict(transmitters(count), 0) for predict in (certain, nearly)]
+        np.testing.assert_allclose(*reports, rtol=0, atol=10 * SINGLE)
 
 
 def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml: Path) -> None:
@@ -178,3 +200,30 @@ def test_single_predictions_are_those_of_a_batch(receiver_model: str, xml: Path)
     assert np.abs(alone - traced(tx, 0)).max() > 0.01  # the Gaussians tell
     np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=SINGLE if receiver_model == "array" else SINGLE_DB)
     assert any(name[0] == "both" and one.n_recordings for (name, _), one in predict._recordings.items())
+
+
+@pytest.mark.parametrize(("off_m", "certain"), [(0.0, True), (0.03, False)])
+def test_phases_are_uncertain_where_walls_are_off(off_m: float, certain: bool, xml: Path, tmp_path: Path) -> None:
+    """By held-out rows; the choice is stored with the state, and the trainer's predictions follow it."""
+    record = spectra(xml, 60)
+    rows = np.flatnonzero(record.carriers_hz == CARRIERS_HZ[2])
+    record = replace(
+        record,
+        tx_pos_m=record.tx_pos_m[rows],
+        observation=record.observation[:, rows],
+        frequencies_hz=np.array([CARRIERS_HZ[2]]),
+        carriers_hz=None,
+    )
+    moved = {
+        name: (material, mesh.copy().apply_translation([off_m, -off_m, off_m]))
+        for name, (material, mesh) in {**WALLS, **CEILING, **PARTITION}.items()
+    }
+    scene = open_scene(write_xml(tmp_path, moved), CARRIERS_HZ[2])
+    split = Split("own", 0, np.arange(50), np.arange(50, 55), np.arange(55, 60))
+    settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=40", "validate_every=10"
+    trainer = Trainer(
+        record, split, with_settings(calibration_config(["gain", "surface"], images=True), settings), scene=scene
+    )
+    trainer.run(lambda progress: None, lambda: None, lambda: False)
+    assert (trainer.state.phase_error == 0) == certain
+    assert trainer.predictor().phase_error == trainer.state.phase_error

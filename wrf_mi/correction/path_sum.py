@@ -38,6 +38,8 @@ MOST_WAVES = 1 << 24
 """Most element signals of paths, of 16 bytes each, that are kept for spectra."""
 TOGETHER = 512
 """Rows, over all vectors, of which trials are computed at once: their spectra fit into the cache of a processor."""
+MOST_KEPT = 64
+"""Most sets of paths that are kept for further trials: each takes up to a megabyte, and a Jacobian has hundreds."""
 STEP = 1e-4
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
 centimetres resonate within a few per cent of their thickness."""
@@ -257,14 +259,15 @@ class PathSum:
 
     def _touched_by(self, differs: NDArray[np.bool_]) -> _Touched:
         key = differs.tobytes()
-        if key not in self._touched:
-            planes, slabs = np.split(differs, [len(self.misfit.planes)])
+        touched = self._touched.get(key)
+        if touched is None:
+            if len(self._touched) >= MOST_KEPT:
+                self._touched.clear()
+            planes, slabs = (np.append(part, False) for part in np.split(differs, [len(self.misfit.planes)]))
             # The last entries are those of the place holder -1.
-            met = np.append(planes, False)[self._mirrors].any(axis=1) | np.append(slabs, False)[self._paths.slab].any(
-                axis=1
-            )
-            self._touched[key] = self._of_paths(key, np.flatnonzero(met))
-        return self._touched[key]
+            met = planes[self._mirrors].any(axis=1) | slabs[self._paths.slab].any(axis=1)
+            touched = self._touched[key] = self._of_paths(key, np.flatnonzero(met))
+        return touched
 
     def _changed(self, vectors: FloatArray) -> tuple[_Touched, Complex]:
         """The n paths that meet a plane or surface that a vector of [v, p] changes, and waves as of `_waves_of`."""

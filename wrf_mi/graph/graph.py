@@ -43,6 +43,7 @@ from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.traced_carriers import traced_fields
 from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
 from .evaluations import EVALUATIONS, Evaluation
+from .phase_errors import draws_of, for_draws, mean_of_draws, with_phase_errors
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
@@ -306,6 +307,7 @@ class Graph:
         chunked: bool = False,
         surface: bool = True,
         alone: Alone | None = None,
+        phase_error: float = 0.0,
     ) -> Report:
         """Reports of a port as a function of parameters, for transmitters of a traced side.
 
@@ -317,6 +319,8 @@ class Graph:
             surface: with the Gaussians on surfaces, where the graph has some.
             alone: report one of both sides alone, without an instrument's scaling of each report, so that the two
                 compare; the unit of the Gaussians is that beside the paths. None: both together.
+            phase_error: standard deviation of the phase that each reflection of a path adds, rad; the report is then
+                the expectation (`wrf_mi.receivers.instruments.SpectrumInstrument`).
         """
         model: Any = self.models[number]
         if alone is not None:
@@ -326,15 +330,20 @@ class Graph:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
             paths = None if side is None else side(params, batch.slots)
+            drawn = paths
+            if phase_error and side is not None and paths is not None and alone is None:
+                drawn = with_phase_errors(paths, side.bounces, batch.slots, phase_error)
             if self.field is None or not learned or alone == "traced":
-                return model(paths, None)
+                return mean_of_draws(model(drawn, None), paths, drawn)
             signal = batch.signal or self.learned(number, params, batch, chunked)
             if (unit := self.unit(params, batch, paths)) is not None:
                 if (count := dr.width(unit)) > 1:
                     each = dr.width(signal[0]) // count
                     unit = dr.gather(type(unit), unit, dr.arange(mi.UInt32, count * each) // each)
                 signal = signal[0] * unit, signal[1] * unit
-            return model(None if alone == "learned" else paths, signal)
+            if paths is not None and drawn is not None:
+                signal = for_draws(signal, paths.batch, drawn.batch)
+            return mean_of_draws(model(None if alone == "learned" else drawn, signal), paths, drawn)
 
         return report
 
@@ -342,7 +351,7 @@ class Graph:
         """Constants on the device that a report reads beside its arguments, inputs of a recording."""
         if side is None and self.form.receiver == "pixel":
             return []
-        return [self.models[number].arrays(mi.Float), [] if side is None else side.arrays]
+        return [self.models[number].arrays(mi.Float), [] if side is None else [side.arrays, draws_of(side.form[0])]]
 
     def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
         """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""

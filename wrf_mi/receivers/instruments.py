@@ -127,6 +127,15 @@ class SpectrumInstrument(Instrument):
         return images
 
 
+def phase_draws(count: int) -> FloatArray:
+    """`DRAWS` quantiles of a standard normal variable for each of ``count`` paths [count, DRAWS], in random order.
+
+    Those of a path are the same for any number of others.
+    """
+    order = np.random.default_rng(0).random((count, DRAWS)).argsort(axis=1)
+    return np.asarray(ndtri((order + 0.5) / DRAWS), float)
+
+
 def _with_phases(paths: Paths, phase_error: float) -> list[Paths]:
     """A receiver's paths with `DRAWS` draws of their uncertain phases.
 
@@ -134,8 +143,7 @@ def _with_phases(paths: Paths, phase_error: float) -> list[Paths]:
     do not depend on others.
     """
     number = np.arange(len(paths)) - np.searchsorted(paths.tx, paths.tx)
-    order = np.random.default_rng(0).random((int(number.max(initial=0)) + 1, DRAWS)).argsort(axis=1)
-    drawn = ndtri((order + 0.5) / DRAWS)[number]
+    drawn = phase_draws(int(number.max(initial=0)) + 1)[number]
     interactions = ((paths.interactions != 0) & (paths.interactions != TRANSMISSION)).sum(axis=1)
     phase = phase_error * np.sqrt(interactions)[:, None] * drawn
     return [replace(paths, gain=paths.gain * np.exp(1j * angle)) for angle in phase.T]

@@ -133,6 +133,7 @@ class TracedField:
     Attributes:
         frequency_hz: carrier of the paths.
         chains: surfaces that each path meets, planes as stated.
+        bounces: square roots of the numbers of reflections of paths [n * each], on the device.
         interactions: points at which paths meet surfaces, with the planes as stated.
         slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
         surfaces: surfaces of the scene, with the planes of the parameters.
@@ -188,7 +189,7 @@ class TracedField:
     @property
     def arrays(self) -> list[Any]:
         """Device arrays that a call reads beside its arguments, the inputs of a recording."""
-        return [self.chains, self._constants, self._planes, self._weights]
+        return [self.chains, self._constants, self._planes, self._weights, self.bounces]
 
     @property
     def form(self) -> tuple[int, int, int]:
@@ -334,6 +335,9 @@ class TracedField:
             self.attach(self._gaussians)
         # Place holders have a transmitter, too: lengths of zero have no direction.
         sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
+        bounces = np.zeros(len(place))
+        bounces[entry] = np.sqrt((types == SPECULAR).sum(axis=1))
+        self.bounces = on_device(bounces, Float64)
         self.chains = Chains(sources[:3], tuple(sources[3:]), dr.zeros(Float64, len(place)), [])
         if len(kept):
             index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)

@@ -16,6 +16,9 @@ from .predictor import Predictor
 from .reach import Reach, choose_reach, improves
 from .state import FitState
 
+PHASE_ERRORS = (0.5, 1.0, 1.5)
+"""Phase errors that are tried, rad: beyond, a reflection knows nothing of its phase."""
+
 
 @dataclass(frozen=True)
 class HeldOutReports:
@@ -130,7 +133,31 @@ class Judge:
             state.baseline = state.best_scores
         return score
 
-    def held_out_reports(self, predict: Predictor, state: FitState) -> NDArray[Any]:
+    def choose_phase_error(self, predict: Predictor, state: FitState) -> NDArray[Any]:
+        """Reports of all rows on which a state was chosen, port by port, by the phase error that predicts them best.
+
+        Planes that are centimetres off leave phases uncertain, and the expectation of a spectrum is then nearer to what
+        is measured than the spectrum of any phases (`Graph.report`). Other reports have no such expectation.
+        """
+        best, rows = self._held_out_reports(predict, state), self._held_out(False)
+        if self.plan.graph.scene is None or not self.plan.task.image:
+            return best
+        carriers = self.plan.graph.carriers
+        observed = np.concatenate(
+            [self.plan.record.observation[p // carriers, of_port] for p, of_port in enumerate(rows)]
+        )
+        before = np.ravel(self.plan.task.training_score(best, observed))
+        for phase_error in PHASE_ERRORS:
+            predict.phase_error = phase_error
+            reports = self._held_out_reports(predict, state)
+            scores = np.ravel(self.plan.task.training_score(reports, observed))
+            if not improves(scores, before, self.plan.task.higher_is_better):
+                break
+            state.phase_error, best, before = phase_error, reports, scores
+        predict.phase_error = state.phase_error
+        return best
+
+    def _held_out_reports(self, predict: Predictor, state: FitState) -> NDArray[Any]:
         """Reports of all rows on which a state was chosen, port by port."""
         reach, reports = self.reach(False, state.reach_m), list[NDArray[Any]]()
         for port, rows in enumerate(self._held_out(False)):

@@ -55,6 +55,7 @@ class Predictor:
         store: folder in which operators are stored; None: in memory only.
         graph: graph of the field, these receivers and a scene; None: the field alone, with pixel receivers.
         reach: region in which the Gaussians are used; None: everywhere.
+        phase_error: see `wrf_mi.graph.graph.Graph.report`.
     """
 
     def __init__(
@@ -68,8 +69,9 @@ class Predictor:
         store: Path | None = None,
         graph: Graph | None = None,
         reach: Reach | None = None,
+        phase_error: float = 0.0,
     ) -> None:
-        self.receivers, self.reach = tuple(receivers), reach
+        self.receivers, self.reach, self.phase_error = tuple(receivers), reach, phase_error
         self.graph = graph or Graph(field, receivers, Form(PIXEL, (height, width)))
         # Operator and recorded prediction give the splatted magnitude at each direction.
         self._recordable = self.graph.scene is None and self.graph.evaluation.recordable
@@ -134,7 +136,7 @@ class Predictor:
             graph, size = self.graph.at_carrier(carrier_hz), self.graph.form.size
             self._others[carrier_hz] = Predictor(self._field, {}, self.receivers, *size, graph=graph)
             self._others[carrier_hz].update(self._params)
-        self._others[carrier_hz].reach = self.reach
+        self._others[carrier_hz].reach, self._others[carrier_hz].phase_error = self.reach, self.phase_error
         return self._others[carrier_hz], receiver
 
     def _of_positions(
@@ -265,11 +267,12 @@ class Predictor:
         learned &= side is None or weight is None or bool(np.any(weight))
         if side is not None and len(side) == 1 and self._may_record(1):
             # Recordings of one transmitter serve others, whose traced side is an input.
-            of_one = "both", port, learned, alone, side.form
+            how: dict[str, Any] = {"alone": alone, "phase_error": self.phase_error}
+            of_one = "both", port, learned, *how.values(), side.form
             self._traced[of_one] = side
 
             def reported(params: Mapping[str, Any], batch: Batch) -> Any:
-                return self.graph.report(port, self._traced[of_one], learned, alone=alone)(params, batch)
+                return self.graph.report(port, self._traced[of_one], learned, **how)(params, batch)
 
             def read() -> list[Any]:
                 return self.graph.arrays(port, self._traced[of_one])
@@ -281,7 +284,7 @@ class Predictor:
             # One recording serves the poses of all receivers unless they are trained.
             of_signal = "signal", port if self.graph.moves else None
             signal = self._recorded(of_signal, TOGETHER, partial(self.graph.learned, port), condition, port)
-        report = self.graph.report(port, side, learned, alone=alone)
+        report = self.graph.report(port, side, learned, alone=alone, phase_error=self.phase_error)
         return evaluated(report, self._params, condition, place, slots, weight, signal)
 
     def _may_record(self, size: int) -> bool:

@@ -15,7 +15,16 @@ from ..backend.device import to_float, to_tensor
 from ..gaussians.density import DensityChange
 
 Arrays = dict[str, NDArray[Any]]
-KEPT = ("step", "chosen", "view_gradient_norm", "view_gradient_steps", "reach_m", "searched_m", "surface")
+KEPT = (
+    "step",
+    "chosen",
+    "view_gradient_norm",
+    "view_gradient_steps",
+    "reach_m",
+    "searched_m",
+    "surface",
+    "phase_error",
+)
 """Attributes that a checkpoint stores under their names."""
 OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")
 """Further ones that belong to a fit, not to one of its states."""
@@ -37,6 +46,7 @@ class FitState:
         reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
         searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
         surface: whether Gaussians on surfaces are trained.
+        phase_error: standard deviation of a reflection's phase in predictions, rad (`Graph.report`), once chosen.
         baseline: scores of the held-out rows by the best state before the present stage, [rows]; empty where there is
             none.
         best_scores: those by the best state.
@@ -54,7 +64,7 @@ class FitState:
         self.mean = {name: to_tensor(values) for name, values in params.items()}
         self.step = self.chosen = 0
         self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
-        self.surface, self.baseline = False, np.zeros(0)
+        self.surface, self.phase_error, self.baseline = False, 0.0, np.zeros(0)
         self.best_scores, self.stage_scores, self.held_out = np.zeros(0), np.zeros(0), np.zeros(0)
         self.best: Arrays | None = None
         self.best_score, self.waited = -np.inf, 0

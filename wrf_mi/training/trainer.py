@@ -220,7 +220,7 @@ class Trainer(TrainingLoop):
             self._predictor = Predictor(graph.field, params, graph.receivers, *size, graph=graph)
         else:
             self._predictor.update(self.state.mean)
-        self._predictor.reach = self.reach()
+        self._predictor.reach, self._predictor.phase_error = self.reach(), self.state.phase_error
         return self._predictor
 
     def reach(self) -> Reach | None:
@@ -258,7 +258,7 @@ class Trainer(TrainingLoop):
             return False
         self._restore_paths()
         if self.plan.in_groups and self.graph.scene is not None:
-            self.state.held_out = self._judge.held_out_reports(self.predictor(), self.state)
+            self.state.held_out = self._judge.choose_phase_error(self.predictor(), self.state)
         if self.state.reach_m == 0 and self.graph.scene is None:
             logger.warning("at no distance from training rows do the Gaussians predict held-out rows better than zero")
             self.state.step = self.config.steps

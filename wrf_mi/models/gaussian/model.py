@@ -94,6 +94,8 @@ PARAM = "param/"
 """Prefix of a parameter's array in ``model.npz``."""
 REACH = "reach_m"
 """Array of the reach in metres: infinite where no validation chose a finite one."""
+PHASE_ERROR = "phase_error"
+"""Array of the standard deviation of a reflection's phase in predictions, rad, where it is not 0."""
 
 
 class FittedField(Fitted):
@@ -129,7 +131,14 @@ class FittedField(Fitted):
         graph.cover((), self.params)
         common = self.field, self.params, self.receivers, *form.size
         reach = _reach(self._arrays)
-        return Predictor(*common, operator=self._problem.operator, store=self._store, graph=graph, reach=reach)
+        return Predictor(
+            *common,
+            operator=self._problem.operator,
+            store=self._store,
+            graph=graph,
+            reach=reach,
+            phase_error=float(self._arrays.get(PHASE_ERROR, 0.0)),
+        )
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""
@@ -151,7 +160,8 @@ class FittedField(Fitted):
     def facts(self) -> dict[str, Any]:
         """Steps of the training and number of Gaussians."""
         gaussians = {} if self.field is None else {"gaussians": int(self.params["position"].shape[1])}
-        return {"steps": self.config.steps} | gaussians
+        phases = {PHASE_ERROR: float(self._arrays[PHASE_ERROR])} if PHASE_ERROR in self._arrays else {}
+        return {"steps": self.config.steps} | gaussians | phases
 
     def without_gaussians(self) -> FittedField:
         """The same paths without the Gaussians beside them."""
@@ -215,6 +225,8 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
         **receiver_arrays(receivers),
         **_reach_arrays(reach),
     }
+    if trainer.state.phase_error:
+        arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
     fitted = load(arrays, problem, folder)
     fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.held_out_reports()
     return fitted
