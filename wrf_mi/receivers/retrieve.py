@@ -20,10 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..parallel.threads import on_threads
 from .array import mirror_order
 from .lags import Lags
 
@@ -34,7 +35,15 @@ STARTS = 200
 GOOD_ENOUGH = 4.0
 """A start has converged when its residual is at most this many times that of the grey levels."""
 STEPS = 120
-"""Evaluations of one start; starts that converge take 20 to 60."""
+"""Steps of one start; starts that converge take 20 to 60."""
+TOGETHER = 128
+"""Spectra whose starts take their steps together."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e6
+"""Damping of the first step, the smallest, and the one at which a descent ends, relative to the diagonal."""
+SOFTER, HARDER = 5.0, 4.0
+"""Factors of the damping after a step that decreased the cost, and after another."""
+CONVERGED = 1e-7
+"""Relative decrease of the cost below which a start has converged: grey levels leave far more."""
 LEVELS = 255
 """Highest grey level; digits below a level are cut off."""
 
@@ -126,37 +135,63 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
     pixels = lags.shape[0] * lags.shape[1]
     wanted = lags.coordinates(unscaled.squared)
     enough = GOOD_ENOUGH * unscaled.rounding * np.sqrt(lags.count / pixels)
-    rng = np.random.default_rng(seed)
+    size = np.sqrt(unscaled.squared.mean(axis=(1, 2)) / (2 * m))
+    draws = np.random.default_rng(seed).normal(size=(len(wanted), starts, 2 * m))
     signals, residual = np.zeros((len(wanted), m), complex), np.full(len(wanted), np.inf)
-    for row, target in enumerate(wanted):
-        size = np.sqrt(unscaled.squared[row].mean() / (2 * m))
-        for _ in range(starts):
-            x, left = _descend(form, target, size * rng.normal(size=2 * m))
-            if left / np.sqrt(pixels) < residual[row]:
-                residual[row], signals[row] = left / np.sqrt(pixels), x[:m] + 1j * x[m:]
-            if residual[row] < enough[row]:
-                break
+
+    def descend(rows: IntArray) -> None:
+        left, done = rows, 0
+        while len(left) and done < starts:
+            # Several starts at once as soon as few rows are left: the calls take longer than small products.
+            together = min(max(1, len(rows) // len(left)), starts - done)
+            start = (size[left, None, None] * draws[left, done : done + together]).reshape(-1, 2 * m)
+            x, norm = _descend(form, np.repeat(wanted[left], together, axis=0), start)
+            norm = norm.reshape(-1, together) / np.sqrt(pixels)
+            best = norm.argmin(axis=1)
+            x, norm = (values.reshape(len(left), together, -1)[np.arange(len(left)), best] for values in (x, norm))
+            better = norm[:, 0] < residual[left]
+            residual[left[better]], signals[left[better]] = norm[better, 0], x[better, :m] + 1j * x[better, m:]
+            left, done = left[residual[left] >= enough[left]], done + together
+
+    on_threads(descend, np.array_split(np.arange(len(wanted)), -(-len(wanted) // TOGETHER)) if len(wanted) else [])
     return Retrieved(signals, residual, residual < enough)
 
 
-def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
-    """Levenberg-Marquardt from one start: real and imaginary parts of the signals, and the norm of the residual."""
-    size = len(start)
-    flat = form.reshape(size, -1)
+def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Levenberg-Marquardt from n starts [n, 2 m]: real and imaginary parts of the signals, and norms of residuals [n].
 
-    def slope(x: FloatArray) -> FloatArray:
-        return (x @ flat).reshape(size, -1).T
+    All starts take their steps together, each with a damping of its own: a step of one takes less time than its calls.
+    """
+    flat = form.reshape(len(form), -1)
 
-    best = least_squares(
-        lambda x: slope(x) @ x - target,
-        start,
-        lambda x: 2 * slope(x),
-        method="lm",
-        max_nfev=STEPS,
-        xtol=1e-9,
-        ftol=1e-9,
-    )
-    return best.x, float(np.sqrt(2 * best.cost))
+    def evaluated(x: FloatArray, of: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        half_slope = (x @ flat).reshape(len(x), len(form), -1)  # of the coordinates x^T F x by x
+        rest = np.matmul(x[:, None], half_slope)[:, 0] - target[of]
+        return half_slope, rest, np.square(rest).sum(axis=1)
+
+    x, damping, active = start.copy(), np.full(len(start), FIRST_DAMPING), np.arange(len(start))
+    half_slope, rest, cost = evaluated(x, active)
+    best = cost.copy()
+    for _ in range(STEPS):
+        matrix = 4 * half_slope @ half_slope.transpose(0, 2, 1)
+        diagonal = np.einsum("nii->ni", matrix)
+        diagonal *= 1 + damping[active, None]  # a view: Marquardt's scaling
+        step = np.linalg.solve(matrix, -2 * half_slope @ rest[:, :, None])[:, :, 0]
+        tried = evaluated(x[active] + step, active)
+        lower = tried[2] < cost
+        damping[active] = np.where(lower, np.maximum(damping[active] / SOFTER, LEAST_DAMPING), damping[active] * HARDER)
+        x[active[lower]] += step[lower]
+        # Steps that decrease the cost no more end a descent, and so do ever smaller ones.
+        goes_on = np.where(lower, cost - tried[2] > CONVERGED * cost, damping[active] < MOST_DAMPING)
+        half_slope, rest, cost = (
+            np.where(lower.reshape(-1, *[1] * (new.ndim - 1)), new, old)[goes_on]
+            for new, old in zip(tried, (half_slope, rest, cost), strict=True)
+        )
+        best[active[lower]] = tried[2][lower]
+        active = active[goes_on]
+        if not len(active):
+            break
+    return x, np.sqrt(best)
 
 
 def align_signals(signals: ArrayLike, tx_pos_m: ArrayLike, elements_m: ArrayLike) -> ComplexArray:
