@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from .. import __version__
 from ..backend.device import to_tensor
 from ..core import Receiver
 from ..core.array_files import stored_arrays, write_arrays
@@ -27,6 +26,7 @@ from ..gaussians.operator import Images, PixelOperator, pixel_weights
 from ..gaussians.static_signals import static_signals
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Field
+from ..version import __version__
 from .step import device_pose
 
 FORMAT = 1
