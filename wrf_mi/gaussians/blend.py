@@ -14,9 +14,9 @@ from typing import Any
 import drjit as dr
 
 from ..backend.device import quads
-from .footprint import Footprints
-from .footprint_constants import CUTOFF, LOG2_E, MIN_COSINE
-from .recurrence import ForwardState, Pair, ReverseState, accumulate, forward_step, reverse_start, reverse_step
+from ..backend.vectors import Complex
+from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints
+from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
 from .tiles import LANE_ROWS, Plane, TileLists
 
 RECORD = 16
@@ -101,7 +101,7 @@ def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
     return table
 
 
-def _read_signals(table: Any, slot: Any, group: int) -> list[Pair]:
+def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
     """Signals of a group for one Gaussian."""
     if group % 2:
         values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
@@ -156,7 +156,9 @@ def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = 
     )
 
 
-def _blend_one(record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ForwardState) -> ForwardState:
+def _blend_one(
+    record: list[Any], fields: int, signals: list[Complex], lanes: Lanes, state: ForwardState
+) -> ForwardState:
     """State behind one more Gaussian, of ``fields`` numbers without its signal."""
     along = along_azimuth(record, lanes.azimuth)
     result = ForwardState([], [])
@@ -195,13 +197,18 @@ def _forward(
 
 
 def _derivatives(
-    record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ReverseState, slopes: list[list[Pair]]
+    record: list[Any],
+    fields: int,
+    signals: list[Complex],
+    lanes: Lanes,
+    state: ReverseState,
+    slopes: list[list[Complex]],
 ) -> tuple[list[Any], list[Any], Any, ReverseState]:
     """Derivatives by one Gaussian's record and signals, summed over a lane's pixels; whether any sees it; the state."""
     along = along_azimuth(record, lanes.azimuth)
     sums: list[list[Any]] = [[0, 0] for _ in range(3)]
     by_blending: list[Any] = [0] * (fields - 9)
-    by_signal: list[Pair] = [(0, 0) for _ in signals]
+    by_signal: list[Complex] = [(0, 0) for _ in signals]
     after, seen = ReverseState([], []), False
     for k, elevation in enumerate(lanes.elevation):
         g, x, y, inverse = footprint_at(along, elevation)

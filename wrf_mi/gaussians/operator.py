@@ -23,12 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 
 from ..backend.device import on_device
+from ..backend.vectors import Complex, Pose
 from ..core import InputError
 from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
-from .footprint import Footprints, Pose, depth_order, project
+from .footprint import Footprints, depth_order, project
 from .parameters import Gaussians
-from .recurrence import SMALLEST_FACTOR, Pair, forward_step
+from .recurrence import SMALLEST_FACTOR, forward_step
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -93,8 +94,8 @@ def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
 
 
 def _store(
-    record: list[Any], i: Any, strip: Plane, slots: list[Any], t: list[Pair], out: tuple[Any, ...]
-) -> tuple[list[Any], list[Pair]]:
+    record: list[Any], i: Any, strip: Plane, slots: list[Any], t: list[Complex], out: tuple[Any, ...]
+) -> tuple[list[Any], list[Complex]]:
     """Write one Gaussian's weight at each pixel of a lane that sees it; next slots and T behind the Gaussian."""
     next_slots, behind = [], []
     for g, active, slot, before in zip(_footprints(record, strip), strip.active, slots, t, strict=True):

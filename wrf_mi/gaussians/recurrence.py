@@ -25,7 +25,7 @@ from typing import Any
 
 import drjit as dr
 
-Pair = tuple[Any, Any]
+from ..backend.vectors import Complex, conjugate_times, times
 
 SMALLEST_FACTOR = 1e-4
 """|b| below this is replaced in the derivative's quotient Q / b, of which both then vanish.
@@ -38,8 +38,8 @@ In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is ac
 class ForwardState:
     """State of the forward pass for each pixel of a lane: sums of its transmitters, and the transmittance T."""
 
-    total: list[list[Pair]]
-    t: list[Pair]
+    total: list[list[Complex]]
+    t: list[Complex]
 
     @classmethod
     def start(cls, float_type: Any, pixels: int, transmitters: int = 1) -> ForwardState:
@@ -52,29 +52,17 @@ class ForwardState:
 class ReverseState:
     """State of the reverse pass for each pixel of a lane: T, and Q times the gradient's conjugate."""
 
-    t: list[Pair]
-    q: list[Pair]
+    t: list[Complex]
+    q: list[Complex]
 
 
-def conjugate_times(a: Sequence[Any], b: Pair) -> Pair:
-    """Conjugate of a, times b."""
-    if len(a) == 1:
-        return a[0] * b[0], a[0] * b[1]
-    return a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]
-
-
-def times(a: Sequence[Any], b: Pair) -> Pair:
-    """Product of complex numbers."""
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def accumulate(total: Pair, weight: Sequence[Any], signal: Pair) -> Pair:
+def accumulate(total: Complex, weight: Sequence[Any], signal: Complex) -> Complex:
     """The sum R after one more Gaussian of weight w T."""
     re, im = dr.fma(weight[0], signal[0], total[0]), dr.fma(weight[0], signal[1], total[1])
     return (re, im) if len(weight) == 1 else (dr.fma(-weight[1], signal[1], re), dr.fma(weight[1], signal[0], im))
 
 
-def forward_step(blending: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...], Pair]:
+def forward_step(blending: list[Any], g: Any, t: Complex) -> tuple[tuple[Any, ...], Complex]:
     """Weight w T of a Gaussian with footprint G', and the transmittance behind it."""
     if len(blending) == 1:
         alpha = blending[0] * g
@@ -82,13 +70,13 @@ def forward_step(blending: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...],
     return (g * t[0], g * t[1]), times(_factor(blending, g), t)
 
 
-def _factor(delta: list[Any], g: Any) -> Pair:
+def _factor(delta: list[Any], g: Any) -> Complex:
     return 1 - g * (1 - delta[0]), g * delta[1]
 
 
 def reverse_start(
-    pixels: list[list[Any]], active: list[Any], total: Pair, gradient: Pair
-) -> tuple[list[list[Pair]], ReverseState]:
+    pixels: list[list[Any]], active: list[Any], total: Complex, gradient: Complex
+) -> tuple[list[list[Complex]], ReverseState]:
     """Gradients of each pixel of a lane, and the state before the first Gaussian.
 
     Args:
@@ -107,15 +95,15 @@ def reverse_start(
     return slopes, state
 
 
-def _summed(slopes: list[Any], values: list[Any]) -> Pair:
+def _summed(slopes: list[Any], values: list[Any]) -> Complex:
     """Conjugates of the gradients times values, summed over transmitters."""
     parts = [conjugate_times(g, v) for g, v in zip(slopes, values, strict=True)]
     return sum((re for re, _ in parts[1:]), parts[0][0]), sum((im for _, im in parts[1:]), parts[0][1])
 
 
 def reverse_step(
-    blending: list[Any], g: Any, t: Pair, q: Pair, signals: list[Pair], slopes: list[Pair]
-) -> tuple[Any, list[Any], list[Pair], Pair, Pair]:
+    blending: list[Any], g: Any, t: Complex, q: Complex, signals: list[Complex], slopes: list[Complex]
+) -> tuple[Any, list[Any], list[Complex], Complex, Complex]:
     """Derivatives of the loss by one Gaussian in one pixel.
 
     Args:

@@ -28,9 +28,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.vectors import Complex
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import TracedPaths
 from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
 

@@ -26,15 +26,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.vectors import Complex, Pose
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
-from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
-from ..tracing.field_calculator import Complex
 from ..tracing.instrument_parameters import receiver_pose
 from ..tracing.options import FACTOR
 from ..tracing.polarization import check_polarization

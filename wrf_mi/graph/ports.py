@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import columns_on_device, on_device
+from ..backend.vectors import Complex
 from ..core.angles import FloatArray, solid_angles
 from ..receivers.array import array_response
-from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import Float64, TracedPaths
 
 
