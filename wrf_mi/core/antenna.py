@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .angles import FloatArray, rotation_matrix
 from .errors import InputError
-
-if TYPE_CHECKING:
-    from .types import Record
 
 OMNIDIRECTIONAL = ("iso", "dipole", "hw_dipole")
 """Sionna RT's antenna patterns without dependence on azimuth: isotropic, short and half-wave dipole."""
@@ -135,20 +132,14 @@ class AntennaOptions:
         """Whether any attribute is stated."""
         return any(getattr(self, field.name) is not None for field in fields(self))
 
-    def of(self, record: Record) -> Record:
-        """A record with these antennas.
+    def replaced(self, antenna: Antenna, end: Literal["rx", "tx"]) -> Antenna:
+        """An antenna of the data, of a receiver or a transmitter, with the attributes that are stated for this end.
 
         Raises:
             InputError: names that `Antenna` refuses.
         """
-        if not self:
-            return record
-        stated = [(*field.name.split("_"), getattr(self, field.name)) for field in fields(self)]
-        rx, tx = (
-            {key: value for end, key, value in stated if end == which and value is not None} for which in ("rx", "tx")
-        )
-        receivers = tuple(replace(receiver, antenna=replace(receiver.antenna, **rx)) for receiver in record.receivers)
-        return replace(record, receivers=receivers, tx_antenna=replace(record.tx_antenna, **tx))
+        stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
+        return replace(antenna, **{name: value for name, value in stated.items() if value is not None})
 
 
 AS_STATED = AntennaOptions()
