@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import SQUARED_MAGNITUDE_EPS, IntArray
-from ..graph.combine import LEAST_POWER, SILENCE, ArrayReceiver, PowerReceiver
+from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..graph.ports import steering
+from ..receivers.reports import LEAST_POWER, SILENCE
 
 if TYPE_CHECKING:
     from .misfit import Misfit

@@ -31,17 +31,11 @@ from numpy.typing import NDArray
 from ..backend.vectors import Complex
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import SQUARED_MAGNITUDE_EPS
+from ..receivers.reports import LEAST_POWER, arrives, scaled, strength_db
 from ..tracing.traced_field import TracedPaths
 from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
 
 How = Literal["coherent", "power"]
-
-LEAST_POWER = 1e-20
-"""Constant added to a power before its logarithm: the lowest report is -200 dB."""
-SILENCE = 4 * LEAST_POWER
-"""Power up to which nothing arrives: above the constants that are added to powers."""
-FLOOR_DB = 1e-3
-"""Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
@@ -67,18 +61,6 @@ def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
 def add(*sides: Complex) -> Complex:
     """Sum of complex flat arrays."""
     return sum((re for re, _ in sides[1:]), sides[0][0]), sum((im for _, im in sides[1:]), sides[0][1])
-
-
-def scaled(image: Any, pixels: int) -> Any:
-    """Each image of ``pixels`` values scaled to its minimum and maximum, 0..1, as the instrument does.
-
-    Differentiable, extremes included; an image without contrast becomes 0.
-    """
-    index = dr.arange(dr.uint32_array_t(type(image)), dr.width(image)) // pixels
-    low, high = (dr.block_reduce(op, image, pixels) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
-    span = high - low
-    inverse = dr.select(span > 0, dr.rcp(dr.select(span > 0, span, 1)), 0)
-    return (image - dr.gather(type(image), low, index)) * dr.gather(type(image), inverse, index)
 
 
 def _float_type(learned: Complex | None) -> Any:
@@ -287,12 +269,11 @@ class PowerReceiver(CsiReceiver):
             mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
             of_paths = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count
-        received = dr.select(received > SILENCE, received + LEAST_POWER, self.floor)
-        return 10 * dr.log2(received) / math.log2(10)
+        return strength_db(received, self.floor, LEAST_POWER)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by mean powers in dB."""
-        arrives = np.abs(report - 10 * math.log10(self.floor)) > FLOOR_DB
-        if not arrives.any():
+        received = arrives(report, self.floor)
+        if not received.any():
             return 0.0
-        return float((np.nanmean(observed[arrives]) - np.mean(report[arrives])) * math.log(10) / 20)
+        return float((np.nanmean(observed[received]) - np.mean(report[received])) * math.log(10) / 20)

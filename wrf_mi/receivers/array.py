@@ -1,4 +1,4 @@
-"""Antenna arrays: response to a plane wave, Bartlett spectrum, the instrument's scaling.
+"""Antenna arrays: response to a plane wave and Bartlett spectrum.
 
 Conventions (`wrf_mi.core.angles`): elements lie in the array's x-y plane, boresight +z. With the time factor
 exp(+j omega t), a wave that arrives *from* unit vector u reaches the element at p with the phase +k p . u
@@ -116,15 +116,3 @@ def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin:
     """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
     directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
     return array_response(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).conj().T.copy()
-
-
-def minmax_scale(spectrum: ArrayLike) -> FloatArray:
-    """Scale each image [..., height, width] by its minimum and maximum to 0..1, as the instrument does.
-
-    A constant image (nothing received) becomes 0.
-    """
-    image = np.asarray(spectrum, float)
-    low = image.min(axis=(-2, -1), keepdims=True)
-    span = image.max(axis=(-2, -1), keepdims=True) - low
-    result: FloatArray = np.divide(image - low, span, out=np.zeros_like(image), where=span > 0)
-    return result

@@ -11,6 +11,7 @@ from scipy.constants import speed_of_light
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from .reports import strength_db
 
 ComplexArray = NDArray[np.complex128]
 
@@ -145,7 +146,4 @@ def received_power(paths: Paths) -> FloatArray:
 
 def rssi_dbm(paths: Paths) -> FloatArray:
     """Received signal strength in dBm for 0 dBm sent, shape [n_rx, n_tx], NaN where no path arrives."""
-    power = received_power(paths)
-    decibel = np.full(power.shape, np.nan)
-    np.log10(power, out=decibel, where=power > 0)
-    return 10 * decibel
+    return np.asarray(strength_db(received_power(paths)))

@@ -15,8 +15,9 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
-from .array import bartlett_spectrum, minmax_scale
+from .array import bartlett_spectrum
 from .channel import antenna_csi, csi, rssi_dbm
+from .reports import minmax_scale
 
 CHUNK_SIZE = 64
 """Transmitters whose spectra are computed together."""
