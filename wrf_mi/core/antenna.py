@@ -91,13 +91,15 @@ class Antenna:
         square = x * x + y * y
         pole = square < POLE
         inverse = 1 / arrays.sqrt(select(pole, 1.0, square))
+        # Cosine and sine of the azimuth, and ``level``, the sine of the zenith angle.
         cosine, sine, level = select(pole, 1.0, x * inverse), select(pole, 0.0, y * inverse), square * inverse
         unit = [z * cosine, z * sine, -level] if self.polarization == "V" else [-sine, cosine, 0 * z]
         if self.pattern == "iso":
             return unit
         if self.pattern == "dipole":
-            amplitude = math.sqrt(1.5) * level
+            amplitude = math.sqrt(1.5) * level  # directivity 1.5
         elif self.pattern == "hw_dipole":
+            # Its limit at the poles is 0, where the quotient is 0 / 0; directivity 1.643.
             amplitude = select(pole, 0.0, math.sqrt(1.643) * arrays.cos(math.pi / 2 * z) * inverse)
         else:
             angles = (arrays.atan2(level, z) - math.pi / 2) / WIDTH_RAD, arrays.atan2(sine, cosine) / WIDTH_RAD

@@ -126,10 +126,11 @@ class WrfGs:
         batch, hidden = tx_pos.shape[1], self.features(params)
         z = linear(params, "attenuation.delta", hidden)
         re, im = rows(z)
+        # delta = z / sqrt(1 + |z|^2): |delta| < 1, so that a Gaussian never amplifies what lies behind it.
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
         encoded = {"transmitter": self.encoding.transmitter(tx_pos)}
-        seen = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
-        signal = linear(params, "signal.out", dense(params, "signal.1", seen))
+        hidden = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
+        signal = linear(params, "signal.out", dense(params, "signal.1", hidden))
         return Gaussians(
             **common_geometry(params),
             signal=rows(signal),

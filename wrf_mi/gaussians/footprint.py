@@ -74,6 +74,7 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     depth = dr.sqrt(dot(local, local))
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
+    # A Gaussian without footprint gets the direction +z: a zero vector has no tangent basis.
     n[2] = dr.select(visible, n[2], 1)
     e1, e2 = tangent_basis(n)
     n, e1, e2 = ([dr.tile(c, batch) for c in v] for v in (n, e1, e2))
@@ -100,6 +101,7 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     a = [p * l11 for p in e1]
     b = [(q - slope * p) * l22 for p, q in zip(e1, e2, strict=True)]
 
+    # The larger eigenvalue of C bounds the footprint's radius; it only selects tiles, so it takes no gradient.
     d11, d22, d12 = dr.detach(c11), dr.detach(c22), dr.detach(c12)
     largest = 0.5 * (d11 + d22 + dr.sqrt((d11 - d22) ** 2 + 4 * d12 * d12))
     return Footprints(
@@ -132,19 +134,19 @@ def ranked_order(keys: list[dr.ArrayBase]) -> dr.ArrayBase:
     """
     index_type: Any = dr.uint32_array_t(type(keys[0]))
     n = dr.width(keys[0])
-    own = dr.arange(index_type, n)
+    lane = dr.arange(index_type, n)
     other, rank = dr.zeros(index_type, n), dr.zeros(index_type, n)
     while other < n:
-        rank = dr.select(_precedes(keys, other, own), rank + 1, rank)
+        rank = dr.select(_precedes(keys, other, lane), rank + 1, rank)
         other += 1
     # Of keys that are no numbers none is before another: their places hold the first entry.
     order = dr.zeros(index_type, n)
-    dr.scatter(order, own, rank)
+    dr.scatter(order, lane, rank)
     return order
 
 
-def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, own: dr.ArrayBase) -> dr.ArrayBase:
-    """Whether the entry of index ``other`` comes before ``own``, the lanes' indices in order."""
+def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, lane: dr.ArrayBase) -> dr.ArrayBase:
+    """Whether the entry of index ``other`` comes before ``lane``, the lanes' indices in order."""
     mask_type: Any = dr.mask_t(keys[0])
     before, equal = mask_type(False), mask_type(True)
     for key in keys:
@@ -152,4 +154,4 @@ def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, own: dr.ArrayBase) 
         value = dr.gather(type(key), key, other, equal)
         before |= equal & (value < key)
         equal &= value == key
-    return before | (equal & (other < own))
+    return before | (equal & (other < lane))

@@ -87,8 +87,10 @@ def reverse_start(
     """
     float_type: Any = type(total[0])
     slopes, state = [], ReverseState([], [])
-    for numbers, seen in zip(pixels, active, strict=True):
-        g, r = ([tuple(dr.gather(float_type, a, i, seen) for a in pair) for i in numbers] for pair in (gradient, total))
+    for numbers, is_active in zip(pixels, active, strict=True):
+        g, r = (
+            [tuple(dr.gather(float_type, a, i, is_active) for a in pair) for i in numbers] for pair in (gradient, total)
+        )
         slopes.append(g)
         state.q.append(_summed(g, r))
         state.t.append((float_type(1), float_type(0)))
@@ -121,14 +123,16 @@ def reverse_step(
     by_signal = [conjugate_times(weight, slope) for slope in slopes]
     h = _summed(slopes, signals)
     if len(blending) == 1:
+        # T and w are real: only Re(conj(slope) S) counts. c = dL/dw; dL/db = Q / b, with db = -dw.
         alpha, c_re = blending[0] * g, h[0] * t[0]
         q_re = q[0] - alpha * c_re
         by_alpha = c_re - q_re * dr.rcp(dr.maximum(1 - alpha, SMALLEST_FACTOR))
         return by_alpha * blending[0], [by_alpha * g], by_signal, after, (q_re, q[1])
-    # Re(c) is the derivative by a real weight.
+    # c = conj(slope) S T: Re(c) is dL/dw of the real weight w = G'; Q / b = Q conj(b) / |b|^2 is dL/db.
     c_re, c_im = times(h, t)
     q, b = (q[0] - g * c_re, q[1] - g * c_im), _factor(blending, g)
     scale = dr.rcp(dr.maximum(b[0] * b[0] + b[1] * b[1], SMALLEST_FACTOR**2))
     f_re, f_im = (x * scale for x in conjugate_times(b, q))
+    # b = 1 - G' (1 - delta): db/dG' = delta - 1 and db/d(delta) = G', complex, of which L takes the real part.
     by_g = c_re - f_re * (1 - blending[0]) - f_im * blending[1]
     return by_g, [g * f_re, -g * f_im], by_signal, after, q

@@ -63,6 +63,7 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
     """
     each = paths.each
+    # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them.
     lane = dr.arange(mi.UInt32, paths.batch * ports.count * each)
     port = (lane // each) % ports.count
     slot = (lane // (each * ports.count)) * each + lane % each
@@ -77,6 +78,7 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     away = [of_path(u) * length - of_port(p) for u, p in zip(paths.arrival, ports.offset_m, strict=True)]
     distance = dr.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
     sine, cosine = dr.sincos(-of_port(ports.wavenumber) * distance)
+    # The gain has the loss lambda / (4 pi d) of the origin; at the port the wave has travelled d_m.
     re, im = (of_path(part) * length / distance for part in paths.gain)
     terms = re * cosine - im * sine, re * sine + im * cosine
     return tuple(dr.block_reduce(dr.ReduceOp.Add, term, each) for term in terms)
@@ -123,8 +125,8 @@ def _products(x: Complex, parts: Any) -> list[Any]:
     One matrix product in place of four, for each of which Dr.Jit would rearrange the matrix.
     """
     rows = matrix(dr.concat(x), parts.shape[0])
-    found = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
-    return [found[i, :, j].array for i in range(2) for j in range(2)]
+    real_products = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
+    return [real_products[i, :, j].array for i in range(2) for j in range(2)]
 
 
 def steering(offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> ComplexMatrix:

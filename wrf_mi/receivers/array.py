@@ -78,6 +78,7 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
     """
     signals, elements = np.asarray(h, dtype=complex), np.asarray(positions_m, float)
     first, second, order = _lines(elements)
+    # exp(-j k (x + y) . u) is a product: a planar grid is summed along one line, then along the other.
     grids = signals[..., order].reshape(-1, len(first), len(second))
     images = np.empty((len(grids), height * width))
     step = max(1, TABLE_BYTES // (16 * (len(first) + len(second))))
@@ -86,10 +87,10 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
         block = float(frequency_hz), height, width, begin, begin + step
         outer, inner = (_beams(line.tobytes(), *block) for line in (first, second))
         for start in range(0, len(grids), together):
-            some = slice(start, start + together)
-            waves = grids[some] @ inner
+            rows = slice(start, start + together)
+            waves = grids[rows] @ inner
             total = waves[:, 0] if len(first) == 1 else np.einsum("nxd,xd->nd", waves, outer)
-            images[some, begin : begin + step] = np.abs(total)
+            images[rows, begin : begin + step] = np.abs(total)
     return images.reshape(*signals.shape[:-1], height, width)
 
 
@@ -99,14 +100,14 @@ def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     The first line of other arrays is the origin alone: one sum is faster for few elements, and tables of lines are
     smaller for many.
     """
-    whole = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
+    ungrouped = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
     grain = ALIGNED * float(np.ptp(elements_m, axis=0).max())
     if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:
-        return whole
+        return ungrouped
     (x, column), (y, row) = (np.unique(np.round(part / grain), return_inverse=True) for part in elements_m.T[:2])
     order = np.lexsort((row, column))
     if len(x) * len(y) != len(elements_m) or (np.diff(column[order] * len(y) + row[order]) != 1).any():
-        return whole
+        return ungrouped
     grid = elements_m[order].reshape(len(x), len(y), 3)
     return grid[:, 0], grid[0] - grid[0, 0], order
 

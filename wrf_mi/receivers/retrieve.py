@@ -93,12 +93,12 @@ class Retrieved:
     Attributes:
         signals: [n, m], each row up to a common phase (and the exchange with its mirror image).
         residual: root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n].
-        found: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
+        explained: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
     """
 
     signals: ComplexArray
     residual: FloatArray
-    found: NDArray[np.bool_]
+    explained: NDArray[np.bool_]
 
 
 def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:
@@ -145,7 +145,7 @@ def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[F
     flat = form.reshape(size, -1)
 
     def slope(x: FloatArray) -> FloatArray:
-        return (x @ flat).reshape(size, -1).T
+        return (x @ flat).reshape(size, -1).T  # F x: the forms are quadratic, so their derivative is 2 F x
 
     best = least_squares(
         lambda x: slope(x) @ x - target,
