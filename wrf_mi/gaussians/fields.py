@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from scipy.constants import speed_of_light
 
+from ..backend.vectors import times
 from ..core import InputError
 from .encoding import encode, encoded_size
 from .initial import InitialGaussians
@@ -235,8 +236,8 @@ class WrfGsPlus:
         turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
         # Subtract whole turns first: sines of large arguments have no digits left in float32.
         sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
-        re, im = signal
-        return [re * cosine - im * sine, re * sine + im * cosine]
+        re, im = signal  # a field with a phase has one component
+        return list(times((re, im), (cosine, sine)))
 
 
 @dataclass(frozen=True)

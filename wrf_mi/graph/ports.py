@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import columns_on_device, on_device
-from ..backend.vectors import Complex
+from ..backend.vectors import Complex, times
 from ..core.angles import FloatArray, solid_angles
 from ..receivers.array import array_response
 from ..tracing.traced_field import Float64, TracedPaths
@@ -80,7 +80,7 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     sine, cosine = dr.sincos(-of_port(ports.wavenumber) * distance)
     # The gain has the loss lambda / (4 pi d) of the origin; at the port the wave has travelled d_m.
     re, im = (of_path(part) * length / distance for part in paths.gain)
-    terms = re * cosine - im * sine, re * sine + im * cosine
+    terms = times((re, im), (cosine, sine))
     return tuple(dr.block_reduce(dr.ReduceOp.Add, term, each) for term in terms)
 
 
