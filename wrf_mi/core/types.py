@@ -47,9 +47,6 @@ class Prediction:
 
 IntArray = NDArray[np.int64]
 
-SQUARED_MAGNITUDE_EPS = 1e-8
-"""Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
-
 
 @dataclass(frozen=True)
 class Receiver:

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from ..backend.vectors import Complex
 from ..core.angles import FloatArray, pixel_directions
-from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..receivers.reports import LEAST_POWER, arrives, scaled, strength_db
+from ..receivers.array import steering_matrix
+from ..receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS, arrives, scaled, strength_db
 from ..tracing.traced_field import TracedPaths
-from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
+from .ports import ComplexMatrix, Ports, direction_weights, path_sum, weighted
 
 How = Literal["coherent", "power"]
 
@@ -94,7 +94,8 @@ class PixelReceiver:
 
     @cached_property
     def _steering(self) -> ComplexMatrix:
-        return steering(self.elements_m, pixel_directions(self.height, self.width).reshape(-1, 3), self.frequency_hz)
+        directions = pixel_directions(self.height, self.width).reshape(-1, 3)
+        return ComplexMatrix(steering_matrix(self.elements_m, directions, self.frequency_hz))
 
     @cached_property
     def _ports(self) -> Ports:

@@ -17,7 +17,6 @@ from scipy.constants import speed_of_light
 from ..backend.device import columns_on_device, on_device
 from ..backend.vectors import Complex, times
 from ..core.angles import FloatArray, solid_angles
-from ..receivers.array import array_response
 from ..tracing.traced_field import Float64, TracedPaths
 
 
@@ -47,11 +46,7 @@ class Ports:
 
 
 def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
-    """Coherent sum of a receiver's paths at m ports: sum over paths of g (d / d_m) exp(-j k_m d_m).
-
-    Each path is a spherical wave from its image source, at the unfolded length d in the direction of arrival; for flat
-    mirrors that is exact, near field included. It neglects that a path may be blocked for some elements only; all
-    reflect at the angle of the array's origin.
+    """Coherent sum of a receiver's paths at m ports, spherical waves as in `wrf_mi.receivers.antenna_csi`.
 
     Args:
         paths: paths of a batch of transmitters.
@@ -59,8 +54,6 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
 
     Returns:
         Real and imaginary part, float64 [batch * m]. A fixed order of summation: the same in every run.
-
-    Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
     """
     each = paths.each
     # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them.
@@ -127,17 +120,6 @@ def _products(x: Complex, parts: Any) -> list[Any]:
     rows = matrix(dr.concat(x), parts.shape[0])
     real_products = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
     return [real_products[i, :, j].array for i in range(2) for j in range(2)]
-
-
-def steering(offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> ComplexMatrix:
-    """Matrix exp(-j k p . u) [m, n] of ports and directions: forward gives the Bartlett sum, its adjoint port signals.
-
-    Args:
-        offset_m: ports [m, 3] in the receiver's frame, metres.
-        directions: unit vectors [n, 3] in that frame.
-        frequency_hz: carrier.
-    """
-    return ComplexMatrix(array_response(offset_m, directions, frequency_hz).conj().T)
 
 
 def matrix(flat: Any, columns: int) -> Any:

@@ -112,8 +112,13 @@ def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     return grid[:, 0], grid[0] - grid[0, 0], order
 
 
+def steering_matrix(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
+    """Factors exp(-j k p_m . u) [m, n] of elements [m, 3] and directions [n, 3]: h times it is the Bartlett sum."""
+    return array_response(positions_m, directions, frequency_hz).conj().T
+
+
 @lru_cache(KEPT_TABLES)
 def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin: int, end: int) -> ComplexArray:
     """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
     directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
-    return array_response(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).conj().T.copy()
+    return steering_matrix(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).copy()

@@ -1,8 +1,14 @@
-"""Reports of instruments: strengths with their floor and spectra with their scaling, for NumPy and Dr.Jit arrays alike.
+"""Reports of instruments, for NumPy and Dr.Jit arrays alike.
 
-The traced instruments (`wrf_mi.receivers.instruments`) report NumPy arrays, the receiver models of a fit
-(`wrf_mi.graph.combine`) Dr.Jit dr. Dr.Jit is imported on request: a
-command that only reads data does without it.
+| instrument | reports | of path gains g, lengths d and, at element or antenna m, distances d_m from the image source |
+| --- | --- | --- |
+| array | spectrum | magnitude of the Bartlett sum of h_m in each direction, scaled to 0..1; in a fit at least 1e-4 |
+| power | strength | sum of the powers of paths, in dB, or a floor |
+| antennas | channel | h_m = sum over paths of g (d / d_m) exp(-j k d_m), on each subcarrier |
+
+Sums over paths depend on the layout of their arrays: `wrf_mi.receivers.channel` has those of traced instruments
+(`wrf_mi.receivers.instruments`, NumPy), `wrf_mi.graph.ports` those of a fit's receiver models (`wrf_mi.graph.combine`,
+Dr.Jit). Dr.Jit is imported on request: a command that only reads data does without it.
 """
 
 from __future__ import annotations
@@ -15,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray
 
+SQUARED_MAGNITUDE_EPS = 1e-8
+"""Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
 LEAST_POWER = 1e-20
 """Constant added to a power before its logarithm in a fit: the lowest report is -200 dB."""
 SILENCE = 4 * LEAST_POWER
