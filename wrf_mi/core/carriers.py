@@ -28,6 +28,7 @@ def by_carrier(
     """
     every = rows_of_carriers(carriers_hz)
     values = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)
+    # Rows came out carrier by carrier; the inverse permutation puts them back.
     return np.take(values, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
 
 

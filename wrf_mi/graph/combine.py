@@ -136,9 +136,11 @@ class ArrayReceiver(PixelReceiver):
         sides: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
         if learned is not None:
             weights = direction_weights(self.height, self.width, 1, _float_type(learned))
+            # The integral over directions gives element signals, so that a learned spectrum has the array's lobes.
             sides[1] = self._steering.adjoint(weighted(learned, weights))
         present = [side for side in sides if side is not None]
         if self.how == "coherent" and present:
+            # The Bartlett sum is linear: one image of the sum in place of one of each side.
             sides = [add(*present), None]
         images = [None if side is None else self._steering.forward(side) for side in sides]
         spectrum = magnitude(images[0], images[1], self.how)
@@ -231,10 +233,12 @@ class CsiReceiver:
             raise ValueError("CsiReceiver: neither a traced nor a learned side")
         re, im = add(*sides)
         pair: Any = mi.Complex2f if type(re) is mi.Float else dr.float64_array_t(mi.Complex2f)
+        # Real and imaginary parts in turn, as a record's complex numbers are in memory.
         return dr.ravel(pair(re, im))
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
+        # Half the logarithm of a ratio of powers is that of amplitudes.
         powers = [np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report)]
         return float(np.log(powers[0] / powers[1]) / 2)
 
@@ -277,4 +281,5 @@ class PowerReceiver(CsiReceiver):
         received = arrives(report, self.floor)
         if not received.any():
             return 0.0
+        # dB to nepers of an amplitude: ln(10) / 20.
         return float((np.nanmean(observed[received]) - np.mean(report[received])) * math.log(10) / 20)

@@ -105,6 +105,7 @@ def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:
         return ungrouped
     (x, column), (y, row) = (np.unique(np.round(part / grain), return_inverse=True) for part in elements_m.T[:2])
+    # A grid has each pair of a column and a row once: numbers of places in order then differ by one.
     order = np.lexsort((row, column))
     if len(x) * len(y) != len(elements_m) or (np.diff(column[order] * len(y) + row[order]) != 1).any():
         return ungrouped

@@ -114,6 +114,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
         InputError: an array whose lags do not determine its signals: a line, or fewer than four elements.
     """
     m = lags.elements
+    # A second singular value of zero: all lags are on one line, whose spectra other signals have too.
     extent = np.linalg.svd(lags.lag_m, compute_uv=False)
     if lags.count < 2 * m - 1 or extent[1] < 1e-6 * extent[0]:
         raise InputError(f"retrieval: {m} elements on a line or too few lags; it takes an array of two dimensions")
@@ -129,6 +130,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
     rng = np.random.default_rng(seed)
     signals, residual = np.zeros((len(wanted), m), complex), np.full(len(wanted), np.inf)
     for row, target in enumerate(wanted):
+        # The mean of P over directions is about the sum of |h_m|^2, that is 2 m times a real part's variance.
         size = np.sqrt(unscaled.squared[row].mean() / (2 * m))
         for _ in range(starts):
             x, left = _descend(form, target, size * rng.normal(size=2 * m))

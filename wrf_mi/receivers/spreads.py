@@ -58,7 +58,7 @@ class PathStatistics:
 
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = total(np.ones(len(power)))
-            gain[gain == 0] = np.nan
+            gain[gain == 0] = np.nan  # makes every statistic NaN
             # About the first delay of each transmitter, as variances about zero cancel.
             first_m = np.full(count, np.inf)
             np.minimum.at(first_m, transmitter, length_m)
