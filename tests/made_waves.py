@@ -8,7 +8,8 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.receivers.reports import minmax_scale
 
 FREQUENCY_HZ = 920e6
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ

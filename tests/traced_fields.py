@@ -8,7 +8,7 @@ import numpy as np
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core import Receiver, rotation_matrix, unit_vectors
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 RECEIVER = Receiver(
     "receiver", np.array([0.3, -1.2, 2.0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])

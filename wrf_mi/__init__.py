@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from .version import __version__
+
 if TYPE_CHECKING:
     from .checking import check_data
     from .core import BackendError, InputError, Receiver, Record, Split
@@ -29,8 +31,6 @@ if TYPE_CHECKING:
     from .training.config import TrainConfig
     from .training.trainer import Trainer
     from .viewer.view import view
-
-__version__ = "0.2.0"
 
 _HOME = {
     "BackendError": "core",

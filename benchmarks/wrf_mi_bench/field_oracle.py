@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from wrf_mi.core import Receiver, rotation_matrix
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 ComplexArray = NDArray[np.complex128]
 

@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 import traceback
-import zlib
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -237,13 +236,6 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         append_line(place / RESULTS, _tally(name, int(count), refused, loaded, failed, slowest, largest))
         start = 0
     shutil.rmtree(place / "work", ignore_errors=True)
-
-
-def unpacked(text: str) -> bytes:
-    """Bytes of a sample that is stored in the source."""
-    import base64
-
-    return zlib.decompress(base64.b85decode(text))
 
 
 if __name__ == "__main__":

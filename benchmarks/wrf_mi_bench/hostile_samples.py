@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -44,8 +46,6 @@ from wrf_mi.scene.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.training.checkpoint import cut_log, read_checkpoint
 from wrf_mi.viewer.map_layer import read_map
-
-from .hostile_files import unpacked
 
 UP = np.array([0.0, 0, 0, 1])
 CARRIER_HZ = 2.4e9
@@ -281,7 +281,7 @@ def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None
     channels = rng.normal(size=12) + 1j * rng.normal(size=12)
     room = {"tx_pos": np.zeros(3), "rx_pos": positions, "frequency_hz": np.asarray(CARRIER_HZ), "csi": channels}
     write_arrays(folder / "room.npz", room, compressed=True)
-    (folder / "table.pkl").write_bytes(unpacked(PICKLE))
+    (folder / "table.pkl").write_bytes(zlib.decompress(base64.b85decode(PICKLE)))
     with h5py.File(folder / "capture.hdf5", "w") as stored:
         samples = rng.integers(-99, 99, (4, 2, 448, 2), dtype=np.int16)
         stored.create_dataset("Pilot_Samples", data=samples, compression="gzip")

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wrf_mi.backend.device import on_device as to_device
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint import Pose
-from wrf_mi.gaussians.footprint_constants import CUTOFF, MIN_COSINE
+from wrf_mi.gaussians.footprint import CUTOFF, MIN_COSINE
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose

@@ -19,10 +19,10 @@ from wrf_mi_plugins.ray_response import ray_footprints
 
 from wrf_mi.backend.device import on_device as to_device
 from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians.footprint import Pose, depth_order
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, depth_order
 from wrf_mi.gaussians.parameters import Gaussians
 
 from . import field_oracle

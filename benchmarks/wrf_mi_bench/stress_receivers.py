@@ -15,10 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from wrf_mi.backend.device import on_device as to_device
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Paths, Receiver, unit_vectors
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver

@@ -29,7 +29,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from wrf_mi.gaussians.footprint import Pose, depth_order
+from wrf_mi.backend.vectors import Pose
+from wrf_mi.gaussians.footprint import depth_order
 from wrf_mi.gaussians.parameters import Gaussians
 
 from .bundles import Bundles, RayLists

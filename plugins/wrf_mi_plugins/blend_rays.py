@@ -17,16 +17,15 @@ from typing import Any
 
 import drjit as dr
 
+from wrf_mi.backend.vectors import conjugate_times, times
 from wrf_mi.gaussians.blend import RECORD, pack, read, unpack
 from wrf_mi.gaussians.recurrence import (
     ForwardState,
     ReverseState,
     accumulate,
-    conjugate_times,
     forward_step,
     reverse_start,
     reverse_step,
-    times,
 )
 
 from .bundles import Bundles, RayLists

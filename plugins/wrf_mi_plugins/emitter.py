@@ -10,7 +10,7 @@ import mitsuba as mi
 from numpy.typing import ArrayLike
 
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.footprint import CUTOFF
 from wrf_mi.gaussians.parameters import Gaussians
 
 from .optical_depth import attenuators, closest_approach

@@ -14,14 +14,13 @@ import mitsuba as mi
 import numpy as np
 
 from wrf_mi.backend.device import to_float
+from wrf_mi.backend.vectors import Complex, Pose
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import Plane
 from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
-from wrf_mi.tracing.field_calculator import Complex
 from wrf_mi.tracing.material_parameters import MaterialGrouping, slabs_of_faces
 from wrf_mi.tracing.surfaces import scene_surfaces
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.footprint import CUTOFF
 
 CELLS_PER_GAUSSIAN = 8
 """Approximate number of (cubic) cells per Gaussian."""

@@ -21,7 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD
 from wrf_mi.gaussians.parameters import Gaussians
 
 from .blend_rays import Walls

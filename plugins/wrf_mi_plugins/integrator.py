@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.footprint import Pose
 
 from .acceleration import traced_lists
 from .blend_rays import Walls, blend_rays

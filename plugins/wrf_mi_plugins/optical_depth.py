@@ -27,8 +27,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from wrf_mi.gaussians.footprint import dot, principal_axes
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.backend.vectors import dot, principal_axes
+from wrf_mi.gaussians.footprint import CUTOFF
 from wrf_mi.gaussians.parameters import Gaussians, each
 
 from .extinction_cells import CellLists, HostGaussians

@@ -24,8 +24,8 @@ from typing import Any
 
 import drjit as dr
 
-from wrf_mi.gaussians.footprint import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.backend.vectors import Pose, centre_distance, cross, dot, principal_axes, tangent_basis
+from wrf_mi.gaussians.footprint import CUTOFF, LOG2_E, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from wrf_mi.gaussians.parameters import Gaussians
 
 RAY_FIELDS = 12

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wrf_mi.backend.device import to_vectors
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import InputError, pixel_directions, rotation_matrix
 from wrf_mi.core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray, azimuth_rad, unit_vectors
-from wrf_mi.gaussians.footprint import Pose
 
 
 def equirectangular_sphere(height: int, width: int) -> FloatArray:

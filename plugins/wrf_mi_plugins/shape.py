@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.footprint import CUTOFF
 from wrf_mi.gaussians.parameters import Gaussians
 
 SIGNAL, OPACITY, ATTENUATION = "signal", "opacity", "attenuation"

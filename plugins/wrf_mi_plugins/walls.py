@@ -9,8 +9,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import InputError
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.tracing.field_calculator import slab
 from wrf_mi.tracing.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wrf_mi import backend
-from wrf_mi.backend import cache, libraries, probe
+from wrf_mi.backend import libraries, probe
 from wrf_mi.core import BackendError, InputError
 
 SECONDS_PER_CHILD = 300
@@ -26,7 +26,7 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Other tests may have initialised the backend in this process, which sets the variable.
     monkeypatch.delenv(libraries.LLVM_VARIABLE, raising=False)
     monkeypatch.delenv(libraries.CUDA_VARIABLE, raising=False)
-    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
+    monkeypatch.setattr(probe, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
 
 
 @pytest.fixture
@@ -203,25 +203,25 @@ def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypat
 
 
 def test_cached_failures_expire() -> None:
-    cache.remember("short", {"usable": False}, seconds=-1)
-    cache.remember("long", {"usable": True})
-    assert cache.recall("short") is None
-    assert cache.recall("long") == {"usable": True}
+    probe.remember("short", {"usable": False}, seconds=-1)
+    probe.remember("long", {"usable": True})
+    assert probe.recall("short") is None
+    assert probe.recall("long") == {"usable": True}
 
 
 def test_damaged_cache_counts_as_empty() -> None:
-    cache.remember("key", {"usable": True})
-    cache.cache_file().write_text('{"key": {"usa')
-    assert cache.recall("key") is None
-    cache.remember("key", {"usable": True})
-    assert cache.recall("key") == {"usable": True}
+    probe.remember("key", {"usable": True})
+    probe.cache_file().write_text('{"key": {"usa')
+    assert probe.recall("key") is None
+    probe.remember("key", {"usable": True})
+    assert probe.recall("key") == {"usable": True}
 
 
 def test_unwritable_cache_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
-    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "file" / "libraries.json")
-    cache.remember("key", {"usable": True})
-    assert cache.recall("key") is None
+    monkeypatch.setattr(probe, "cache_file", lambda: tmp_path / "file" / "libraries.json")
+    probe.remember("key", {"usable": True})
+    assert probe.recall("key") is None
 
 
 def test_choice_is_fast_once_cached() -> None:

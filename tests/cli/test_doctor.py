@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from wrf_mi import backend
-from wrf_mi.backend import cache, libraries, remedy
+from wrf_mi.backend import libraries, probe, remedy
 from wrf_mi.cli import doctor
 from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError
@@ -18,7 +18,7 @@ from wrf_mi.core import BackendError
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Other tests may have initialised the backend in this process, which sets the variable.
     monkeypatch.delenv(libraries.LLVM_VARIABLE, raising=False)
-    monkeypatch.setattr(cache, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
+    monkeypatch.setattr(probe, "cache_file", lambda: tmp_path / "cache" / "libraries.json")
 
 
 class System:

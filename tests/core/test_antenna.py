@@ -80,13 +80,14 @@ def made(antenna: Antenna) -> Record:
 
 def test_options_replace_only_the_given_properties() -> None:
     record = made(Antenna("dipole", "H"))
-    assert AntennaOptions().of(record) is record
-    changed = AntennaOptions(rx_polarization="V", tx_pattern="hw_dipole").of(record)
+    assert record.with_antennas(AntennaOptions()) is record
+    changed = record.with_antennas(AntennaOptions(rx_polarization="V", tx_pattern="hw_dipole"))
     assert [astuple(receiver.antenna) for receiver in changed.receivers] == [("dipole", "V", "world")] * 2
     assert changed.tx_antenna == Antenna("hw_dipole")
     with pytest.raises(InputError, match="state frame array"):
-        AntennaOptions(rx_pattern="tr38901").of(record)
-    assert AntennaOptions(rx_pattern="tr38901", rx_frame="array").of(record).receivers[1].antenna.frame == "array"
+        record.with_antennas(AntennaOptions(rx_pattern="tr38901"))
+    directional = record.with_antennas(AntennaOptions(rx_pattern="tr38901", rx_frame="array"))
+    assert directional.receivers[1].antenna.frame == "array"
 
 
 def test_stored_receivers_are_read_back(tmp_path: Path) -> None:

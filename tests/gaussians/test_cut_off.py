@@ -16,8 +16,7 @@ from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core.angles import pixel_directions
 from wrf_mi.gaussians.density import adapt
-from wrf_mi.gaussians.footprint import depth_order, project, ranked_order
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.footprint import CUTOFF, depth_order, project, ranked_order
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
 from wrf_mi.training.config import DensityConfig
 

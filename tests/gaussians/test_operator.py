@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import (
     Gaussians,
 )
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import Plane, perception_plane

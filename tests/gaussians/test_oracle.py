@@ -19,7 +19,7 @@ from wrf_mi_bench.field_oracle import (
 
 from wrf_mi.core import Receiver, azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 
 EXACT = 1e-12
 """A few roundings of float64 on values near one."""

@@ -18,15 +18,16 @@ from wrf_mi.tracing.traced_field import TracedPaths
 import drjit as dr
 import mitsuba as mi
 
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import pixel_directions, unit_vectors
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint import Pose
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import magnitude, power, scaled
+from wrf_mi.graph.combine import magnitude, power
 from wrf_mi.graph.ports import Ports, path_sum
-from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.receivers.reports import minmax_scale, scaled
 
 Float64 = dr.float64_array_t(mi.Float)
 

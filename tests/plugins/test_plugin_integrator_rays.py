@@ -16,10 +16,10 @@ from wrf_mi_plugins.ray_response import hulls, ray_footprints
 from wrf_mi_plugins.sensor import equirectangular_sphere
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint import Pose, depth_order
-from wrf_mi.gaussians.footprint_constants import NEAR_M
+from wrf_mi.gaussians.footprint import NEAR_M, depth_order
 from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 

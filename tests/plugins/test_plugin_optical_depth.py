@@ -17,7 +17,7 @@ from wrf_mi_plugins.optical_depth import CENTRE_LINE, LEAST_PASSED, attenuators,
 from wrf_mi.backend.device import on_device
 from wrf_mi.core import rotation_matrix
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint_constants import CUTOFF
+from wrf_mi.gaussians.footprint import CUTOFF
 
 Float64 = dr.float64_array_t(mi.Float)
 

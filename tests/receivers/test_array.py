@@ -11,7 +11,8 @@ from wrf_mi.core import pixel_directions, unit_vectors
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load
 from wrf_mi.receivers import array as module
-from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale, mirror_order
+from wrf_mi.receivers.array import array_response, bartlett_spectrum, mirror_order
+from wrf_mi.receivers.reports import minmax_scale
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16

@@ -65,12 +65,12 @@ def test_signals_are_retrieved_from_grey_images():
     magnitude = bartlett_spectrum(signals, ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
     lags = Lags(ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
     found = retrieve_signals(unscale(stored(magnitude[:20]), lags), lags)
-    assert found.found.all()
+    assert found.explained.all()
     aligned = align_signals(found.signals, positions[:20], ELEMENTS)
     assert largest_error(aligned, signals[:20]) < 0.01
     # Two incoherent snapshots have no spectrum of a single snapshot.
     mixed = stored(np.sqrt(magnitude[:3] ** 2 + magnitude[20:23] ** 2))
-    assert not retrieve_signals(unscale(mixed, lags), lags, starts=5).found.any()
+    assert not retrieve_signals(unscale(mixed, lags), lags, starts=5).explained.any()
     line = Lags(planar_array(1, 6, 0.16), FREQUENCY_HZ, HEIGHT, WIDTH)
     with pytest.raises(InputError, match="two dimensions"):
         retrieve_signals(unscale(stored(magnitude[:1]), line), line)
@@ -84,4 +84,4 @@ def test_measured_spectra_are_cut_magnitudes_of_single_snapshots():
     lags = Lags(record.receivers[0].array_m, float(record.frequencies_hz[0]), 90, 360)
     found = unscale(record.observation[0, rows], lags)
     assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(np.sqrt(np.mean(found.rounding**2)), rel=0.02)
-    assert retrieve_signals(found, lags).found.all()
+    assert retrieve_signals(found, lags).explained.all()

@@ -11,8 +11,7 @@ from wrf_mi_bench import field_oracle
 from wrf_mi.core import Receiver, unit_vectors
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.footprint import Footprints, project
-from wrf_mi.gaussians.footprint_constants import LOW_PASS_RAD, NEAR_M
+from wrf_mi.gaussians.footprint import LOW_PASS_RAD, NEAR_M, Footprints, project
 from wrf_mi.runs import figures
 from wrf_mi.training.step import device_pose
 

@@ -198,5 +198,5 @@ def test_joint_training_warns_of_crossed_polarisation(
     split = Split("all", 0, rows, rows[:0], rows[:0])
     config = with_settings(TrainConfig(), ["model=wrf-gs+", "traced.depth=1", "traced.rays=4096"])
     for options, warned in ((AntennaOptions(), False), (AntennaOptions(rx_frame="array"), True)):
-        Trainer(options.of(load(turned_folder)), split, config, scene=scene)
+        Trainer(load(turned_folder).with_antennas(options), split, config, scene=scene)
         assert (WARNING in caplog.text) is warned

@@ -16,8 +16,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from wrf_mi.core.errors import BackendError, InputError
-
+from ..core.errors import BackendError, InputError
 from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary, find_cuda, find_llvm
 from .probe import VARIANTS, try_cuda, try_llvm
 from .remedy import GOOD_FROM, install_line

@@ -49,11 +49,11 @@ def columns_on_device(columns: Iterable[ArrayLike], kind: Any) -> list[Any]:
 
 def with_room(values: ArrayLike, kind: type[np.generic]) -> NDArray[Any]:
     """A flat copy of all values, with room for the rest of a packet after its end, at the start of a cache line."""
-    given, size = np.asarray(values), np.dtype(kind).itemsize
-    memory = np.zeros((given.size + PACKET) * size + ALIGNED_BYTES, np.uint8)
+    source, size = np.asarray(values), np.dtype(kind).itemsize
+    memory = np.zeros((source.size + PACKET) * size + ALIGNED_BYTES, np.uint8)
     first = -memory.ctypes.data % ALIGNED_BYTES
-    room: NDArray[Any] = memory[first : first + given.size * size].view(kind)
-    np.copyto(room.reshape(given.shape), given, casting="unsafe")
+    room: NDArray[Any] = memory[first : first + source.size * size].view(kind)
+    np.copyto(room.reshape(source.shape), source, casting="unsafe")
     return room
 
 

@@ -72,8 +72,8 @@ def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
         real = file.resolve()
         names = [version_from_name(name) or () for name in (file.name, real.name)]
         versions[real] = max([versions.get(real, ()), *names], key=len)
-    found = starmap(LlvmLibrary, versions.items())
-    return sorted(found, key=lambda library: (library.version, str(library.path)), reverse=True)
+    libraries = starmap(LlvmLibrary, versions.items())
+    return sorted(libraries, key=lambda library: (library.version, str(library.path)), reverse=True)
 
 
 def find_cuda() -> Path | None:
@@ -123,8 +123,8 @@ def _library_folders() -> list[Path]:
             "/opt/llvm*/lib",
             "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
         ]
-    found = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
-    return list(dict.fromkeys(folder for folder in found if folder.is_dir()))
+    folders = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
+    return list(dict.fromkeys(folder for folder in folders if folder.is_dir()))
 
 
 def _linker_cache(start: str) -> list[Path]:

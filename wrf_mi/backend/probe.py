@@ -1,7 +1,12 @@
-"""Trial of a library in a separate process before this one loads it."""
+"""Trial of a library in a separate process before this one loads it.
+
+Results are kept in one JSON file of the user's cache folder, which only saves time: an unreadable or unwritable file
+counts as an empty one.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -10,12 +15,16 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass, fields
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
-from .cache import file_key, recall, remember
+import platformdirs
+
+from ..core.files import write_atomically
 from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary
 
 VARIANTS = {"llvm": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
@@ -137,3 +146,38 @@ def _reason(status: int, errors: str) -> str:
         ended = f"ends the process with {signal.Signals(-status).name}"
         return f"{ended}: {line}" if line else ended
     return f"fails: {line}" if line else f"fails with status {status}"
+
+
+def cache_file() -> Path:
+    """The file: ``~/.cache/wrf-mi/libraries.json`` on Linux."""
+    return platformdirs.user_cache_path("wrf-mi") / "libraries.json"
+
+
+def file_key(path: Path) -> str:
+    """Key of a file in its present version."""
+    real = path.resolve()
+    state = real.stat()
+    return f"{real}|{state.st_mtime_ns}|{state.st_size}"
+
+
+def recall(key: str) -> dict[str, Any] | None:
+    """The entry under ``key`` if there is a valid one, else None."""
+    entry = _read().get(key)
+    if not isinstance(entry, dict) or time.time() > entry.get("kept_until_s", float("inf")):
+        return None
+    return entry
+
+
+def remember(key: str, entry: dict[str, Any], seconds: float = float("inf")) -> None:
+    """Store ``entry`` under ``key`` for a time."""
+    limit = {} if seconds == float("inf") else {"kept_until_s": time.time() + seconds}
+    with contextlib.suppress(OSError):
+        write_atomically(cache_file(), json.dumps(_read() | {key: entry | limit}, indent=1))
+
+
+def _read() -> dict[str, Any]:
+    try:
+        entries = json.loads(cache_file().read_text())
+    except (OSError, ValueError):
+        return {}
+    return entries if isinstance(entries, dict) else {}

@@ -11,9 +11,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from .. import __version__
 from ..core import BackendError, InputError
 from ..core.files import os_failure
+from ..version import __version__
 from .options import Parser
 
 MODULES = ("doctor", "data", "mesh", "correct", "edit", "train", "runs", "maps", "export", "bench", "demo")

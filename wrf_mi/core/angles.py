@@ -83,5 +83,6 @@ def fibonacci_sphere(count: int) -> FloatArray:
     """Unit vectors [count, 3] spread evenly over the sphere (Gonzalez, 2010)."""
     number = np.arange(count) + 0.5
     z = 1 - 2 * number / count
+    # Heights are uniform, hence areas equal; successive azimuths differ by the golden ratio of a turn, modulo 2 pi.
     turn, radius = np.pi * (1 + np.sqrt(5)) * number, np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .angles import FloatArray, rotation_matrix
 from .errors import InputError
-
-if TYPE_CHECKING:
-    from .types import Record
 
 OMNIDIRECTIONAL = ("iso", "dipole", "hw_dipole")
 """Sionna RT's antenna patterns without dependence on azimuth: isotropic, short and half-wave dipole."""
@@ -94,13 +91,15 @@ class Antenna:
         square = x * x + y * y
         pole = square < POLE
         inverse = 1 / arrays.sqrt(select(pole, 1.0, square))
+        # Cosine and sine of the azimuth, and ``level``, the sine of the zenith angle.
         cosine, sine, level = select(pole, 1.0, x * inverse), select(pole, 0.0, y * inverse), square * inverse
         unit = [z * cosine, z * sine, -level] if self.polarization == "V" else [-sine, cosine, 0 * z]
         if self.pattern == "iso":
             return unit
         if self.pattern == "dipole":
-            amplitude = math.sqrt(1.5) * level
+            amplitude = math.sqrt(1.5) * level  # directivity 1.5
         elif self.pattern == "hw_dipole":
+            # Its limit at the poles is 0, where the quotient is 0 / 0; directivity 1.643.
             amplitude = select(pole, 0.0, math.sqrt(1.643) * arrays.cos(math.pi / 2 * z) * inverse)
         else:
             angles = (arrays.atan2(level, z) - math.pi / 2) / WIDTH_RAD, arrays.atan2(sine, cosine) / WIDTH_RAD
@@ -135,20 +134,14 @@ class AntennaOptions:
         """Whether any attribute is stated."""
         return any(getattr(self, field.name) is not None for field in fields(self))
 
-    def of(self, record: Record) -> Record:
-        """A record with these antennas.
+    def replaced(self, antenna: Antenna, end: Literal["rx", "tx"]) -> Antenna:
+        """An antenna of the data, of a receiver or a transmitter, with the attributes that are stated for this end.
 
         Raises:
             InputError: names that `Antenna` refuses.
         """
-        if not self:
-            return record
-        stated = [(*field.name.split("_"), getattr(self, field.name)) for field in fields(self)]
-        rx, tx = (
-            {key: value for end, key, value in stated if end == which and value is not None} for which in ("rx", "tx")
-        )
-        receivers = tuple(replace(receiver, antenna=replace(receiver.antenna, **rx)) for receiver in record.receivers)
-        return replace(record, receivers=receivers, tx_antenna=replace(record.tx_antenna, **tx))
+        stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
+        return replace(antenna, **{name: value for name, value in stated.items() if value is not None})
 
 
 AS_STATED = AntennaOptions()

@@ -27,8 +27,9 @@ def by_carrier(
         axis: axis of the values that counts rows.
     """
     every = rows_of_carriers(carriers_hz)
-    found = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)
-    return np.take(found, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
+    values = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)
+    # Rows came out carrier by carrier; the inverse permutation puts them back.
+    return np.take(values, np.argsort(np.concatenate([rows for _, rows in every])), axis=axis)
 
 
 def rows_of_carriers(carriers_hz: FloatArray) -> list[tuple[float, IntArray]]:

@@ -131,20 +131,20 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
     file or folder of this name are removed.
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
-        found = LEFTOVER.fullmatch(path.name)
-        if found is None:
+        leftover = LEFTOVER.fullmatch(path.name)
+        if leftover is None:
             continue
         # Files of this process count: it makes each temporary file once.
-        if (process := int(found[2])) != os.getpid() and psutil.pid_exists(process):
+        if (process := int(leftover[2])) != os.getpid() and psutil.pid_exists(process):
             continue
-        last = found[1]
+        last = leftover[1]
         while inner := LEFTOVER.fullmatch(last):  # a temporary folder that is written atomically itself
             last = inner[1]
         if name is not None and last != name:
             continue
         with suppress(OSError):
-            if found[3] == "old" and last == found[1] and not path.with_name(last).exists():
-                os.replace(path, path.with_name(found[1]))
+            if leftover[3] == "old" and last == leftover[1] and not path.with_name(last).exists():
+                os.replace(path, path.with_name(leftover[1]))
             elif path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
             else:

@@ -33,10 +33,10 @@ def free_bytes() -> int:
     """Bytes that this process may still allocate: of the machine, its control group and its own limits."""
     free = [psutil.virtual_memory().available, *_cgroup_bytes()]
     used = psutil.Process().memory_info()
-    for limit, taken in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
+    for limit, used_bytes in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, getattr(used, "data", used.rss))):
         most, _ = resource.getrlimit(limit)
         if most != resource.RLIM_INFINITY:
-            free.append(most - taken)
+            free.append(most - used_bytes)
     return max(int(min(free)), 0)
 
 
@@ -47,11 +47,11 @@ def _cgroup_bytes() -> Iterator[int]:
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
     ):
         try:
-            most, taken = ((_CGROUP / name).read_text().strip() for name in (limit, usage))
+            most, used_bytes = ((_CGROUP / name).read_text().strip() for name in (limit, usage))
             words = (_CGROUP / limit).with_name("memory.stat").read_text().split()
             reclaimed = int(words[words.index(cache) + 1]) if cache in words else 0
             if most.isdecimal() and int(most) < _UNLIMITED:
-                yield int(most) - max(int(taken) - reclaimed, 0)
+                yield int(most) - max(int(used_bytes) - reclaimed, 0)
         except (OSError, ValueError):
             continue
 

@@ -68,9 +68,9 @@ class Paths:
         more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
         more |= {"objects": (depth,), "vertices_m": (depth, 3)}
         for name in _ARRAYS:
-            expected, found = (len(self.tx), *more.get(name, ())), getattr(self, name).shape
-            if found != expected:
-                raise ValueError(f"Paths: {name} has shape {list(found)}, expected {list(expected)}")
+            expected, actual = (len(self.tx), *more.get(name, ())), getattr(self, name).shape
+            if actual != expected:
+                raise ValueError(f"Paths: {name} has shape {list(actual)}, expected {list(expected)}")
 
     @property
     def bounces(self) -> IntArray:

@@ -49,7 +49,7 @@ _adapter = cache(TypeAdapter)
 def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
     """Ranges of all fields of a class, as if they were numbers; a subclass that changes a default keeps the range."""
     hints = [typing.get_type_hints(base, include_extras=True) for base in reversed(kind.__mro__)]
-    items = (item for found in hints for item in found.items())
+    items = (item for of_class in hints for item in of_class.items())
     stated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
     limits = {field.name: stated.get(field.name, NOT_NEGATIVE) for field in dataclasses.fields(kind)}
     finite = Field(allow_inf_nan=False)

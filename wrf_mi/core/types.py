@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import FloatArray, rotation_matrix
-from .antenna import ANTENNA, Antenna
+from .antenna import ANTENNA, Antenna, AntennaOptions
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,6 @@ class Prediction:
 
 
 IntArray = NDArray[np.int64]
-
-SQUARED_MAGNITUDE_EPS = 1e-8
-"""Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +153,17 @@ class Record:
     def with_array(self, array_m: FloatArray | None) -> Record:
         """The record with the same array, elements [m, 3] in metres or None, at every receiver."""
         return replace(self, receivers=tuple(replace(receiver, array_m=array_m) for receiver in self.receivers))
+
+    def with_antennas(self, options: AntennaOptions) -> Record:
+        """The record with antennas whose attributes are those that the options state.
+
+        Raises:
+            InputError: names that `Antenna` refuses.
+        """
+        if not options:
+            return self
+        receivers = (replace(each, antenna=options.replaced(each.antenna, "rx")) for each in self.receivers)
+        return replace(self, receivers=tuple(receivers), tx_antenna=options.replaced(self.tx_antenna, "tx"))
 
     def seen(self, split: Split) -> Record:
         """The record as if the receivers that a split holds out had received nothing but the rows it leaves them."""

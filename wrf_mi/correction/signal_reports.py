@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.angles import FloatArray, pixel_directions
-from ..core.types import SQUARED_MAGNITUDE_EPS, IntArray
-from ..graph.combine import LEAST_POWER, SILENCE, ArrayReceiver, PowerReceiver
-from ..graph.ports import steering
+from ..core.types import IntArray
+from ..graph.combine import ArrayReceiver, PowerReceiver
+from ..receivers.array import steering_matrix
+from ..receivers.reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS
 
 if TYPE_CHECKING:
     from .misfit import Misfit
@@ -71,7 +72,7 @@ class Spectra(Channels):
             if key not in number_of:
                 number_of[key] = len(number_of)
                 directions = pixel_directions(model.height, model.width).reshape(-1, 3)
-                matrix = steering(model.elements_m, directions, model.frequency_hz).values
+                matrix = steering_matrix(model.elements_m, directions, model.frequency_hz)
                 self._matrices.append(matrix.astype(np.complex64))
             self._which[places] = number_of[key]
 

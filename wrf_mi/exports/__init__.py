@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from ..core.registry import Registry
+from ..core.registry import Registry, resolve
 from .format import DATASET, RUN, SCENE, ExportOptions, Format
 
 ENTRY_POINTS = "wrf_mi.exports"
@@ -70,7 +70,7 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
     """
     if format not in FORMATS:
         raise InputError(f"format {format!r}: unknown; choose from {', '.join(FORMATS)}")
-    from .source import Source, kinds_of  # imports tracer and models, which the list of formats does without
+    from .source import Source, Write, kinds_of  # imports tracer and models, which the list of formats does without
 
     asked, given = FORMATS[format], options or ExportOptions()
     asked.check(Path(out), given)
@@ -80,7 +80,8 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
         others = [name for name, other in FORMATS.items() if set(other.kinds) & set(kinds)]
         text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
         raise InputError(f"{text}; choose from {', '.join(others)}")
-    return asked.write(Source(str(source), kind), Path(out), given)
+    write: Write = resolve(asked.writer) if isinstance(asked.writer, str) else asked.writer
+    return write(Source(str(source), kind), Path(out), given)
 
 
 __all__ = ["BUILT_IN", "DATASET", "ENTRY_POINTS", "FORMATS", "RUN", "SCENE", "ExportOptions", "Format", "export"]

@@ -25,7 +25,7 @@ TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}
 
 
 def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write a field of Gaussians (`wrf_mi.exports.format.Write`).
+    """Write a field of Gaussians (`wrf_mi.exports.source.Write`).
 
     Keys: ``param/<name>``, the parameters in single precision, [k, n] each; ``form/*``, the form of the observations;
     ``receiver_*`` and ``tx_antenna``; ``split/*`` and ``run/*`` of the run's ``split.npz`` and ``model.npz``; the texts

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..core import InputError
-from ..core.registry import resolve
-
-if TYPE_CHECKING:
-    from ..core.angles import FloatArray
-    from .source import Source
+from ..core.angles import FloatArray
 
 RUN, SCENE, DATASET = "run", "scene", "data set"
 """Kinds of sources."""
@@ -53,9 +49,6 @@ NAMES = {
 }
 """Options that belong to some formats, as the command has them."""
 
-Write = Callable[["Source", Path, ExportOptions], dict[str, Any]]
-"""``write(source, out, options)`` writes a file or folder and returns facts about it, by words for a reader."""
-
 
 @dataclass(frozen=True)
 class Format:
@@ -65,7 +58,7 @@ class Format:
         name: name, as in ``wrf-mi export --format``.
         kinds: kinds of sources that it takes.
         suffix: ending of the file; "": a folder.
-        writer: ``module:function`` of type `Write`, or the function.
+        writer: ``module:function`` of type `wrf_mi.exports.source.Write`, or the function.
         options: names of fields of `ExportOptions` that it takes.
         text: what is written, for the help of the command.
     """
@@ -73,7 +66,7 @@ class Format:
     name: str
     kinds: tuple[str, ...]
     suffix: str
-    writer: str | Write
+    writer: str | Callable[..., dict[str, Any]]
     options: tuple[str, ...]
     text: str
 
@@ -90,8 +83,3 @@ class Format:
             foreign = field.name in NAMES and field.name not in self.options
             if foreign and getattr(options, field.name) is not getattr(unset, field.name):
                 raise InputError(f"{NAMES[field.name]} does not belong to format {self.name}; omit it")
-
-    def write(self, source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-        """Write the source; see `Write`."""
-        write: Write = resolve(self.writer) if isinstance(self.writer, str) else self.writer
-        return write(source, out, options)

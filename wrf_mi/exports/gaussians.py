@@ -80,7 +80,7 @@ def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:
 
 
 def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write the Gaussians of a run for one transmitter (`wrf_mi.exports.format.Write`).
+    """Write the Gaussians of a run for one transmitter (`wrf_mi.exports.source.Write`).
 
     Raises:
         InputError: no Gaussians, a field that is trained on the uplink, or not one transmitter.

@@ -17,7 +17,7 @@ BITS = 16
 
 
 def _written(task: str | None, write: Callable[[Path, Record, bool], object]) -> Callable[..., dict[str, Any]]:
-    """A `wrf_mi.exports.format.Write` of a layout for data of a task."""
+    """A `wrf_mi.exports.source.Write` of a layout for data of a task."""
 
     def write_layout(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
         record = source.record(options.progress)

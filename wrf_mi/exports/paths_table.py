@@ -80,7 +80,7 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
 
 
 def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write paths of a run or a scene as CSV (`wrf_mi.exports.format.Write`).
+    """Write paths of a run or a scene as CSV (`wrf_mi.exports.source.Write`).
 
     Raises:
         InputError: a run without stored paths, a scene without transmitters, receivers or frequency.
@@ -94,7 +94,7 @@ def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, 
 
 
 def write_scenario(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write the paths of a run as a scenario of DeepMIMO (`wrf_mi.exports.format.Write`)."""
+    """Write the paths of a run as a scenario of DeepMIMO (`wrf_mi.exports.source.Write`)."""
     traced = source.trace()
     write_deepmimo(out, traced, options.replace)
     return {"paths": len(traced.paths), "users": traced.paths.n_tx, "base stations": traced.paths.n_rx}

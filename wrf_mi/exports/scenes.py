@@ -42,7 +42,7 @@ def _colour_bytes(material: str) -> IntArray:
 
 
 def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write a scene as a folder for plain Sionna RT (`wrf_mi.exports.format.Write`).
+    """Write a scene as a folder for plain Sionna RT (`wrf_mi.exports.source.Write`).
 
     ``scene.xml`` opens with ``sionna.rt.load_scene``: materials of ITU-R P.2040 follow the frequency and have the
     scene's thicknesses; materials with constants, and those that are not in the range of ITU-R P.2040, have the
@@ -101,7 +101,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
 
 
 def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write a scene as binary glTF 2.0 (`wrf_mi.exports.format.Write`).
+    """Write a scene as binary glTF 2.0 (`wrf_mi.exports.source.Write`).
 
     A node and a mesh for each surface, named like it, and a material for each radio material, named like it. As glTF
     has y up, coordinates x, y, z of the scene are x, z, -y there.
@@ -127,7 +127,7 @@ def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, An
 
 
 def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write a scene as one PLY mesh (`wrf_mi.exports.format.Write`).
+    """Write a scene as one PLY mesh (`wrf_mi.exports.source.Write`).
 
     Faces have colours, and the numbers of their ``material`` and ``surface``, whose names are in the header's comments.
     """

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from wrf_mi_scenes import scenes
 
-from ..core import InputError
+from ..core import InputError, Record
 from ..datasets.layouts import is_data
 from ..datasets.registry import KNOWN
 from ..models.ray_tracing import CORRECTED, PATHS
@@ -17,10 +18,7 @@ from ..runs.run import Run, open_run
 from ..scene.folder import FACTS_FILE
 from ..tracing.result import TraceResult, load_trace
 from ..tracing.scenes import MESHES
-from .format import DATASET, RUN, SCENE
-
-if TYPE_CHECKING:
-    from ..core import Record
+from .format import DATASET, RUN, SCENE, ExportOptions
 
 
 @dataclass(frozen=True)
@@ -83,6 +81,10 @@ class Source:
         from ..tasks.conditions import scene_carrier
 
         return scene_carrier(self.run.problem.record) if self.is_run else None
+
+
+Write = Callable[[Source, Path, ExportOptions], dict[str, Any]]
+"""``write(source, out, options)`` writes a file or folder and returns facts about it, by words for a reader."""
 
 
 def kinds_of(name: str | Path) -> tuple[str, ...]:

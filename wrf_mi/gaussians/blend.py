@@ -14,9 +14,9 @@ from typing import Any
 import drjit as dr
 
 from ..backend.device import quads
-from .footprint import Footprints
-from .footprint_constants import CUTOFF, LOG2_E, MIN_COSINE
-from .recurrence import ForwardState, Pair, ReverseState, accumulate, forward_step, reverse_start, reverse_step
+from ..backend.vectors import Complex
+from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints
+from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
 from .tiles import LANE_ROWS, Plane, TileLists
 
 RECORD = 16
@@ -81,6 +81,7 @@ def footprint_at(along: list[Any], elevation: list[Any]) -> tuple[Any, Any, Any,
     inverse = dr.rcp(facing)
     p, q = p * inverse, q * inverse
     square = dr.fma(p, p, q * q)
+    # 1 / (n . u) is infinite or negative for a pixel beside or behind the Gaussian; the mask discards those.
     inside = (facing > MIN_COSINE) & (square < CUTOFF * CUTOFF)
     return dr.select(inside, dr.exp2(-0.5 * LOG2_E * square), 0), p, q, inverse
 
@@ -101,7 +102,7 @@ def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
     return table
 
 
-def _read_signals(table: Any, slot: Any, group: int) -> list[Pair]:
+def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
     """Signals of a group for one Gaussian."""
     if group % 2:
         values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
@@ -156,7 +157,9 @@ def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = 
     )
 
 
-def _blend_one(record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ForwardState) -> ForwardState:
+def _blend_one(
+    record: list[Any], fields: int, signals: list[Complex], lanes: Lanes, state: ForwardState
+) -> ForwardState:
     """State behind one more Gaussian, of ``fields`` numbers without its signal."""
     along = along_azimuth(record, lanes.azimuth)
     result = ForwardState([], [])
@@ -195,29 +198,36 @@ def _forward(
 
 
 def _derivatives(
-    record: list[Any], fields: int, signals: list[Pair], lanes: Lanes, state: ReverseState, slopes: list[list[Pair]]
+    record: list[Any],
+    fields: int,
+    signals: list[Complex],
+    lanes: Lanes,
+    state: ReverseState,
+    slopes: list[list[Complex]],
 ) -> tuple[list[Any], list[Any], Any, ReverseState]:
     """Derivatives by one Gaussian's record and signals, summed over a lane's pixels; whether any sees it; the state."""
     along = along_azimuth(record, lanes.azimuth)
     sums: list[list[Any]] = [[0, 0] for _ in range(3)]
     by_blending: list[Any] = [0] * (fields - 9)
-    by_signal: list[Pair] = [(0, 0) for _ in signals]
-    after, seen = ReverseState([], []), False
+    by_signal: list[Complex] = [(0, 0) for _ in signals]
+    after, is_seen = ReverseState([], []), False
     for k, elevation in enumerate(lanes.elevation):
         g, x, y, inverse = footprint_at(along, elevation)
         by_g, d_blending, d_signal, t, q = reverse_step(record[9:fields], g, state.t[k], state.q[k], signals, slopes[k])
         after.t.append(t)
         after.q.append(q)
+        # With p = (a . u) / (n . u) and q likewise, dG'/da = -G' p u / (n . u), dG'/dn = G' (p^2 + q^2) u / (n . u):
+        # all are multiples of u, whose elevation is summed here and whose azimuth, common to the lane, below.
         f = dr.select(g > 0, -by_g * g * inverse, 0)
         d_x, d_y = f * x, f * y
         for pair, d in zip(sums, (-(d_x * x + d_y * y), d_x, d_y), strict=True):
             pair[0], pair[1] = dr.fma(d, elevation[0], pair[0]), dr.fma(d, elevation[1], pair[1])
         by_blending = [a + b for a, b in zip(by_blending, d_blending, strict=True)]
         by_signal = [(a + c, b + d) for (a, b), (c, d) in zip(by_signal, d_signal, strict=True)]
-        seen |= g > 0
+        is_seen |= g > 0
     cosine, sine = lanes.azimuth
     vectors = [c for level, up in sums for c in (level * cosine, level * sine, up)]
-    return [*vectors, *by_blending], [part for pair in by_signal for part in pair], seen, after
+    return [*vectors, *by_blending], [part for pair in by_signal for part in pair], is_seen, after
 
 
 @dr.syntax
@@ -249,12 +259,12 @@ def _backward(
         slot = lanes.group * n + i
         record = read(table, i, fields if shared else fields + 2)
         sent = _read_signals(signals, slot, size) if shared else [tuple(record[fields:])]
-        values, by_signal, seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
+        values, by_signal, is_seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
         values, by_signal = (values, by_signal) if shared else (values + by_signal, [])
         for k in range(len(values)):
-            dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=mode)
+            dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, is_seen, mode=mode)
         for k in range(len(by_signal)):
-            dr.scatter_reduce(dr.ReduceOp.Add, out_signals, by_signal[k], slot * (2 * size) + k, seen, mode=mode)
+            dr.scatter_reduce(dr.ReduceOp.Add, out_signals, by_signal[k], slot * (2 * size) + k, is_seen, mode=mode)
         j += 1
     return out, out_signals
 

@@ -70,6 +70,7 @@ def adapt(
     alive = np.flatnonzero(keep)
     room = max(0, min(round(growth_fraction * len(alive)), max_gaussians - len(alive)))
     growing = alive[np.argsort(-view_gradient_norm[alive], kind="stable")[:room]]
+    # Angular size, as a receiver sees it, decides between a clone and a split: metres far away are no detail.
     size = np.exp(parameters["log_scale"].max(axis=0)) / distance_m
     split = growing[size[growing] > split_rad]
     source = np.concatenate([alive, growing])

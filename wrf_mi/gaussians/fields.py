@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from scipy.constants import speed_of_light
 
+from ..backend.vectors import times
 from ..core import InputError
 from .encoding import encode, encoded_size
 from .initial import InitialGaussians
@@ -126,10 +127,11 @@ class WrfGs:
         batch, hidden = tx_pos.shape[1], self.features(params)
         z = linear(params, "attenuation.delta", hidden)
         re, im = rows(z)
+        # delta = z / sqrt(1 + |z|^2): |delta| < 1, so that a Gaussian never amplifies what lies behind it.
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
         encoded = {"transmitter": self.encoding.transmitter(tx_pos)}
-        seen = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
-        signal = linear(params, "signal.out", dense(params, "signal.1", seen))
+        hidden = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
+        signal = linear(params, "signal.out", dense(params, "signal.1", hidden))
         return Gaussians(
             **common_geometry(params),
             signal=rows(signal),
@@ -234,8 +236,8 @@ class WrfGsPlus:
         turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
         # Subtract whole turns first: sines of large arguments have no digits left in float32.
         sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
-        re, im = signal
-        return [re * cosine - im * sine, re * sine + im * cosine]
+        re, im = signal  # a field with a phase has one component
+        return list(times((re, im), (cosine, sine)))
 
 
 @dataclass(frozen=True)

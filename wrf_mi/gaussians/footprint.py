@@ -12,25 +12,32 @@ which equals the paper's form to first order at low elevation and has neither se
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from .footprint_constants import CUTOFF, LOW_PASS_RAD, NEAR_M
+from ..backend.vectors import Pose, centre_distance, dot, principal_axes, tangent_basis
 from .parameters import Gaussians
 
+LOW_PASS_RAD = math.radians(0.3)
+"""Standard deviation added in quadrature to each footprint: 0.3 pixel at one degree per pixel."""
 
-@dataclass
-class Pose:
-    """A receiver's pose on the device: position (three arrays of width 1) and rotation to the world (3 x 3)."""
+CUTOFF = 3.0
+"""Mahalanobis radius beyond which a footprint is zero; the jump there is exp(-4.5) = 0.011."""
 
-    position: list[dr.ArrayBase]
-    to_world: list[list[dr.ArrayBase]]
+NEAR_M = 0.05
+"""A Gaussian whose centre is closer to the receiver than this has no footprint."""
 
-    def to_local(self, v: list[dr.ArrayBase]) -> list[dr.ArrayBase]:
-        """A world vector in the receiver's frame (R^T v)."""
-        return [sum((self.to_world[k][i] * v[k] for k in (1, 2)), self.to_world[0][i] * v[0]) for i in range(3)]
+MIN_COSINE = 0.1
+"""Cosine of the largest angle, about 84 degrees, between a Gaussian's direction and a pixel it reaches.
+
+The central projection onto the tangent plane diverges at 90 degrees and would mirror what lies behind.
+"""
+
+LOG2_E = math.log2(math.e)
+"""Footprints are powers of two, which processors compute faster than exp."""
 
 
 @dataclass
@@ -53,36 +60,6 @@ class Footprints:
     depth: dr.ArrayBase
 
 
-def dot(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
-    """Scalar product of two vectors, each three arrays."""
-    return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
-
-
-def cross(a: list[Any], b: list[Any]) -> list[Any]:
-    """Vector product of two vectors, each three arrays."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def tangent_basis(n: list[dr.ArrayBase]) -> tuple[list[dr.ArrayBase], list[dr.ArrayBase]]:
-    """Two unit vectors perpendicular to n and to each other (Duff et al. 2017, J. Comput. Graph. Techn. 6)."""
-    x, y, z = n
-    sign: Any = dr.copysign(type(z)(1), dr.detach(z))
-    a = -dr.rcp(sign + z)
-    b = x * y * a
-    return [dr.fma(sign * x * x, a, 1), sign * b, -sign * x], [b, dr.fma(y * y, a, sign), -y]
-
-
-def principal_axes(quaternion: list[dr.ArrayBase]) -> list[list[dr.ArrayBase]]:
-    """World directions of a Gaussian's axes (columns of the rotation) from unnormalised quaternions x, y, z, w."""
-    x, y, z, w = quaternion
-    f = 2 / (x * x + y * y + z * z + w * w)
-    return [
-        [1 - f * (y * y + z * z), f * (x * y + z * w), f * (x * z - y * w)],
-        [f * (x * y - z * w), 1 - f * (x * x + z * z), f * (y * z + x * w)],
-        [f * (x * z + y * w), f * (y * z - x * w), 1 - f * (x * x + y * y)],
-    ]
-
-
 def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     """Footprints of Gaussians as a receiver sees them. Differentiable in position, scale and rotation.
 
@@ -97,6 +74,7 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     depth = dr.sqrt(dot(local, local))
     inverse = dr.select(visible, dr.rcp(dr.maximum(depth, NEAR_M)), 0)
     n = [c * inverse for c in local]
+    # A Gaussian without footprint gets the direction +z: a zero vector has no tangent basis.
     n[2] = dr.select(visible, n[2], 1)
     e1, e2 = tangent_basis(n)
     n, e1, e2 = ([dr.tile(c, batch) for c in v] for v in (n, e1, e2))
@@ -123,6 +101,7 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
     a = [p * l11 for p in e1]
     b = [(q - slope * p) * l22 for p, q in zip(e1, e2, strict=True)]
 
+    # The larger eigenvalue of C bounds the footprint's radius; it only selects tiles, so it takes no gradient.
     d11, d22, d12 = dr.detach(c11), dr.detach(c22), dr.detach(c12)
     largest = 0.5 * (d11 + d22 + dr.sqrt((d11 - d22) ** 2 + 4 * d12 * d12))
     return Footprints(
@@ -132,13 +111,6 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
         visible=dr.tile(visible, batch),
         depth=exact,
     )
-
-
-def centre_distance(a: list[dr.ArrayBase], b: list[dr.ArrayBase]) -> dr.ArrayBase:
-    """Distance of points in float64, detached."""
-    double: Any = dr.float64_array_t(type(a[0]))
-    x, y, z = (double(dr.detach(p)) - double(dr.detach(q)) for p, q in zip(a, b, strict=True))
-    return dr.sqrt(x * x + y * y + z * z)
 
 
 def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBase:
@@ -162,19 +134,19 @@ def ranked_order(keys: list[dr.ArrayBase]) -> dr.ArrayBase:
     """
     index_type: Any = dr.uint32_array_t(type(keys[0]))
     n = dr.width(keys[0])
-    own = dr.arange(index_type, n)
+    lane = dr.arange(index_type, n)
     other, rank = dr.zeros(index_type, n), dr.zeros(index_type, n)
     while other < n:
-        rank = dr.select(_precedes(keys, other, own), rank + 1, rank)
+        rank = dr.select(_precedes(keys, other, lane), rank + 1, rank)
         other += 1
     # Of keys that are no numbers none is before another: their places hold the first entry.
     order = dr.zeros(index_type, n)
-    dr.scatter(order, own, rank)
+    dr.scatter(order, lane, rank)
     return order
 
 
-def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, own: dr.ArrayBase) -> dr.ArrayBase:
-    """Whether the entry of index ``other`` comes before ``own``, the lanes' indices in order."""
+def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, lane: dr.ArrayBase) -> dr.ArrayBase:
+    """Whether the entry of index ``other`` comes before ``lane``, the lanes' indices in order."""
     mask_type: Any = dr.mask_t(keys[0])
     before, equal = mask_type(False), mask_type(True)
     for key in keys:
@@ -182,4 +154,4 @@ def _precedes(keys: list[dr.ArrayBase], other: dr.ArrayBase, own: dr.ArrayBase) 
         value = dr.gather(type(key), key, other, equal)
         before |= equal & (value < key)
         equal &= value == key
-    return before | (equal & (other < own))
+    return before | (equal & (other < lane))

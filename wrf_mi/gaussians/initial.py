@@ -86,6 +86,7 @@ def random_gaussians(
     for receiver, index in zip(receivers, share, strict=True):
         # A margin below the horizon: footprints of Gaussians there reach above it.
         lowest = -1.0 if sphere else -np.sin(np.radians(size_deg))
+        # Equal areas of a sphere have equal heights (Archimedes): the sine is uniform, not the elevation.
         elevation = np.arcsin(rng.uniform(lowest, 1.0, len(index)))
         direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(index)), elevation)
         distance = rng.uniform(*distance_m, len(index))
@@ -119,4 +120,5 @@ def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.ran
     chosen = points[rng.choice(len(points), count, replace=False)]
     gaps, _ = cKDTree(chosen).query(chosen, k=4)
     scale = np.sqrt((gaps[:, 1:] ** 2).mean(axis=1))
+    # Repeated points would give scale 0, whose logarithm is the parameter.
     return InitialGaussians(chosen, np.maximum(scale, 1e-3))

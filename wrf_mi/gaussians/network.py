@@ -56,20 +56,21 @@ class _Rectified(dr.CustomOp):
             total += per_gaussian.array
         if product is not None:
             total += product.array
-        self.given = product is not None, per_gaussian is not None
+        self.present = product is not None, per_gaussian is not None
         self.out = type(per_transmitter)(dr.maximum(total, 0), (outputs, self.batch * self.columns))
         return self.out
 
     def backward(self) -> None:
         outputs, kind = self.out.shape[0], type(self.out)
         gradient: Any = self.grad_out()
+        # The rectifier passes gradients where its output is positive; sums over rows are those of broadcast parts.
         slope = kind(dr.select(self.out.array > 0, gradient.array, 0), self.out.shape)
         dr.eval(slope)
         self.set_grad_in("per_transmitter", kind(dr.block_sum(slope.array, self.columns), (outputs, self.batch)))
-        if self.given[1]:
+        if self.present[1]:
             parts: Any = dr.reshape(slope, (outputs, self.batch, self.columns))
             self.set_grad_in("per_gaussian", slope if self.batch == 1 else dr.sum(parts, axis=1))
-        if self.given[0]:
+        if self.present[0]:
             self.set_grad_in("product", slope)
 
     def name(self) -> str:

@@ -23,12 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 
 from ..backend.device import on_device
+from ..backend.vectors import Complex, Pose
 from ..core import InputError
 from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
-from .footprint import Footprints, Pose, depth_order, project
+from .footprint import Footprints, depth_order, project
 from .parameters import Gaussians
-from .recurrence import SMALLEST_FACTOR, Pair, forward_step
+from .recurrence import SMALLEST_FACTOR, forward_step
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -74,9 +75,9 @@ def _footprints(record: list[Any], strip: Plane) -> list[Any]:
     return [footprint_at(along, elevation)[0] for elevation in strip.elevation]
 
 
-def _counted(seen: list[Any], footprints: list[Any]) -> list[Any]:
+def _counted(counts: list[Any], footprints: list[Any]) -> list[Any]:
     """Counters after one more Gaussian."""
-    return [s + dr.select(g > 0, type(s)(1), type(s)(0)) for s, g in zip(seen, footprints, strict=True)]
+    return [s + dr.select(g > 0, type(s)(1), type(s)(0)) for s, g in zip(counts, footprints, strict=True)]
 
 
 @dr.syntax
@@ -84,17 +85,17 @@ def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
     """Number of Gaussians that each pixel of a lane sees."""
     index_type = type(lists.index)
     j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
-    seen = [dr.zeros(index_type, dr.width(strip.tile)) for _ in range(LANE_ROWS)]
+    counts = [dr.zeros(index_type, dr.width(strip.tile)) for _ in range(LANE_ROWS)]
     while j < end:
-        seen = _counted(seen, _footprints(read(table, dr.gather(index_type, lists.index, start + j), 9), strip))
+        counts = _counted(counts, _footprints(read(table, dr.gather(index_type, lists.index, start + j), 9), strip))
         j += 1
-    dr.eval(seen)
-    return seen
+    dr.eval(counts)
+    return counts
 
 
 def _store(
-    record: list[Any], i: Any, strip: Plane, slots: list[Any], t: list[Pair], out: tuple[Any, ...]
-) -> tuple[list[Any], list[Pair]]:
+    record: list[Any], i: Any, strip: Plane, slots: list[Any], t: list[Complex], out: tuple[Any, ...]
+) -> tuple[list[Any], list[Complex]]:
     """Write one Gaussian's weight at each pixel of a lane that sees it; next slots and T behind the Gaussian."""
     next_slots, behind = [], []
     for g, active, slot, before in zip(_footprints(record, strip), strip.active, slots, t, strict=True):
@@ -133,8 +134,8 @@ def _weights(
     index_type: Any = type(order)
     lists = build_lists(footprints, order, strip, 1)
     entries = dr.zeros(index_type, count)
-    for k, seen in enumerate(_count(table, lists, strip, n)):
-        dr.scatter(entries, seen, strip.pixel[k] - first, strip.active[k])
+    for k, visible_count in enumerate(_count(table, lists, strip, n)):
+        dr.scatter(entries, visible_count, strip.pixel[k] - first, strip.active[k])
     start: NDArray[np.int64] = np.concatenate([[0], np.cumsum(entries.numpy(), dtype=np.int64)])
     total = int(start[-1])
     if total > MOST_IN_STRIP:
@@ -182,11 +183,11 @@ def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: fl
             size += parts[-1].data.nbytes + parts[-1].nnz * np.dtype(np.int32).itemsize
             if size > most_bytes:
                 raise MemoryError(f"weights of {gaussians.count} Gaussians take more than {most_bytes / 1e6:.0f} MB")
-    whole = csr_array(vstack(parts, format="csr"))
-    if whole.nnz < 2**31:
+    matrix = csr_array(vstack(parts, format="csr"))
+    if matrix.nnz < 2**31:
         # SciPy keeps indices of 64 bits where it is given those: twice the memory and time.
-        whole.indices, whole.indptr = whole.indices.astype(np.int32), whole.indptr.astype(np.int32)
-    return whole
+        matrix.indices, matrix.indptr = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32)
+    return matrix
 
 
 _POOL = ThreadPoolExecutor(processors(), "wrf-mi-operator")  # without a thread until its first use
@@ -261,8 +262,8 @@ class PixelOperator(_Operator):
         """R [batch, height * width] of complex signals [batch, n]."""
         columns = np.asarray(signals, self.kind).T
         # One column as a vector: SciPy's product with a matrix of one column takes twice as long.
-        whole = (self.weights @ columns[:, 0])[None] if columns.shape[1] == 1 else (self.weights @ columns).T
-        return np.ascontiguousarray(whole)
+        fields = (self.weights @ columns[:, 0])[None] if columns.shape[1] == 1 else (self.weights @ columns).T
+        return np.ascontiguousarray(fields)
 
     def power(self, signals: NDArray[Any], out: NDArray[Any]) -> None:
         """Write |R|^2 into ``out``, [batch, height * width]."""
@@ -283,19 +284,21 @@ def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> NDArray[np.float6
     T_i = 1 - sum_{k < i} B_k (alpha blending) or 1 - sum_{k < i} B_k (1 - delta_k) (product blending).
     """
     weights = pixel_weights(gaussians, pose, plane)
-    seen, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)
+    gaussian, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)
     delta = [np.array(part, float) for part in gaussians.attenuation or (np.zeros(gaussians.count),) * 2]
     re, im = (np.array(part, float) for part in gaussians.signal)
-    sent, hidden = (weights.data * values[seen] for values in (re + 1j * im, 1 - delta[0] - 1j * delta[1]))
+    sent, hidden = (weights.data * values[gaussian] for values in (re + 1j * im, 1 - delta[0] - 1j * delta[1]))
 
     def before(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Sum over the entries before each in its pixel."""
         total = np.concatenate([[0], np.cumsum(values)])
         return total[:-1] - np.repeat(total[start], length)
 
+    # T_{i+1} = T_i - B_i (1 - delta_i), with delta = 0 under alpha blending: sums of the entries in front.
     transmittance = 1 - before(hidden)
+    # b_i = 1 - B_i (1 - delta_i) / T_i; without Gaussian i, what it hides grows from Q_i to Q_i / b_i.
     hides = np.divide(hidden, transmittance, out=np.zeros_like(hidden), where=transmittance != 0)
     factor = 1 - hides
     behind = np.repeat(weights @ (re + 1j * im), length) - before(sent) - sent
     quotient = behind * np.conj(factor) / np.maximum(np.abs(factor), SMALLEST_FACTOR) ** 2
-    return np.asarray(np.bincount(seen, np.abs(sent - hides * quotient), gaussians.count), float)
+    return np.asarray(np.bincount(gaussian, np.abs(sent - hides * quotient), gaussians.count), float)

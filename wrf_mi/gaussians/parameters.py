@@ -157,8 +157,8 @@ def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_on
         order = on_device(np.concatenate(slots, axis=1), dr.uint32_array_t(type(parts[0].position[0])))
 
         def joined(*arrays: Any) -> Any:
-            whole = dr.concat(list(arrays))
-            return whole if dr.width(whole) == count else dr.gather(type(whole), whole, order)
+            joint = dr.concat(list(arrays))
+            return joint if dr.width(joint) == count else dr.gather(type(joint), joint, order)
 
         names = [f.name for f in fields(Gaussians) if f.name != "batch"]
         result = Gaussians(**{n: each(joined, *(getattr(part, n) for part in parts)) for n in names}, batch=batch)

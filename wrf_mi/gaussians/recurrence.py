@@ -25,7 +25,7 @@ from typing import Any
 
 import drjit as dr
 
-Pair = tuple[Any, Any]
+from ..backend.vectors import Complex, conjugate_times, times
 
 SMALLEST_FACTOR = 1e-4
 """|b| below this is replaced in the derivative's quotient Q / b, of which both then vanish.
@@ -38,8 +38,8 @@ In float32, Q carries an error of 1e-7 of the pixel's sum, so the quotient is ac
 class ForwardState:
     """State of the forward pass for each pixel of a lane: sums of its transmitters, and the transmittance T."""
 
-    total: list[list[Pair]]
-    t: list[Pair]
+    total: list[list[Complex]]
+    t: list[Complex]
 
     @classmethod
     def start(cls, float_type: Any, pixels: int, transmitters: int = 1) -> ForwardState:
@@ -52,29 +52,17 @@ class ForwardState:
 class ReverseState:
     """State of the reverse pass for each pixel of a lane: T, and Q times the gradient's conjugate."""
 
-    t: list[Pair]
-    q: list[Pair]
+    t: list[Complex]
+    q: list[Complex]
 
 
-def conjugate_times(a: Sequence[Any], b: Pair) -> Pair:
-    """Conjugate of a, times b."""
-    if len(a) == 1:
-        return a[0] * b[0], a[0] * b[1]
-    return a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]
-
-
-def times(a: Sequence[Any], b: Pair) -> Pair:
-    """Product of complex numbers."""
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def accumulate(total: Pair, weight: Sequence[Any], signal: Pair) -> Pair:
+def accumulate(total: Complex, weight: Sequence[Any], signal: Complex) -> Complex:
     """The sum R after one more Gaussian of weight w T."""
     re, im = dr.fma(weight[0], signal[0], total[0]), dr.fma(weight[0], signal[1], total[1])
     return (re, im) if len(weight) == 1 else (dr.fma(-weight[1], signal[1], re), dr.fma(weight[1], signal[0], im))
 
 
-def forward_step(blending: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...], Pair]:
+def forward_step(blending: list[Any], g: Any, t: Complex) -> tuple[tuple[Any, ...], Complex]:
     """Weight w T of a Gaussian with footprint G', and the transmittance behind it."""
     if len(blending) == 1:
         alpha = blending[0] * g
@@ -82,13 +70,13 @@ def forward_step(blending: list[Any], g: Any, t: Pair) -> tuple[tuple[Any, ...],
     return (g * t[0], g * t[1]), times(_factor(blending, g), t)
 
 
-def _factor(delta: list[Any], g: Any) -> Pair:
+def _factor(delta: list[Any], g: Any) -> Complex:
     return 1 - g * (1 - delta[0]), g * delta[1]
 
 
 def reverse_start(
-    pixels: list[list[Any]], active: list[Any], total: Pair, gradient: Pair
-) -> tuple[list[list[Pair]], ReverseState]:
+    pixels: list[list[Any]], active: list[Any], total: Complex, gradient: Complex
+) -> tuple[list[list[Complex]], ReverseState]:
     """Gradients of each pixel of a lane, and the state before the first Gaussian.
 
     Args:
@@ -99,23 +87,25 @@ def reverse_start(
     """
     float_type: Any = type(total[0])
     slopes, state = [], ReverseState([], [])
-    for numbers, seen in zip(pixels, active, strict=True):
-        g, r = ([tuple(dr.gather(float_type, a, i, seen) for a in pair) for i in numbers] for pair in (gradient, total))
+    for numbers, is_active in zip(pixels, active, strict=True):
+        g, r = (
+            [tuple(dr.gather(float_type, a, i, is_active) for a in pair) for i in numbers] for pair in (gradient, total)
+        )
         slopes.append(g)
         state.q.append(_summed(g, r))
         state.t.append((float_type(1), float_type(0)))
     return slopes, state
 
 
-def _summed(slopes: list[Any], values: list[Any]) -> Pair:
+def _summed(slopes: list[Any], values: list[Any]) -> Complex:
     """Conjugates of the gradients times values, summed over transmitters."""
     parts = [conjugate_times(g, v) for g, v in zip(slopes, values, strict=True)]
     return sum((re for re, _ in parts[1:]), parts[0][0]), sum((im for _, im in parts[1:]), parts[0][1])
 
 
 def reverse_step(
-    blending: list[Any], g: Any, t: Pair, q: Pair, signals: list[Pair], slopes: list[Pair]
-) -> tuple[Any, list[Any], list[Pair], Pair, Pair]:
+    blending: list[Any], g: Any, t: Complex, q: Complex, signals: list[Complex], slopes: list[Complex]
+) -> tuple[Any, list[Any], list[Complex], Complex, Complex]:
     """Derivatives of the loss by one Gaussian in one pixel.
 
     Args:
@@ -133,14 +123,16 @@ def reverse_step(
     by_signal = [conjugate_times(weight, slope) for slope in slopes]
     h = _summed(slopes, signals)
     if len(blending) == 1:
+        # T and w are real: only Re(conj(slope) S) counts. c = dL/dw; dL/db = Q / b, with db = -dw.
         alpha, c_re = blending[0] * g, h[0] * t[0]
         q_re = q[0] - alpha * c_re
         by_alpha = c_re - q_re * dr.rcp(dr.maximum(1 - alpha, SMALLEST_FACTOR))
         return by_alpha * blending[0], [by_alpha * g], by_signal, after, (q_re, q[1])
-    # Re(c) is the derivative by a real weight.
+    # c = conj(slope) S T: Re(c) is dL/dw of the real weight w = G'; Q / b = Q conj(b) / |b|^2 is dL/db.
     c_re, c_im = times(h, t)
     q, b = (q[0] - g * c_re, q[1] - g * c_im), _factor(blending, g)
     scale = dr.rcp(dr.maximum(b[0] * b[0] + b[1] * b[1], SMALLEST_FACTOR**2))
     f_re, f_im = (x * scale for x in conjugate_times(b, q))
+    # b = 1 - G' (1 - delta): db/dG' = delta - 1 and db/d(delta) = G', complex, of which L takes the real part.
     by_g = c_re - f_re * (1 - blending[0]) - f_im * blending[1]
     return by_g, [g * f_re, -g * f_im], by_signal, after, q

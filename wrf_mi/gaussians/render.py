@@ -7,8 +7,9 @@ from typing import Any
 
 import drjit as dr
 
+from ..backend.vectors import Pose
 from .blend import blend
-from .footprint import Pose, depth_order, project
+from .footprint import depth_order, project
 from .parameters import Gaussians
 from .tiles import Plane, build_lists
 

@@ -55,10 +55,10 @@ def _wrf_gs_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
         out, step = np.empty((len(tx_pos_m), count), np.complex64), max(1, PAIRS_PER_CHUNK // count)
         for first in range(0, len(tx_pos_m), step):
             encoded = field.encoding.transmitter(tx_pos_m[first : first + step].T)
-            seen = products[None]
+            hidden = products[None]
             if len(encoded):
-                seen = seen + (params["signal.0.transmitter"] @ encoded).T[:, :, None]
-            pair: Any = linear(params, "signal.out", dense(params, "signal.1", np.maximum(seen, 0)))
+                hidden = hidden + (params["signal.0.transmitter"] @ encoded).T[:, :, None]
+            pair: Any = linear(params, "signal.out", dense(params, "signal.1", np.maximum(hidden, 0)))
             out[first : first + step] = _complex(pair.swapaxes(0, 1))
         return out
 
@@ -75,7 +75,7 @@ def recorded_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
             return field.gaussians(params, tx_pos).signal
 
     def coefficients(tx_pos_m: Any) -> ComplexArray:
-        found = (signals(tensors, to_tensor(position[:, None])) for position in tx_pos_m)
-        return np.stack([_complex([part.numpy() for part in pair]) for pair in found])
+        per_transmitter = (signals(tensors, to_tensor(position[:, None])) for position in tx_pos_m)
+        return np.stack([_complex([part.numpy() for part in pair]) for pair in per_transmitter])
 
     return coefficients

@@ -28,20 +28,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.vectors import Complex
 from ..core.angles import FloatArray, pixel_directions
-from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..tracing.field_calculator import Complex
+from ..receivers.array import steering_matrix
+from ..receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS, arrives, scaled, strength_db
 from ..tracing.traced_field import TracedPaths
-from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
+from .ports import ComplexMatrix, Ports, direction_weights, path_sum, weighted
 
 How = Literal["coherent", "power"]
-
-LEAST_POWER = 1e-20
-"""Constant added to a power before its logarithm: the lowest report is -200 dB."""
-SILENCE = 4 * LEAST_POWER
-"""Power up to which nothing arrives: above the constants that are added to powers."""
-FLOOR_DB = 1e-3
-"""Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
@@ -67,18 +61,6 @@ def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
 def add(*sides: Complex) -> Complex:
     """Sum of complex flat arrays."""
     return sum((re for re, _ in sides[1:]), sides[0][0]), sum((im for _, im in sides[1:]), sides[0][1])
-
-
-def scaled(image: Any, pixels: int) -> Any:
-    """Each image of ``pixels`` values scaled to its minimum and maximum, 0..1, as the instrument does.
-
-    Differentiable, extremes included; an image without contrast becomes 0.
-    """
-    index = dr.arange(dr.uint32_array_t(type(image)), dr.width(image)) // pixels
-    low, high = (dr.block_reduce(op, image, pixels) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
-    span = high - low
-    inverse = dr.select(span > 0, dr.rcp(dr.select(span > 0, span, 1)), 0)
-    return (image - dr.gather(type(image), low, index)) * dr.gather(type(image), inverse, index)
 
 
 def _float_type(learned: Complex | None) -> Any:
@@ -112,7 +94,8 @@ class PixelReceiver:
 
     @cached_property
     def _steering(self) -> ComplexMatrix:
-        return steering(self.elements_m, pixel_directions(self.height, self.width).reshape(-1, 3), self.frequency_hz)
+        directions = pixel_directions(self.height, self.width).reshape(-1, 3)
+        return ComplexMatrix(steering_matrix(self.elements_m, directions, self.frequency_hz))
 
     @cached_property
     def _ports(self) -> Ports:
@@ -153,9 +136,11 @@ class ArrayReceiver(PixelReceiver):
         sides: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
         if learned is not None:
             weights = direction_weights(self.height, self.width, 1, _float_type(learned))
+            # The integral over directions gives element signals, so that a learned spectrum has the array's lobes.
             sides[1] = self._steering.adjoint(weighted(learned, weights))
         present = [side for side in sides if side is not None]
         if self.how == "coherent" and present:
+            # The Bartlett sum is linear: one image of the sum in place of one of each side.
             sides = [add(*present), None]
         images = [None if side is None else self._steering.forward(side) for side in sides]
         spectrum = magnitude(images[0], images[1], self.how)
@@ -248,10 +233,12 @@ class CsiReceiver:
             raise ValueError("CsiReceiver: neither a traced nor a learned side")
         re, im = add(*sides)
         pair: Any = mi.Complex2f if type(re) is mi.Float else dr.float64_array_t(mi.Complex2f)
+        # Real and imaginary parts in turn, as a record's complex numbers are in memory.
         return dr.ravel(pair(re, im))
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
+        # Half the logarithm of a ratio of powers is that of amplitudes.
         powers = [np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report)]
         return float(np.log(powers[0] / powers[1]) / 2)
 
@@ -287,12 +274,12 @@ class PowerReceiver(CsiReceiver):
             mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
             of_paths = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count
-        received = dr.select(received > SILENCE, received + LEAST_POWER, self.floor)
-        return 10 * dr.log2(received) / math.log2(10)
+        return strength_db(received, self.floor, LEAST_POWER)
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by mean powers in dB."""
-        arrives = np.abs(report - 10 * math.log10(self.floor)) > FLOOR_DB
-        if not arrives.any():
+        received = arrives(report, self.floor)
+        if not received.any():
             return 0.0
-        return float((np.nanmean(observed[arrives]) - np.mean(report[arrives])) * math.log(10) / 20)
+        # dB to nepers of an amplitude: ln(10) / 20.
+        return float((np.nanmean(observed[received]) - np.mean(report[received])) * math.log(10) / 20)

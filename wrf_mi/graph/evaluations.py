@@ -11,11 +11,10 @@ from typing import Any
 
 import drjit as dr
 
+from ..backend.vectors import Complex, Pose
 from ..gaussians import Gaussians
-from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
 from ..gaussians.tiles import Plane
-from ..tracing.field_calculator import Complex
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {

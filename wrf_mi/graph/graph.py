@@ -26,15 +26,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.vectors import Complex, Pose
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
-from ..gaussians.footprint import Pose
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
-from ..tracing.field_calculator import Complex
 from ..tracing.instrument_parameters import receiver_pose
 from ..tracing.options import FACTOR
 from ..tracing.polarization import check_polarization
@@ -139,15 +138,15 @@ class Graph:
 
     def at_carrier(self, carrier_hz: float) -> Graph:
         """The same graph for rows of another carrier."""
-        found = copy(self)
-        found._take(replace(self.form, carriers_hz=np.array([carrier_hz])))
-        return found
+        graph = copy(self)
+        graph._take(replace(self.form, carriers_hz=np.array([carrier_hz])))
+        return graph
 
     def _take(self, form: Form) -> None:
         """Take a form, with the models of its ports."""
-        at = form.of_ports
-        self.form, self.carriers = form, len(at)
-        self.models = tuple(self.kind.make(one, receiver) for receiver in self.receivers for one in at)
+        forms = form.of_ports
+        self.form, self.carriers = form, len(forms)
+        self.models = tuple(self.kind.make(of_port, receiver) for receiver in self.receivers for of_port in forms)
 
     def log_carrier(self, number: int) -> float | None:
         """Logarithm of a port's carrier over the middle one of training; None: rows have a single carrier."""
@@ -215,28 +214,28 @@ class Graph:
             return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
         t = self.traced
         options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
-        given = tx_pos_m, self.receivers[receiver], options, self._prepared, tx_heading_rad, carriers_hz, params
-        sides = traced_fields(self.scene, *given)
+        at = self.receivers[receiver], options, self._prepared
+        sides = traced_fields(self.scene, tx_pos_m, *at, tx_heading_rad, carriers_hz, params)
         if self.surface:
             for side in sides:
                 side.attach(self.surface)
         return sides
 
     def cover(
-        self, sides: Sequence[TracedField | None], given: Mapping[str, NDArray[Any]] | None = None
+        self, sides: Sequence[TracedField | None], fitted: Mapping[str, NDArray[Any]] | None = None
     ) -> dict[str, NDArray[np.float32]]:
         """Put Gaussians on the surfaces that paths of traced sides meet, if the settings train them.
 
         Args:
             sides: traced sides of the training transmitters; later ones get the same Gaussians.
-            given: parameters of a fit with such Gaussians, which replace new ones.
+            fitted: parameters of a fit with such Gaussians, which replace new ones.
 
         Returns:
             Starting values of their parameters, none without such Gaussians.
         """
         spacing_m, present = self.traced.surface_spacing, [side for side in sides if side is not None]
-        if given is not None:
-            self.surface = SurfaceGaussians.of(given, spacing_m)
+        if fitted is not None:
+            self.surface = SurfaceGaussians.of(fitted, spacing_m)
         elif self.traced.surface > 0 and present:
             self.surface = SurfaceGaussians.covering(Interactions.joined([s.interactions for s in present]), spacing_m)
         if not self.surface:
@@ -276,8 +275,8 @@ class Graph:
             Real and imaginary part, [batch * components * directions].
         """
         assert self.field is not None
-        made = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
-        gaussians = by_component(made(params, _condition(batch)), self.form.components)
+        evaluate = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
+        gaussians = by_component(evaluate(params, _condition(batch)), self.form.components)
         pose = batch.pose
         if self.moves:
             pose = receiver_pose(self.receivers[number // self.carriers], params, mi.Float)
@@ -296,6 +295,7 @@ class Graph:
         if paths is not None:
             re, im = paths.gain
             power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
+            # A root of squares keeps both derivatives, where a maximum would leave ``level`` without one.
             unit = dr.sqrt(SHARE**2 * power + unit * unit)
         return unit if batch.weight is None else unit * batch.weight
 
@@ -387,5 +387,5 @@ def _condition(batch: Batch) -> Any:
     tensor = type(batch.condition)
     flat = batch.condition.array
     count, width = batch.condition.shape
-    whole = dr.concat([flat, dr.repeat(type(flat)(batch.carrier), width)])
-    return tensor(whole, (count + 1, width))
+    joint = dr.concat([flat, dr.repeat(type(flat)(batch.carrier), width)])
+    return tensor(joint, (count + 1, width))

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..backend.device import on_device
-from ..gaussians.recurrence import times
+from ..backend.vectors import times
 from ..receivers.instruments import DRAWS, phase_draws
 from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import Float64, TracedPaths

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import columns_on_device, on_device
+from ..backend.vectors import Complex, times
 from ..core.angles import FloatArray, solid_angles
-from ..receivers.array import array_response
-from ..tracing.field_calculator import Complex
 from ..tracing.traced_field import Float64, TracedPaths
 
 
@@ -47,11 +46,7 @@ class Ports:
 
 
 def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
-    """Coherent sum of a receiver's paths at m ports: sum over paths of g (d / d_m) exp(-j k_m d_m).
-
-    Each path is a spherical wave from its image source, at the unfolded length d in the direction of arrival; for flat
-    mirrors that is exact, near field included. It neglects that a path may be blocked for some elements only; all
-    reflect at the angle of the array's origin.
+    """Coherent sum of a receiver's paths at m ports, spherical waves as in `wrf_mi.receivers.antenna_csi`.
 
     Args:
         paths: paths of a batch of transmitters.
@@ -59,10 +54,9 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
 
     Returns:
         Real and imaginary part, float64 [batch * m]. A fixed order of summation: the same in every run.
-
-    Source: image method, Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
     """
     each = paths.each
+    # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them.
     lane = dr.arange(mi.UInt32, paths.batch * ports.count * each)
     port = (lane // each) % ports.count
     slot = (lane // (each * ports.count)) * each + lane % each
@@ -77,8 +71,9 @@ def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
     away = [of_path(u) * length - of_port(p) for u, p in zip(paths.arrival, ports.offset_m, strict=True)]
     distance = dr.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
     sine, cosine = dr.sincos(-of_port(ports.wavenumber) * distance)
+    # The gain has the loss lambda / (4 pi d) of the origin; at the port the wave has travelled d_m.
     re, im = (of_path(part) * length / distance for part in paths.gain)
-    terms = re * cosine - im * sine, re * sine + im * cosine
+    terms = times((re, im), (cosine, sine))
     return tuple(dr.block_reduce(dr.ReduceOp.Add, term, each) for term in terms)
 
 
@@ -123,19 +118,8 @@ def _products(x: Complex, parts: Any) -> list[Any]:
     One matrix product in place of four, for each of which Dr.Jit would rearrange the matrix.
     """
     rows = matrix(dr.concat(x), parts.shape[0])
-    found = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
-    return [found[i, :, j].array for i in range(2) for j in range(2)]
-
-
-def steering(offset_m: FloatArray, directions: FloatArray, frequency_hz: float) -> ComplexMatrix:
-    """Matrix exp(-j k p . u) [m, n] of ports and directions: forward gives the Bartlett sum, its adjoint port signals.
-
-    Args:
-        offset_m: ports [m, 3] in the receiver's frame, metres.
-        directions: unit vectors [n, 3] in that frame.
-        frequency_hz: carrier.
-    """
-    return ComplexMatrix(array_response(offset_m, directions, frequency_hz).conj().T)
+    real_products = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
+    return [real_products[i, :, j].array for i in range(2) for j in range(2)]
 
 
 def matrix(flat: Any, columns: int) -> Any:

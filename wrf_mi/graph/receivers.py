@@ -18,7 +18,8 @@ from ..core import InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import middle_carrier
 from ..core.registry import Registry
-from .combine import LEAST_POWER, ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from ..receivers.reports import LEAST_POWER
+from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
 """Group of entry points of receiver models."""

@@ -104,7 +104,7 @@ class Problem:
         record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         if self.left_out:
             record = record.at_receivers([k for k, one in enumerate(record.receivers) if one.name not in self.left_out])
-        return self.antennas.of(record)
+        return record.with_antennas(self.antennas)
 
     @cached_property
     def opened_scene(self) -> Any | None:

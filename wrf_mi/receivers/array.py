@@ -1,4 +1,4 @@
-"""Antenna arrays: response to a plane wave, Bartlett spectrum, the instrument's scaling.
+"""Antenna arrays: response to a plane wave and Bartlett spectrum.
 
 Conventions (`wrf_mi.core.angles`): elements lie in the array's x-y plane, boresight +z. With the time factor
 exp(+j omega t), a wave that arrives *from* unit vector u reaches the element at p with the phase +k p . u
@@ -78,6 +78,7 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
     """
     signals, elements = np.asarray(h, dtype=complex), np.asarray(positions_m, float)
     first, second, order = _lines(elements)
+    # exp(-j k (x + y) . u) is a product: a planar grid is summed along one line, then along the other.
     grids = signals[..., order].reshape(-1, len(first), len(second))
     images = np.empty((len(grids), height * width))
     step = max(1, TABLE_BYTES // (16 * (len(first) + len(second))))
@@ -86,10 +87,10 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
         block = float(frequency_hz), height, width, begin, begin + step
         outer, inner = (_beams(line.tobytes(), *block) for line in (first, second))
         for start in range(0, len(grids), together):
-            some = slice(start, start + together)
-            waves = grids[some] @ inner
+            rows = slice(start, start + together)
+            waves = grids[rows] @ inner
             total = waves[:, 0] if len(first) == 1 else np.einsum("nxd,xd->nd", waves, outer)
-            images[some, begin : begin + step] = np.abs(total)
+            images[rows, begin : begin + step] = np.abs(total)
     return images.reshape(*signals.shape[:-1], height, width)
 
 
@@ -99,32 +100,26 @@ def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     The first line of other arrays is the origin alone: one sum is faster for few elements, and tables of lines are
     smaller for many.
     """
-    whole = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
+    ungrouped = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
     grain = ALIGNED * float(np.ptp(elements_m, axis=0).max())
     if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:
-        return whole
+        return ungrouped
     (x, column), (y, row) = (np.unique(np.round(part / grain), return_inverse=True) for part in elements_m.T[:2])
+    # A grid has each pair of a column and a row once: numbers of places in order then differ by one.
     order = np.lexsort((row, column))
     if len(x) * len(y) != len(elements_m) or (np.diff(column[order] * len(y) + row[order]) != 1).any():
-        return whole
+        return ungrouped
     grid = elements_m[order].reshape(len(x), len(y), 3)
     return grid[:, 0], grid[0] - grid[0, 0], order
+
+
+def steering_matrix(positions_m: ArrayLike, directions: ArrayLike, frequency_hz: float) -> ComplexArray:
+    """Factors exp(-j k p_m . u) [m, n] of elements [m, 3] and directions [n, 3]: h times it is the Bartlett sum."""
+    return array_response(positions_m, directions, frequency_hz).conj().T
 
 
 @lru_cache(KEPT_TABLES)
 def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin: int, end: int) -> ComplexArray:
     """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
     directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
-    return array_response(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).conj().T.copy()
-
-
-def minmax_scale(spectrum: ArrayLike) -> FloatArray:
-    """Scale each image [..., height, width] by its minimum and maximum to 0..1, as the instrument does.
-
-    A constant image (nothing received) becomes 0.
-    """
-    image = np.asarray(spectrum, float)
-    low = image.min(axis=(-2, -1), keepdims=True)
-    span = image.max(axis=(-2, -1), keepdims=True) - low
-    result: FloatArray = np.divide(image - low, span, out=np.zeros_like(image), where=span > 0)
-    return result
+    return steering_matrix(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).copy()

@@ -11,6 +11,7 @@ from scipy.constants import speed_of_light
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.types import IntArray
+from .reports import strength_db
 
 ComplexArray = NDArray[np.complex128]
 
@@ -90,13 +91,13 @@ def array_channels(paths: Paths, receiver: Receiver, array_m: FloatArray, freque
 def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
     """Unfolded distance [p] from the array to the source of each path's spherical wave."""
     count, depth = paths.interactions.shape
-    here = np.broadcast_to(receiver.position_m, (count, 3))
+    last_m = np.broadcast_to(receiver.position_m, (count, 3))
     radius, unfinished = np.zeros(count), np.ones(count, bool)
     for level in range(depth):
-        kind, there = paths.interactions[:, level], paths.vertices_m[:, level]
+        kind, vertex_m = paths.interactions[:, level], paths.vertices_m[:, level]
         unfinished &= kind != 0
-        radius[unfinished] += np.linalg.norm(there - here, axis=1)[unfinished]
-        here = np.where(unfinished[:, None], there, here)
+        radius[unfinished] += np.linalg.norm(vertex_m - last_m, axis=1)[unfinished]
+        last_m = np.where(unfinished[:, None], vertex_m, last_m)
         unfinished &= np.isin(kind, SPECULAR_KINDS)
     scattered = (~np.isin(paths.interactions, SPECULAR_KINDS)).any(axis=1)
     return np.where(scattered, radius, paths.length_m)
@@ -119,6 +120,8 @@ def _spherical_waves(
         radius = radius_m[chunk, None]
         distance = np.linalg.norm((direction[chunk] * radius)[:, None, :] - elements_m[paths.rx[chunk]], axis=-1)
         delay = (paths.length_m[chunk, None] - radius + distance) / speed_of_light
+        # The gain is that at the origin, ``radius`` from the wave's source: at an element the amplitude is radius /
+        # distance times as large, and the way longer by distance - radius.
         wave = paths.gain[chunk, None] * radius / distance * np.exp(-2j * np.pi * frequencies[0] * delay)
         pairs, first = np.unique(pair[chunk], return_index=True)
         gap = 0.0
@@ -129,6 +132,7 @@ def _spherical_waves(
                     gap = frequency - frequencies[k - 1]
                     turn = np.exp(-2j * np.pi * gap * delay)
                 wave = wave * turn
+            # Paths are sorted by pair of devices, so each sum is of a run.
             channel[pairs, :, k] += np.add.reduceat(wave, first, axis=0)
     return channel
 
@@ -145,7 +149,4 @@ def received_power(paths: Paths) -> FloatArray:
 
 def rssi_dbm(paths: Paths) -> FloatArray:
     """Received signal strength in dBm for 0 dBm sent, shape [n_rx, n_tx], NaN where no path arrives."""
-    power = received_power(paths)
-    decibel = np.full(power.shape, np.nan)
-    np.log10(power, out=decibel, where=power > 0)
-    return 10 * decibel
+    return np.asarray(strength_db(received_power(paths)))

@@ -15,8 +15,9 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
-from .array import bartlett_spectrum, minmax_scale
+from .array import bartlett_spectrum
 from .channel import antenna_csi, csi, rssi_dbm
+from .reports import minmax_scale
 
 CHUNK_SIZE = 64
 """Transmitters whose spectra are computed together."""
@@ -55,9 +56,9 @@ class Instrument(ABC):
             return self.observe(paths)
 
         def at_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
-            some = paths.select(np.isin(paths.tx, rows))
-            some = replace(some, tx=np.searchsorted(rows, some.tx), n_tx=len(rows))
-            return replace(self, frequencies_hz=np.array([carrier_hz])).observe(some)
+            of_rows = paths.select(np.isin(paths.tx, rows))
+            of_rows = replace(of_rows, tx=np.searchsorted(rows, of_rows.tx), n_tx=len(rows))
+            return replace(self, frequencies_hz=np.array([carrier_hz])).observe(of_rows)
 
         return by_carrier(carriers_hz, at_carrier, axis=1)
 
@@ -65,8 +66,8 @@ class Instrument(ABC):
         """Each receiver with its paths."""
         parts = []
         for index, receiver in enumerate(self.receivers):
-            some = paths if paths.n_rx == 1 else paths.select(paths.rx == index)
-            parts.append((receiver, replace(some, rx=np.zeros_like(some.rx), n_rx=1)))
+            arriving = paths if paths.n_rx == 1 else paths.select(paths.rx == index)
+            parts.append((receiver, replace(arriving, rx=np.zeros_like(arriving.rx), n_rx=1)))
         return parts
 
 
@@ -88,8 +89,8 @@ class ChannelInstrument(Instrument):
         if all(receiver.array_m is None for receiver in self.receivers):
             return csi(paths, self.frequencies_hz)
         channels = [
-            antenna_csi(some, receiver, receiver.array_m, self.frequencies_hz)[0]
-            for receiver, some in self.by_receiver(paths)
+            antenna_csi(arriving, receiver, receiver.array_m, self.frequencies_hz)[0]
+            for receiver, arriving in self.by_receiver(paths)
             if receiver.array_m is not None
         ]
         return np.stack(channels)
@@ -114,16 +115,16 @@ class SpectrumInstrument(Instrument):
     def observe(self, paths: Paths) -> NDArray[np.float32]:
         """Spectra in 0..1, see `wrf_mi.receivers.bartlett_spectrum`; all 0 where no path arrives."""
         images = np.zeros((len(self.receivers), paths.n_tx, *self.size), np.float32)
-        for index, (receiver, some) in enumerate(self.by_receiver(paths)):
+        for index, (receiver, arriving) in enumerate(self.by_receiver(paths)):
             assert receiver.array_m is not None, "see the task's instrument"
-            turned = _with_phases(some, self.phase_error) if self.phase_error else [some]
-            for one in turned:
-                signals = antenna_csi(one, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
+            draws = _with_phases(arriving, self.phase_error) if self.phase_error else [arriving]
+            for drawn in draws:
+                signals = antenna_csi(drawn, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
                 # Float64 spectra of all would take several times the memory of the result.
                 for start in range(0, len(signals), CHUNK_SIZE):
                     rows = slice(start, start + CHUNK_SIZE)
                     spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
-                    images[index, rows] += minmax_scale(spectra) / len(turned)
+                    images[index, rows] += minmax_scale(spectra) / len(draws)
         return images
 
 

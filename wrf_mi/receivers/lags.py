@@ -113,6 +113,7 @@ def _differences(elements_m: FloatArray) -> tuple[FloatArray, IntArray, IntArray
     count = len(elements_m)
     difference = (elements_m[:, None, :] - elements_m[None, :, :]).reshape(-1, 3)
     grain = SAME_LAG * max(float(np.ptp(elements_m, axis=0).max()), np.finfo(float).tiny)
+    # Whole steps, so that differences of rounded positions compare as equal.
     steps = np.rint(difference / grain)
     first = np.argmax(steps != 0, axis=1)
     side = np.where(steps[np.arange(len(steps)), first] < 0, -1, 1)

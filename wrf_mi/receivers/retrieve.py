@@ -102,12 +102,12 @@ class Retrieved:
     Attributes:
         signals: [n, m], each row up to a common phase (and the exchange with its mirror image).
         residual: root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n].
-        found: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
+        explained: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
     """
 
     signals: ComplexArray
     residual: FloatArray
-    found: NDArray[np.bool_]
+    explained: NDArray[np.bool_]
 
 
 def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:
@@ -123,6 +123,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
         InputError: an array whose lags do not determine its signals: a line, or fewer than four elements.
     """
     m = lags.elements
+    # A second singular value of zero: all lags are on one line, whose spectra other signals have too.
     extent = np.linalg.svd(lags.lag_m, compute_uv=False)
     if lags.count < 2 * m - 1 or extent[1] < 1e-6 * extent[0]:
         raise InputError(f"retrieval: {m} elements on a line or too few lags; it takes an array of two dimensions")
@@ -135,6 +136,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
     pixels = lags.shape[0] * lags.shape[1]
     wanted = lags.coordinates(unscaled.squared)
     enough = GOOD_ENOUGH * unscaled.rounding * np.sqrt(lags.count / pixels)
+    # The mean of P over directions is about the sum of |h_m|^2, that is 2 m times a real part's variance.
     size = np.sqrt(unscaled.squared.mean(axis=(1, 2)) / (2 * m))
     draws = np.random.default_rng(seed).normal(size=(len(wanted), starts, 2 * m))
     signals, residual = np.zeros((len(wanted), m), complex), np.full(len(wanted), np.inf)

@@ -58,7 +58,7 @@ class PathStatistics:
 
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = total(np.ones(len(power)))
-            gain[gain == 0] = np.nan
+            gain[gain == 0] = np.nan  # makes every statistic NaN
             # About the first delay of each transmitter, as variances about zero cancel.
             first_m = np.full(count, np.inf)
             np.minimum.at(first_m, transmitter, length_m)
@@ -74,19 +74,19 @@ class PathStatistics:
             strongest = np.zeros(count)
             np.maximum.at(strongest, transmitter, power)
             single = np.bincount(transmitter, minlength=count) == 1
-            rest = np.where(single, 0.0, gain - strongest)
-            return cls(10 * np.log10(gain), spread, azimuth, 10 * np.log10(strongest / rest))
+            others = np.where(single, 0.0, gain - strongest)
+            return cls(10 * np.log10(gain), spread, azimuth, 10 * np.log10(strongest / others))
 
     @classmethod
     def of_receiver(cls, paths: Paths, receiver: int) -> PathStatistics:
         """Statistics of traced paths at the receiver of a number."""
-        some = paths.select(paths.rx == receiver)
-        power = np.square(np.abs(some.gain))
-        return cls.of_paths(some.tx, paths.n_tx, power, some.length_m, some.arrival)
+        arrived = paths.select(paths.rx == receiver)
+        power = np.square(np.abs(arrived.gain))
+        return cls.of_paths(arrived.tx, paths.n_tx, power, arrived.length_m, arrived.arrival)
 
     def rows(self, chosen: IntArray) -> PathStatistics:
         """The statistics of some transmitters."""
-        return PathStatistics(*(getattr(self, one.name)[chosen] for one in fields(self)))
+        return PathStatistics(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def placed(self, rows: IntArray, count: int) -> PathStatistics:
         """The statistics as those of rows [m] of ``count`` transmitters, NaN for all others."""
@@ -98,4 +98,6 @@ class PathStatistics:
 
 def joined(parts: Sequence[PathStatistics]) -> PathStatistics:
     """Statistics of groups of transmitters one after the other."""
-    return PathStatistics(*(np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(PathStatistics)))
+    return PathStatistics(
+        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(PathStatistics))
+    )

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from .. import __version__
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.array_files import stored_arrays, write_arrays
@@ -43,6 +42,7 @@ from ..models.calibrated import with_intervals
 from ..models.model import Arrays
 from ..tasks import TASKS
 from ..training.fit_plan import check_rows
+from ..version import __version__
 
 FORMAT = 4
 """Version of ``config.yaml`` and ``model.npz``."""

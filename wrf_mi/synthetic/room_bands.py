@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
-from ..receivers.array import bartlett_spectrum, minmax_scale
+from ..receivers.array import bartlett_spectrum
 from ..receivers.channel import array_channels
+from ..receivers.reports import minmax_scale
 from ..tracing.options import TraceOptions
 from ..tracing.result import recompute
 from ..tracing.scenes import open_scene

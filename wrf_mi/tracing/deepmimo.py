@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from .. import __version__
 from ..core import InputError, Paths
 from ..core.angles import FloatArray
 from ..core.array_files import write_arrays
 from ..core.files import atomic_folder
 from ..core.types import IntArray
 from ..datasets.deepmimo import PARAMS, VERSION
+from ..version import __version__
 from .result import TraceResult
 
 logger = logging.getLogger(__name__)

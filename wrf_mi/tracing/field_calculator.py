@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
 from ..backend.device import columns_on_device
+from ..backend.vectors import Pose, cross, dot, tangent_basis
 from ..core import Antenna
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from ..gaussians.footprint import Pose, cross, dot, tangent_basis
 from .buffer import SPECULAR, TRANSMISSION
 from .surfaces import Surfaces
 

@@ -26,11 +26,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ..backend.device import columns_on_device, on_device
+from ..backend.vectors import times
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.types import IntArray
-from ..gaussians.recurrence import times
 from ..receivers.spreads import PathStatistics
 from . import TraceOptions, TraceResult, trace_paths
 from .buffer import SPECULAR, TRANSMISSION

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from .. import __version__
 from ..backend.device import to_tensor
 from ..core import Receiver
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
-from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..gaussians.footprint_constants import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights
 from ..gaussians.static_signals import static_signals
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Field
+from ..receivers.reports import SQUARED_MAGNITUDE_EPS
+from ..version import __version__
 from .step import device_pose
 
 FORMAT = 1

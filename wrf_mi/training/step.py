@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 
 from ..backend.device import on_device, to_float, to_tensor
 from ..backend.recorded import Recorded
+from ..backend.vectors import Complex, Pose
 from ..core import Receiver
-from ..gaussians.footprint import Pose
 from ..gaussians.tiles import Plane, perception_plane
 from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Graph, Report
-from ..tracing.field_calculator import Complex
 from .adam import NonFiniteReport, Params, guarded_step, rated_params
 
 Loss = Callable[..., Any]

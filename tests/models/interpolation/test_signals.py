@@ -24,7 +24,8 @@ from wrf_mi.models.interpolation.signals import (
     fit_signals,
 )
 from wrf_mi.models.interpolation.spectra import ExpectedSpectrum, rician
-from wrf_mi.receivers.array import bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.array import bartlett_spectrum
+from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.receivers.retrieve import mirror_order
 
 TOWARDS = np.array([3.0, 1.0, -0.5]) / np.linalg.norm([3.0, 1.0, -0.5])

@@ -27,7 +27,8 @@ from wrf_mi.models.networks.dcgan import DcganSettings
 from wrf_mi.models.networks.nerf2 import Nerf2Settings
 from wrf_mi.models.networks.nerf2_march import Networks
 from wrf_mi.models.networks.vae import VaeSettings
-from wrf_mi.receivers.array import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 from wrf_mi.training.session import FitSession
 

@@ -34,7 +34,8 @@ from ...backend.recorded import Recorded
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
-from ...core.types import SQUARED_MAGNITUDE_EPS, IntArray
+from ...core.types import IntArray
+from ...receivers.reports import SQUARED_MAGNITUDE_EPS
 from ...tasks import Task, task_of
 from ...tasks.conditions import (
     channel_scales,

@@ -1,0 +1,80 @@
+"""Reports of instruments, for NumPy and Dr.Jit arrays alike.
+
+| instrument | reports | of path gains g, lengths d and, at element or antenna m, distances d_m from the image source |
+| --- | --- | --- |
+| array | spectrum | magnitude of the Bartlett sum of h_m in each direction, scaled to 0..1; in a fit at least 1e-4 |
+| power | strength | sum of the powers of paths, in dB, or a floor |
+| antennas | channel | h_m = sum over paths of g (d / d_m) exp(-j k d_m), on each subcarrier |
+
+Sums over paths depend on the layout of their arrays: `wrf_mi.receivers.channel` has those of traced instruments
+(`wrf_mi.receivers.instruments`, NumPy), `wrf_mi.graph.ports` those of a fit's receiver models (`wrf_mi.graph.combine`,
+Dr.Jit). Dr.Jit is imported on request: a command that only reads data does without it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..core.angles import FloatArray
+
+SQUARED_MAGNITUDE_EPS = 1e-8
+"""Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
+LEAST_POWER = 1e-20
+"""Constant added to a power before its logarithm in a fit: the lowest report is -200 dB."""
+SILENCE = 4 * LEAST_POWER
+"""Power up to which nothing arrives in a fit: above the constants that are added to powers."""
+FLOOR_DB = 1e-3
+"""Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
+
+
+def strength_db(power: Any, floor: Any = math.nan, least: float = 0.0) -> Any:
+    """Power in dB, 10 log10(power + least); ``floor`` stands for powers up to 4 ``least``.
+
+    Args:
+        power: received powers, a NumPy or Dr.Jit array.
+        floor: power that is reported where nothing arrives; NaN: none, as in a record.
+        least: constant that bounds the derivative of the logarithm where little arrives (`LEAST_POWER`).
+    """
+    if isinstance(power, np.ndarray):
+        return 10 * np.log10(np.where(power > 4 * least, power + least, floor))
+    import drjit as dr
+
+    # Dr.Jit has logarithms of base 2 and e alone.
+    return 10 * dr.log2(dr.select(power > 4 * least, power + least, floor)) / math.log2(10)
+
+
+def arrives(report_db: NDArray[Any], floor: float) -> NDArray[np.bool_]:
+    """Whether reports in dB are above the floor, a power."""
+    above: NDArray[np.bool_] = np.abs(report_db - 10 * math.log10(floor)) > FLOOR_DB
+    return above
+
+
+def minmax_scale(spectrum: ArrayLike) -> FloatArray:
+    """Scale each image [..., height, width] by its minimum and maximum to 0..1, as the instrument does.
+
+    A constant image (nothing received) becomes 0.
+    """
+    image = np.asarray(spectrum, float)
+    low = image.min(axis=(-2, -1), keepdims=True)
+    span = image.max(axis=(-2, -1), keepdims=True) - low
+    result: FloatArray = np.divide(image - low, span, out=np.zeros_like(image), where=span > 0)
+    return result
+
+
+def scaled(image: Any, pixels: int) -> Any:
+    """`minmax_scale` of Dr.Jit images of ``pixels`` values each, flat.
+
+    Differentiable, extremes included: a pixel that sets the scale moves all others.
+    """
+    import drjit as dr
+
+    index = dr.arange(dr.uint32_array_t(type(image)), dr.width(image)) // pixels
+    low, high = (dr.block_reduce(op, image, pixels) for op in (dr.ReduceOp.Min, dr.ReduceOp.Max))
+    span = high - low
+    # The inner selection keeps the derivative of an image without contrast finite.
+    inverse = dr.select(span > 0, dr.rcp(dr.select(span > 0, span, 1)), 0)
+    return (image - dr.gather(type(image), low, index)) * dr.gather(type(image), inverse, index)
