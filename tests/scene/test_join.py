@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import shapely
 
-from wrf_mi.scene import outline
-from wrf_mi.scene.planes import Plane, with_axes
+from wrf_mi.scene.mesh import outline
+from wrf_mi.scene.scan.planes import Plane, with_axes
 
 
 def test_pairs_out_of_reach_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,9 +13,9 @@ from made_rooms import attic, by_kind, closed_box, l_shape, sampled, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
-from wrf_mi.scene import points
-from wrf_mi.scene.cloud import surfaces_from_points
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.scan import points
+from wrf_mi.scene.scan.cloud import surfaces_from_points
 
 PLANE_M = 0.003
 """Offset of a plane: noise of 1 cm over the root of some thousand points is 0.2 mm; the rest is their choice."""

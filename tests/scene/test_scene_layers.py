@@ -7,8 +7,8 @@ import pytest
 from made_rooms import Mesh, by_kind, closed_box, sampled
 from wrf_mi_scenes.build_laboratory import sheet, wall
 
-from wrf_mi.scene.cloud import surfaces_from_points
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.scan.cloud import surfaces_from_points
 
 NOISE_M = 0.015
 COUNT = 150_000

@@ -17,11 +17,11 @@ from made_plans import (
 )
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan import floor_of, layout_walls, plan_surfaces, walls_of_plan
-from wrf_mi.scene.plan_align import grid_from_scans, sensor_of
-from wrf_mi.scene.plan_lines import dominant_direction
-from wrf_mi.scene.plan_sources import PlanPoints, grid_from_points, grid_from_probability, read_layout
-from wrf_mi.scene.plan_walls import find_walls, joined
+from wrf_mi.scene.plan.alignment import grid_from_scans, sensor_of
+from wrf_mi.scene.plan.lines import dominant_direction
+from wrf_mi.scene.plan.sources import PlanPoints, grid_from_points, grid_from_probability, read_layout
+from wrf_mi.scene.plan.storey import floor_of, layout_walls, plan_surfaces, walls_of_plan
+from wrf_mi.scene.plan.walls import find_walls, joined
 
 CLOSE_M = 0.1
 """Two cells of the maps made here."""

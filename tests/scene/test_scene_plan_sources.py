@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, read_layout, read_plan
+from wrf_mi.scene.plan.sources import PlanGrid, PlanPoints, read_layout, read_plan
 
 ODDS = np.array([[-3.0, np.nan, 4.0], [-3.0, -3.0, 4.0]])
 """Free on the left, occupied on the right; the first row is on top."""

@@ -14,11 +14,11 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
-from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
-from ..scene.plan import plan_surfaces
-from ..scene.plan_sources import Mask, read_layout
+from ..scene.mesh.facets import SUFFIXES, planes_of_mesh, read_mesh
+from ..scene.mesh.surfaces import Surface, bodies, box_of
+from ..scene.plan.sources import Mask, read_layout
+from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-from ..scene.surfaces import Surface, bodies, box_of
 from ..tracing.devices import winding_number
 from .placements import placements
 from .repeats import named_rows

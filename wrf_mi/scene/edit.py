@@ -17,7 +17,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
-from .surfaces import KINDS, Kind, Surface, box_of, mesh_parts, moved
+from .mesh.surfaces import KINDS, Kind, Surface, box_of, mesh_parts, moved
 
 logger = logging.getLogger(__name__)
 

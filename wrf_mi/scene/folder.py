@@ -27,7 +27,7 @@ from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
-from .surfaces import Surface, box_of
+from .mesh.surfaces import Surface, box_of
 from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from ..core.angles import FloatArray
 from .edit import read_surfaces
 from .folder import write_scene
 from .materials import FILE
-from .surfaces import Surface, bodies
+from .mesh.surfaces import Surface, bodies
 
 PREFIX = "hidden_"
 """Names of supposed faces begin with it."""

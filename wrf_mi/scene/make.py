@@ -14,18 +14,18 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .cloud import surfaces_from_points
 from .coordinates import Up, require_fine, require_near, up_of, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
-from .mesh import SUFFIXES, planes_of_mesh, read_mesh
-from .plan import layout_walls, plan_surfaces
-from .plan_sources import PlanGrid, Row0, read_layout, read_plan
-from .points import check_extent, read_points
-from .polygon_files import FACES, LONGEST_HEADER, ply_header
+from .mesh.facets import SUFFIXES, planes_of_mesh, read_mesh
+from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
+from .mesh.surfaces import Surface, moved, sampled
+from .plan.sources import PlanGrid, Row0, read_layout, read_plan
+from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
-from .surfaces import Surface, moved, sampled
+from .scan.cloud import surfaces_from_points
+from .scan.points import check_extent, read_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -53,8 +53,8 @@ def make_scene(
     r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
-        points_file: a 3D scan (`wrf_mi.scene.points.read_points`); a plan in two dimensions
-            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
+        points_file: a 3D scan (`wrf_mi.scene.scan.points.read_points`); a plan in two dimensions
+            (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
         units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
@@ -67,7 +67,7 @@ def make_scene(
         floor_m: z of a plan's floor.
         resolution_m: side of a plan's cell; overrides that of the file.
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.
-        register_walls_of: a layout file (`wrf_mi.scene.plan_sources.read_layout`) to whose walls the scene is
+        register_walls_of: a layout file (`wrf_mi.scene.plan.sources.read_layout`) to whose walls the scene is
             registered (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
         positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
             source whose walls they cross, or that they fit better when mirrored, is refused.

@@ -30,7 +30,7 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 from ..core import InputError
 from ..core.yaml_files import read_yaml
 from ..datasets.folder_files import SINGLE_MAX, shown
-from .surfaces import KINDS
+from .mesh.surfaces import KINDS
 
 FILE = "materials.yml"
 KEYS = ("rules", "surfaces", "thickness_m", "constants")

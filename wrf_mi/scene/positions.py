@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..datasets.folder_files import read_csv
-from .plan_sources import PlanGrid
+from .mesh.surfaces import Surface, box_of, cut_lines, moved
+from .plan.sources import PlanGrid
 from .register import best_motion, wall_points
-from .surfaces import Surface, box_of, cut_lines, moved
 
 logger = logging.getLogger(__name__)
 

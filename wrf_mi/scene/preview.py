@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.paths import Paths
-from .surfaces import Surface, box_of, cut_lines
+from .mesh.surfaces import Surface, box_of, cut_lines
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000

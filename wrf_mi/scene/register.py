@@ -16,8 +16,8 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.folder_files import read_columns
-from .plan_lines import rotation_2d
-from .surfaces import Surface
+from .mesh.surfaces import Surface
+from .plan.lines import rotation_2d
 
 LEAST_AGREEMENT = 0.5
 """Least agreement of a fit. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""

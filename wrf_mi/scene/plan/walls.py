@@ -18,10 +18,10 @@ import shapely
 from scipy import ndimage
 from scipy.sparse.csgraph import connected_components
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from .plan_lines import CLEARED_M, HALF_WIDTH_M, Run, dominant_direction, find_runs, rotation_2d, turned, without_specks
-from .plan_sources import Mask, PlanGrid
+from ...core import InputError
+from ...core.angles import FloatArray
+from .lines import CLEARED_M, HALF_WIDTH_M, Run, dominant_direction, find_runs, rotation_2d, turned, without_specks
+from .sources import Mask, PlanGrid
 
 REACH_M = 0.35
 """Largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open."""

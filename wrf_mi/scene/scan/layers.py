@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.filters import apply_hysteresis_threshold
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ...core.angles import FloatArray
+from ...core.types import IntArray
 from .planes import SEARCH_M, Mask, Plane, near
 
 POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import backend
-from ..core import InputError
-from ..core.angles import FloatArray
+from ... import backend
+from ...core import InputError
+from ...core.angles import FloatArray
 
 RAYS_PER_POSE = 300_000
 RANGE_NOISE_M = 0.02
@@ -41,7 +41,7 @@ def simulate_scan(scene: Any, poses_m: ArrayLike, *, rays_per_pose: int = RAYS_P
     backend.init()
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     if isinstance(scene, str | Path):
         scene = mi.load_file(str(scene))

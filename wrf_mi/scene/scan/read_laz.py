@@ -1,4 +1,4 @@
-"""Points of a LAZ file, read in a child process: ``python -m wrf_mi.scene.read_laz FILE OUT.npy MOST_BYTES``.
+"""Points of a LAZ file, read in a child process: ``python -m wrf_mi.scene.scan.read_laz FILE OUT.npy MOST_BYTES``.
 
 The decompressor ends the process where a damaged file states a size that it cannot allocate.
 """

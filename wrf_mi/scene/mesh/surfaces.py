@@ -13,11 +13,11 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.files import one_line
-from ..core.types import IntArray
-from .coordinates import Up, turned, up_of
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.files import one_line
+from ...core.types import IntArray
+from ..coordinates import Up, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
 from .triangulation import triangles_of
 

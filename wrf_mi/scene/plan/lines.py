@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.transform import hough_line
 
-from ..core.angles import FloatArray
-from .outline import large_parts
-from .plan_sources import Mask, PlanGrid
+from ...core.angles import FloatArray
+from ..mesh.outline import large_parts
+from .sources import Mask, PlanGrid
 
 HALF_WIDTH_M = 0.1
 """Largest distance of cells that support a line: half the width of a blurred wall."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from shapely import affinity
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .planes import Mask, Plane
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..scan.planes import Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)

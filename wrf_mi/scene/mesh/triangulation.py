@@ -9,8 +9,8 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ...core.angles import FloatArray
+from ...core.types import IntArray
 from .polygon_files import Polygons
 
 FLAT = 1e-9

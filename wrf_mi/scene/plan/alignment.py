@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.draw import line
 
-from ..core.angles import FloatArray
-from .plan_lines import rotation_2d
-from .plan_sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
+from ...core.angles import FloatArray
+from .lines import rotation_2d
+from .sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
 
 STANDING_S = 1.0
 """Largest time between successive scans of a stop."""
@@ -120,7 +120,7 @@ def grid_from_scans(xy_m: FloatArray, time_s: FloatArray) -> PlanGrid:
         time_s: time of each return's scan, shape [n].
 
     Raises:
-        InputError: as `wrf_mi.scene.plan_sources.grid_from_points`.
+        InputError: as `wrf_mi.scene.plan.sources.grid_from_points`.
     """
     grid_from_points(xy_m)  # raises before the search
     canvas = _Canvas(xy_m)

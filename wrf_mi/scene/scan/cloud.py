@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import shapely
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from .classify import Face, kinds
+from ...core import InputError
+from ...core.angles import FloatArray
+from ..mesh.outline import fill_shadows, join, outline, triangulated
+from ..mesh.roles import Face, kinds
+from ..mesh.surfaces import KINDS, Surface, number_names
 from .layers import layers
-from .outline import fill_shadows, join, outline, triangulated
 from .planes import BAND, Plane, find_planes, fit, near, over, with_axes
 from .points import thin
-from .surfaces import KINDS, Surface, number_names
 
 logger = logging.getLogger(__name__)
 

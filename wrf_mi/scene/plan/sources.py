@@ -13,13 +13,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.array_files import stored_arrays
-from ..core.files import inside, one_line, text_lines
-from ..core.pictures import PICTURE_ERRORS, open_picture
-from ..core.yaml_files import read_yaml
-from ..datasets.folder_files import read_columns
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.array_files import stored_arrays
+from ...core.files import inside, one_line, text_lines
+from ...core.pictures import PICTURE_ERRORS, open_picture
+from ...core.yaml_files import read_yaml
+from ...datasets.folder_files import read_columns
 
 Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]

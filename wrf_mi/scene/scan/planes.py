@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from ..core.angles import FloatArray
+from ...core.angles import FloatArray
 from .points import Thinned, lidar_package
 
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)

@@ -11,12 +11,12 @@ import numpy as np
 import shapely
 import trimesh
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from .classify import STOREY_M, UPRIGHT, WALL_SHARE, Face, kinds, least_level_area
-from .coordinates import Up, require_precise
-from .planes import THICKEST_M, Plane, with_axes
-from .points import FORMATS, UNITS_M, check_extent, source_file
+from ...core import InputError
+from ...core.angles import FloatArray
+from ..coordinates import Up, require_precise
+from ..scan.planes import THICKEST_M, Plane, with_axes
+from ..scan.points import FORMATS, UNITS_M, check_extent, source_file
+from .roles import STOREY_M, UPRIGHT, WALL_SHARE, Face, kinds, least_level_area
 from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names, part_names
 from .surfaces import bodies as connected_bodies
 
@@ -43,7 +43,7 @@ LAYERS_M = 0.5
 
 @dataclass(frozen=True)
 class _Body:
-    """Triangles [f, 3, 3] that are connected by their edges, see `wrf_mi.scene.surfaces.bodies`."""
+    """Triangles [f, 3, 3] that are connected by their edges, see `wrf_mi.scene.mesh.surfaces.bodies`."""
 
     corners_m: FloatArray
     closed: bool
@@ -71,8 +71,8 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
 
     Args:
         path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
-        units: unit of its coordinates, a key of `wrf_mi.scene.points.UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.surfaces.mesh_parts`.
+        units: unit of its coordinates, a key of `wrf_mi.scene.scan.points.UNITS_M`.
+        up: axis that is up in it, see `wrf_mi.scene.mesh.surfaces.mesh_parts`.
 
     Raises:
         InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
@@ -106,7 +106,7 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
 def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     """The surfaces of a mesh split into floors, ceilings, walls and the rest.
 
-    The roles are those of planes in a scan (`wrf_mi.scene.classify.kinds`). A closed body within another body, such
+    The roles are those of planes in a scan (`wrf_mi.scene.mesh.roles.kinds`). A closed body within another body, such
     as a cupboard, is furniture unless it reaches from floor to ceiling. The direction of normals has no influence,
     except that a closed body with inward normals within a body with outward normals, clear of its floor and ceiling,
     is a

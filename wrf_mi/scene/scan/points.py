@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.array_files import stored_array, stored_arrays
-from ..core.files import one_line
-from ..core.memory import require_memory
-from ..parallel import run_module
-from .coordinates import Up, extent, require_precise, turned, up_of
-from .polygon_files import read_obj, read_ply
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.array_files import stored_array, stored_arrays
+from ...core.files import one_line
+from ...core.memory import require_memory
+from ...parallel import run_module
+from ..coordinates import Up, extent, require_precise, turned, up_of
+from ..mesh.polygon_files import read_obj, read_ply
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 """Length of each unit that a scan may be in."""
@@ -80,7 +80,7 @@ def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> Flo
         path: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las`` or ``.laz``; ``.xyz`` or ``.txt`` with
             three or more columns, separated by spaces or commas; or any format that trimesh reads (PLY, OBJ, STL).
         units: unit of the file's coordinates, a key of `UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.surfaces.mesh_parts`.
+        up: axis that is up in it, see `wrf_mi.scene.mesh.surfaces.mesh_parts`.
 
     Raises:
         InputError: missing file, unknown units, no points, a point that is not finite, or coordinates that were
@@ -165,7 +165,7 @@ def _read_las(file: Path) -> Any:
         out = Path(folder) / "points.npy"
         arguments = [str(file), str(out), str(LAZ_BYTES + 4 * needed)]
         seconds = LAZ_S + size / LAZ_BYTES_PER_S
-        status, message = run_module("wrf_mi.scene.read_laz", arguments, quiet=True, most_s=seconds)
+        status, message = run_module("wrf_mi.scene.scan.read_laz", arguments, quiet=True, most_s=seconds)
         if status != 0:
             raise ValueError(message if status == 1 else "its compressed points are damaged")
         return stored_array(out)

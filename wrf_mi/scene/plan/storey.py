@@ -7,14 +7,14 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .outline import triangulated
-from .plan_align import grid_from_scans
-from .plan_sources import PlanGrid, PlanPoints, grid_from_points
-from .plan_walls import find_walls
-from .surfaces import Kind, Surface, number_names
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..mesh.outline import triangulated
+from ..mesh.surfaces import Kind, Surface, number_names
+from .alignment import grid_from_scans
+from .sources import PlanGrid, PlanPoints, grid_from_points
+from .walls import find_walls
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
@@ -64,7 +64,7 @@ def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: floa
     """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres.
 
     Points whose scans are known by their times are aligned with one another first, and free space is found from the
-    places of the sensor (`wrf_mi.scene.plan_align`).
+    places of the sensor (`wrf_mi.scene.plan.alignment`).
 
     Raises:
         InputError: no wall.
@@ -88,7 +88,7 @@ def plan_surfaces(
     """Surfaces of a storey: walls extruded from floor to ceiling, and both of these.
 
     Args:
-        source: the plan, as `wrf_mi.scene.plan_sources.read_plan` returns it.
+        source: the plan, as `wrf_mi.scene.plan.sources.read_plan` returns it.
         height_m: height from floor to ceiling, above zero.
         floor_m: z of the floor.
         resolution_m: side of a cell to count points in.
