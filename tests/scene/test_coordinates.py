@@ -18,7 +18,7 @@ from wrf_mi.core import InputError
 from wrf_mi.maps.grid import surface_of
 from wrf_mi.scene.coordinates import Y_UP, looks_y_up, require_fine, require_near, require_precise
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.mesh.surfaces import mesh_parts
+from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.surfaces import sampled as points_on
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from wrf_mi.scene.mesh import outline
-from wrf_mi.scene.scan.planes import Plane, with_axes
+from wrf_mi.scene.mesh.planes import Plane, with_axes
 
 
 def test_pairs_out_of_reach_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
+from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.polygon_files import Polygons
-from wrf_mi.scene.mesh.surfaces import mesh_parts
 from wrf_mi.scene.mesh.triangulation import triangles_of
 
 ROUNDING = 1e-6

@@ -11,7 +11,8 @@ from calling import call
 from made_rooms import Mesh, attic, by_kind, l_shape
 
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.mesh.facets import planes_of_mesh, read_mesh
+from wrf_mi.scene.mesh.facets import planes_of_mesh
+from wrf_mi.scene.mesh.files import read_mesh
 from wrf_mi.scene.mesh.surfaces import Surface
 
 

@@ -12,10 +12,11 @@ import trimesh
 from made_rooms import closed_box, sampled
 
 from wrf_mi.core import InputError
+from wrf_mi.scene.coordinates import check_extent
 from wrf_mi.scene.make import is_plan, make_scene
-from wrf_mi.scene.mesh.facets import read_mesh
+from wrf_mi.scene.mesh.files import read_mesh
 from wrf_mi.scene.scan import points
-from wrf_mi.scene.scan.points import check_extent, lidar_package, read_points
+from wrf_mi.scene.scan.points import lidar_package, read_points
 
 POINTS = np.array([[0.5, 1.25, -2.0], [3.0, 4.5, 5.0], [6.0, -7.75, 8.0]])
 GRID = np.array([500_000.0, 5_400_000.0, 120.0])

@@ -14,7 +14,8 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
-from ..scene.mesh.facets import SUFFIXES, planes_of_mesh, read_mesh
+from ..scene.mesh.facets import planes_of_mesh
+from ..scene.mesh.files import SUFFIXES, read_mesh
 from ..scene.mesh.surfaces import Surface, bodies, box_of
 from ..scene.plan.sources import Mask, read_layout
 from ..scene.plan.storey import plan_surfaces

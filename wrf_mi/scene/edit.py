@@ -17,7 +17,8 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
-from .mesh.surfaces import KINDS, Kind, Surface, box_of, mesh_parts, moved
+from .mesh.files import mesh_parts
+from .mesh.surfaces import KINDS, Kind, Surface, box_of, moved
 
 logger = logging.getLogger(__name__)
 

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import Up, require_fine, require_near, up_of, warn_of_up
+from .coordinates import Up, check_extent, require_fine, require_near, up_of, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
-from .mesh.facets import SUFFIXES, planes_of_mesh, read_mesh
+from .mesh.facets import planes_of_mesh
+from .mesh.files import SUFFIXES, read_mesh
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, moved, sampled
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
@@ -25,7 +26,7 @@ from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
-from .scan.points import check_extent, read_points
+from .scan.points import read_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000

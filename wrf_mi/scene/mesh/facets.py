@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import shapely
 import trimesh
 
-from ...core import InputError
 from ...core.angles import FloatArray
-from ..coordinates import Up, require_precise
-from ..scan.planes import THICKEST_M, Plane, with_axes
-from ..scan.points import FORMATS, UNITS_M, check_extent, source_file
+from .planes import THICKEST_M, Plane, with_axes
 from .roles import STOREY_M, UPRIGHT, WALL_SHARE, Face, kinds, least_level_area
-from .surfaces import KINDS, Kind, Surface, mesh_parts, number_names, part_names
+from .surfaces import KINDS, Kind, Surface, number_names
 from .surfaces import bodies as connected_bodies
 
-logger = logging.getLogger(__name__)
-
-SUFFIXES = (".ply", ".stl", ".obj", ".glb")
-POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
-"""Remedy for a mesh of a format that is not read as points."""
-SMALLEST_FACE_M2 = 1e-10
-"""Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
 FLAT_M = 0.01
 """Largest distance of the vertices of a facet's triangles from its plane."""
 PARALLEL = np.cos(np.radians(2))
@@ -61,46 +49,6 @@ class _Facet(Face):
 
     corners_m: FloatArray
     body: int
-
-
-def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[Surface]:
-    """The surfaces of a mesh file, each of kind "other": a surface per body that the file names.
-
-    Degenerate faces and second copies of a face, which would count each path twice, are dropped (logged). Inverted
-    normals stay, because radio materials act on both sides; so do edges with one, three or more faces.
-
-    Args:
-        path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
-        units: unit of its coordinates, a key of `wrf_mi.scene.scan.points.UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.mesh.surfaces.mesh_parts`.
-
-    Raises:
-        InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
-            finite or were rounded far from the origin, or units that look like others.
-    """
-    file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    parts = mesh_parts(file, up)
-    if not parts:
-        remedy = "make a scene of points with wrf-mi mesh" if file.suffix.lower() == ".ply" else POINTS_ELSEWHERE
-        raise InputError(f"{file}: has no faces, so no surface; {remedy}")
-    require_precise(np.concatenate([part.vertices for part in parts]), UNITS_M[units], file)
-    surfaces = []
-    for name, part in zip(part_names(len(parts)), parts, strict=True):
-        vertices = np.asarray(part.vertices, float) * UNITS_M[units]
-        faces = np.asarray(part.faces, np.int64)
-        solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
-        # Copies may have other vertices: STL has no shared vertices.
-        _, same = np.unique(vertices, axis=0, return_inverse=True)
-        _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
-        for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
-            if count:
-                logger.warning("%s: %d %s faces of %s left out", file, count, what, name)
-        if len(first):
-            surfaces.append(Surface(name, "other", vertices, solid[np.sort(first)]))
-    if not surfaces:
-        raise InputError(f"{file}: every face is degenerate (no area); export it anew, or give its --units")
-    check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
-    return surfaces
 
 
 def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:

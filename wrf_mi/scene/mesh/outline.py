@@ -13,7 +13,7 @@ from shapely import affinity
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..scan.planes import Mask, Plane
+from .planes import Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)

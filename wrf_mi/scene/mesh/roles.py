@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from ..scan.planes import Plane
+from .planes import Plane
 from .surfaces import Kind
 
 LEVEL = np.cos(np.radians(10))

@@ -15,7 +15,8 @@ from skimage.filters import apply_hysteresis_threshold
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .planes import SEARCH_M, Mask, Plane, near
+from ..mesh.planes import Mask, Plane, near
+from .planes import SEARCH_M
 
 POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8
 """Mean and least number of points of a cell."""

@@ -6,16 +6,16 @@ Patches are those of Open3D (Araujo and Oliveira 2020, Pattern Recognit. 107).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
 from ...core.angles import FloatArray
+from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
 from .points import Thinned, lidar_package
 
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
@@ -23,8 +23,6 @@ NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
 joins the walls of a sparse room around its corners, but finds narrow faces."""
 SEARCH_M = 0.10
 """Half thickness of a patch in which parallel layers, such as both sides of a partition, are separated."""
-MARGIN_M = 0.15
-"""A plane may reach this far beyond the patch it was found as."""
 BAND = 3.0
 """Points within this many standard deviations belong to a plane."""
 REPEAT = 5.0
@@ -40,63 +38,8 @@ LAYER_CORE = (0.02, 0.98)
 MERGE_GAP_M = 1.0
 """Coplanar pieces nearer than this are one plane: wall on both sides of a door."""
 MERGE_ANGLE_RAD = float(np.radians(1.0))
-THICKEST_M = 0.3
-"""A thicker box holds more than a plane."""
 SHORTEST_EDGE_M = 0.2
 FEWEST_VOXELS = 60
-
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A plane n . x = d and the patches that it was found as.
-
-    Attributes:
-        normal: unit vector n, shape [3]; its sign has no meaning.
-        offset_m: d, metres.
-        patches_m: corners of the rectangles where it was found, shape [k, 4, 3], metres.
-        centre_m: weighted mean of its points, shape [3].
-        angle_error_rad: standard error of the normal's direction.
-        u: unit vector in the plane, shape [3].
-    """
-
-    normal: FloatArray
-    offset_m: float
-    patches_m: FloatArray
-    centre_m: FloatArray
-    angle_error_rad: float
-    u: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    @property
-    def v(self) -> FloatArray:
-        """The second unit vector in the plane, n x u."""
-        return np.cross(self.normal, self.u)
-
-    def flat(self, points_m: FloatArray) -> FloatArray:
-        """Coordinates [..., 2] along u and v of points [..., 3], metres."""
-        return points_m @ np.stack([self.u, self.v], axis=1).astype(points_m.dtype)
-
-    def lift(self, flat_m: FloatArray) -> FloatArray:
-        """Points [..., 3] of the plane from coordinates [..., 2] in it."""
-        return flat_m @ np.stack([self.u, self.v]) + self.normal * self.offset_m
-
-    def distance(self, points_m: FloatArray) -> FloatArray:
-        """Signed distance [...] of points from the plane, metres."""
-        return points_m @ self.normal.astype(points_m.dtype) - points_m.dtype.type(self.offset_m)
-
-    def region(self, margin_m: float = MARGIN_M) -> Any:
-        """Area (shapely, in the plane's coordinates) of its patches and a margin around them."""
-        hulls = shapely.convex_hull(shapely.multipoints(self.flat(self.patches_m)))
-        return shapely.buffer(shapely.union_all(hulls), margin_m, join_style="mitre")
-
-
-def with_axes(plane: Plane, along: ArrayLike = (1.0, 0.0, 0.0)) -> Plane:
-    """The plane with its axes set: u horizontal where it is upright, else the projection of ``along``."""
-    n = plane.normal
-    level = np.array([-n[1], n[0], 0.0])
-    u = level if np.linalg.norm(level) > 0.5 else np.asarray(along) - n * (n @ np.asarray(along))
-    return replace(plane, u=u / np.linalg.norm(u))
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
@@ -123,19 +66,6 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         for plane in planes:
             rest &= ~near(plane, cloud.points_m, BAND * noise)
     return planes, noise
-
-
-def near(plane: Plane, points_m: FloatArray, band_m: float, margin_m: float = MARGIN_M) -> Mask:
-    """Which points [n] lie within a distance of the plane and over its patches."""
-    return over(plane, plane.region(margin_m), points_m, band_m)
-
-
-def over(plane: Plane, area: Any, points_m: FloatArray, band_m: float) -> Mask:
-    """Which points [n] lie within a distance of an area (shapely) of the plane."""
-    mask: Mask = np.abs(plane.distance(points_m)) < band_m
-    index = np.flatnonzero(mask)
-    mask[index] = shapely.contains_xy(area, plane.flat(points_m[index]))
-    return mask
 
 
 def fit(

@@ -17,16 +17,11 @@ from ...core.array_files import stored_array, stored_arrays
 from ...core.files import one_line
 from ...core.memory import require_memory
 from ...parallel import run_module
-from ..coordinates import Up, extent, require_precise, turned, up_of
+from ..coordinates import FORMATS, UNITS_M, Up, require_precise, source_file, turned, up_of
 from ..mesh.polygon_files import read_obj, read_ply
 
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
-"""Length of each unit that a scan may be in."""
-FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 """Libraries that Open3D is linked against and a small system lacks."""
-LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
-"""Bounds of the extent of a building; outside them the units are wrong."""
 MOST_LAZ = 1000
 """Largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred."""
 LAS_HEADER, LAS_MINOR, LAS_EXTENDED = 375, 25, 4
@@ -64,15 +59,6 @@ def lidar_package(name: str) -> Any:
         raise InputError(f"{name} cannot be loaded ({text}); install that library, on Debian: {SYSTEM}") from None
 
 
-def source_file(path: str | Path, units: str, wanted: str) -> Path:
-    """The path of a file; an `InputError` for unknown units or a missing file, whose message ends with ``wanted``."""
-    if units not in UNITS_M:
-        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; give {wanted}")
-    return Path(path)
-
-
 def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> FloatArray:
     """Points [m, 3] in metres, z up, of a point cloud, or the vertices of a mesh.
 
@@ -80,7 +66,7 @@ def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> Flo
         path: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las`` or ``.laz``; ``.xyz`` or ``.txt`` with
             three or more columns, separated by spaces or commas; or any format that trimesh reads (PLY, OBJ, STL).
         units: unit of the file's coordinates, a key of `UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.mesh.surfaces.mesh_parts`.
+        up: axis that is up in it, see `wrf_mi.scene.mesh.files.mesh_parts`.
 
     Raises:
         InputError: missing file, unknown units, no points, a point that is not finite, or coordinates that were
@@ -104,18 +90,6 @@ def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> Flo
         raise InputError(f"{file}, point {bad[0] + 1}: not finite; remove that point")
     require_precise(points, UNITS_M[units], file)
     return turned(points if UNITS_M[units] == 1 else points * UNITS_M[units], up_of(file, up))
-
-
-def check_extent(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building."""
-    size = np.ptp(extent(points_m), axis=0)
-    text = f"{name}: extent {' x '.join(f'{side:.4g}' for side in size)} m"
-    if size.max() > LARGEST_M:
-        raise InputError(f"{text} looks like millimetres; give --units mm (or cut out one building)")
-    if size[2] > HIGHEST_M:
-        raise InputError(f"{text} looks like centimetres; give --units cm (or cut out one building)")
-    if size.max() < SMALLEST_M:
-        raise InputError(f"{text} is too small for a room; give its --units ({', '.join(UNITS_M)})")
 
 
 def thin(points_m: FloatArray) -> Thinned:
