@@ -57,10 +57,14 @@ class Face:
         z = self.plane.lift(shapely.get_coordinates(self.area))[:, 2]
         return float(z.min()), float(z.max())
 
-    def overlaps(self, other: Face) -> bool:
-        """Whether one of both faces lies above or below the other."""
+    def overlaps(self, other: Face, share: float = 0.3) -> bool:
+        """Whether one of both faces lies above or below at least a share of the other."""
         common = shapely.intersection(self.shadow, other.shadow).area
-        return bool(common > 0.3 * min(self.shadow.area, other.shadow.area))
+        return bool(common > share * min(self.shadow.area, other.shadow.area))
+
+    def height_at(self, x: float, y: float) -> float:
+        """Height of the plane above a point of the ground: a ceiling may slope."""
+        return float((self.plane.offset_m - self.plane.normal[:2] @ (x, y)) / self.plane.normal[2])
 
 
 def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
@@ -70,52 +74,50 @@ def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
     large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls. The median
     height of the points, ``middle_m``, separates floors from ceilings where there is only one of them.
     """
-    least = least_level_area(faces)
-    large = sorted((face for face in faces if face.area.area >= least), key=lambda face: face.span_m[0])
+    least_m2 = least_level_area(faces)
+    large = sorted((face for face in faces if face.area.area >= least_m2), key=lambda face: face.span_m[0])
     roles = dict[Face, Kind]()
     for face in large:
         if face.slope > LEVEL and (role := _level_role(face, roles, middle_m)):
             roles[face] = role
     floors = [face for face, role in roles.items() if role == "floor"]
-    for face in large:
-        if UPRIGHT < face.slope <= LEVEL and _is_sloping_ceiling(face, floors, middle_m):
-            roles[face] = "ceiling"
-    walls = [face for face in faces if face.slope <= UPRIGHT and _is_wall(face, roles)]
-    for face in walls:
-        roles[face] = "wall"
+    sloping = [face for face in large if UPRIGHT < face.slope <= LEVEL]
+    roles |= {face: "ceiling" for face in sloping if _is_high(face, floors, middle_m)}
+    upright = [face for face in faces if face.slope <= UPRIGHT]
+    roles |= {face: "wall" for face in upright if _spans_room(face, roles)}
     return [roles.get(face, "other") for face in faces]
 
 
 def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> Kind | None:
-    """Role of a level face above those that have one; None: it is a table, or a second layer."""
+    """Role of a level face by the highest face below it; None: it is a table, or a second layer."""
+    below = max((other for other in roles if face.overlaps(other)), key=lambda other: other.span_m[0], default=None)
     low = face.span_m[0]
-    top = max((other for other in roles if face.overlaps(other)), key=lambda other: other.span_m[0], default=None)
-    if top is None:
+    if below is None:
         return "floor" if low < middle_m else "ceiling"
-    if roles[top] == "floor":
-        return "ceiling" if low - top.span_m[0] > STOREY_M else None
-    return "floor" if low - top.span_m[0] < SLAB_M else "ceiling"
+    apart_m = low - below.span_m[0]
+    if roles[below] == "floor":
+        return "ceiling" if apart_m > STOREY_M else None
+    return "floor" if apart_m < SLAB_M else "ceiling"
 
 
-def _is_sloping_ceiling(face: Face, floors: Sequence[Face], middle_m: float) -> bool:
+def _is_high(face: Face, floors: Sequence[Face], middle_m: float) -> bool:
+    """Whether a sloping face reaches a storey above the floors below it: the roof of an attic, not a ramp."""
     top = face.span_m[1]
-    under = [floor.span_m[1] for floor in floors if floor.span_m[1] < top and face.overlaps(floor)]
-    return top > max(under, default=middle_m) + STOREY_M
+    below = [floor.span_m[1] for floor in floors if floor.span_m[1] < top and face.overlaps(floor)]
+    return top > max(below, default=middle_m) + STOREY_M
 
 
-def _is_wall(face: Face, roles: Mapping[Face, Kind]) -> bool:
-    """Whether an upright face spans most of the height between floor and ceiling where it stands."""
+def _spans_room(face: Face, roles: Mapping[Face, Kind]) -> bool:
+    """Whether an upright face spans most of the height between floor and ceiling at its middle."""
     x, y, z = face.plane.lift(np.array(face.area.centroid.coords[0]))
-    heights = {"floor": list[float](), "ceiling": list[float]()}
-    for other, role in roles.items():
-        if shapely.intersects(face.shadow, other.shadow):
-            # The height there: a ceiling may slope.
-            heights[role].append((other.plane.offset_m - other.plane.normal[:2] @ (x, y)) / other.plane.normal[2])
-    floor = max((height for height in heights["floor"] if height < z), default=-np.inf)
-    ceiling = min((height for height in heights["ceiling"] if height > z), default=np.inf)
-    least = WALL_SHARE * (ceiling - floor) if np.isfinite(ceiling - floor) else WALL_HEIGHT_M
-    u0, _, u1, _ = face.area.bounds
-    return bool(np.ptp(face.span_m) >= least and u1 - u0 >= NARROWEST_WALL_M)
+    levels = [
+        (role, level.height_at(x, y)) for level, role in roles.items() if shapely.intersects(face.shadow, level.shadow)
+    ]
+    floor = max((height for role, height in levels if role == "floor" and height < z), default=-np.inf)
+    ceiling = min((height for role, height in levels if role == "ceiling" and height > z), default=np.inf)
+    least_m = WALL_SHARE * (ceiling - floor) if np.isfinite(ceiling - floor) else WALL_HEIGHT_M
+    left, _, right, _ = face.area.bounds
+    return bool(np.ptp(face.span_m) >= least_m and right - left >= NARROWEST_WALL_M)
 
 
 def least_level_area(faces: Sequence[Face]) -> float:

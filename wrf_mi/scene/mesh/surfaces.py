@@ -8,8 +8,6 @@ from typing import Literal, get_args
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
@@ -46,10 +44,10 @@ class Surface:
 
 def number_names(kinds: Sequence[Kind]) -> list[str]:
     """A unique name for each surface: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
-    names, seen = [], dict.fromkeys(KINDS, 0)
+    names, number = [], dict.fromkeys(KINDS, 0)
     for kind in kinds:
-        seen[kind] += 1
-        names.append(kind if kinds.count(kind) == 1 else f"{kind}_{seen[kind]:02d}")
+        number[kind] += 1
+        names.append(kind if kinds.count(kind) == 1 else f"{kind}_{number[kind]:02d}")
     return names
 
 
@@ -78,7 +76,7 @@ def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
     """
     _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
-    ends = np.stack([vertex, np.roll(vertex, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = trimesh.geometry.faces_to_edges(vertex)
     # Numbers of both vertices in one integer: NumPy's unique rows take ten times as long.
     both = np.sort(ends, axis=1) @ [len(ends), 1]
     return np.unique(both, return_inverse=True)[1].reshape(-1), ends
@@ -86,7 +84,7 @@ def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
 
 def sampled(triangles: FloatArray, count: int = 20_000) -> FloatArray:
     """Points [count, 3] spread evenly over triangles [f, 3, 3]."""
-    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=False)
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
 
 
@@ -103,8 +101,8 @@ def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
     edge, ends = shared_edges(corners_m)
     uses, face = np.bincount(edge), np.repeat(np.arange(count), 3)
     # Faces and edges are the nodes of one graph, so that an edge of many faces costs no more.
-    incidence = coo_array((np.ones(3 * count), (face, count + edge)), shape=(count + len(uses),) * 2)
-    body = connected_components(incidence, directed=False)[1][:count]
+    incidence = np.stack([face, count + edge], axis=-1)
+    body = trimesh.graph.connected_component_labels(incidence, count + len(uses))[:count]
     # Neighbours of the same orientation run along their common edge in opposite directions.
     turned = np.bincount(edge, np.sign(ends[:, 1] - ends[:, 0]))
     unpaired, crossed = (np.bincount(body[face], wrong[edge]) for wrong in (uses != 2, turned != 0))
