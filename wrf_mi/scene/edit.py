@@ -121,7 +121,7 @@ def edit_scene(
     surfaces, materials = read_surfaces(folder)
     if not moves and not remove:
         raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
-    stated, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
+    unmoved, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
         text = f"move {','.join(move.parts)}"
@@ -130,10 +130,10 @@ def edit_scene(
         if both := sorted(names & gone):
             raise InputError(f"{text}: {both[0]} is also removed; omit one of the two")
         matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
-        surfaces = [moved([one], matrix)[0] if one.name in names else one for one in surfaces]
+        surfaces = [moved([part], matrix)[0] if part.name in names else part for part in surfaces]
         moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
-    _check_moves(stated, left, moved_names)
+    _check_moves(unmoved, left, moved_names)
     kept = {surface.name: materials.surfaces[surface.name] for surface in left}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
@@ -150,22 +150,22 @@ def edit_scene(
 
 def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[str]) -> set[str]:
     """Names of the surfaces that match some patterns; every pattern has to match one."""
-    found: set[str] = set()
+    chosen: set[str] = set()
     for pattern in patterns:
         names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
         if not names:
             known = ", ".join(surface.name for surface in surfaces)
             raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
-        found |= names
-    return found
+        chosen |= names
+    return chosen
 
 
 def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[str]) -> None:
     """Refuse a moved part that is wholly outside of the scene, and warn of one partly out of it, or in others."""
-    parts, others = ([one for one in after if (one.name in names) == chosen] for chosen in (True, False))
+    parts, others = ([part for part in after if (part.name in names) == chosen] for chosen in (True, False))
     if not parts or not others:
         return  # a scene that is moved as a whole has no inside
-    earlier = {one.name: one for one in before}
+    earlier = {part.name: part for part in before}
     low, high = box_of(before)
     for part in parts:
         first, last = box_of([part])

@@ -91,11 +91,11 @@ def write_scene(
     names = [surface.name for surface in surfaces]
     if len(set(names)) < len(names):
         raise ValueError("write_scene: two surfaces have the same name")
-    given = materials or Materials()
-    if unknown := [name for name in given.surfaces if name not in names]:
+    materials = materials or Materials()
+    if unknown := [name for name in materials.surfaces if name not in names]:
         raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
     require_near(box_of(surfaces), source)
-    full = given.complete({surface.name: surface.kind for surface in surfaces})
+    full = materials.complete({surface.name: surface.kind for surface in surfaces})
     matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
         "description": description or f"{len(surfaces)} surfaces made from {Path(source).name}",
