@@ -108,12 +108,10 @@ def check_positions(
     """
     count = len(distinct(positions_m))
     crossings, outside = conflicts(positions_m, surfaces)
-    others = [(remedy, conflicts(positions_m, those)) for remedy, those in mirrored]
+    others = [(remedy, conflicts(positions_m, reflection)) for remedy, reflection in mirrored]
     remedy, best = min(others, key=lambda pair: sum(pair[1]))
-    text = (
-        f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions lie"
-    )
-    text += f" outside; mirrored it is {best[0]} and {best[1]}"
+    text = f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions"
+    text += f" lie outside; mirrored it is {best[0]} and {best[1]}"
     tolerated = TOLERATED + TOLERATED_SHARE * count
     if crossings + outside > 2 * sum(best) + tolerated:
         raise InputError(f"{text}: {remedy}")
@@ -153,14 +151,14 @@ def reflections(
             flips.append((axis, float(totals[axis]), f"replace its {letter} by {totals[axis]:.6g} - {letter}"))
     if known_walls_m is not None:
         del flips[1:]  # all reflections are the same once they are registered
-    found = []
+    scenes = []
     for axis, total, remedy in flips:
         flip = np.eye(4)
         flip[axis, axis], flip[axis, 3] = -1, total
         mirrored = moved(surfaces, flip)
         placing = motion if known_walls_m is None else best_motion(wall_points(mirrored), known_walls_m)
-        found.append((remedy, mirrored if placing is None else moved(mirrored, placing)))
-    return found
+        scenes.append((remedy, moved(mirrored, placing)))
+    return scenes
 
 
 def distinct(positions_m: FloatArray) -> FloatArray:

@@ -123,7 +123,7 @@ def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]
 def _corners(plane: Plane, area: Any) -> FloatArray:
     """Corners [4, 3] of a rectangle of a plane around an area; not finite for an empty one."""
     low_u, low_v, high_u, high_v = area.bounds
-    return plane.lift(np.array([[low_u, low_v], [high_u, low_v], [low_u, high_v], [high_u, high_v]]))
+    return plane.rectangle(np.array([low_u, low_v]), np.array([high_u, high_v]))
 
 
 def _beside(plane: Plane, corners_m: FloatArray, reach_m: float) -> bool:

@@ -56,6 +56,21 @@ class Plane:
         """Signed distance [...] of points from the plane, metres."""
         return points_m @ self.normal.astype(points_m.dtype) - points_m.dtype.type(self.offset_m)
 
+    def shifted(self, distance_m: float) -> Plane:
+        """The parallel plane at a distance along the normal, patches included."""
+        shift = distance_m * self.normal
+        return replace(
+            self,
+            offset_m=self.offset_m + distance_m,
+            patches_m=self.patches_m + shift,
+            centre_m=self.centre_m + shift,
+        )
+
+    def rectangle(self, low_m: FloatArray, high_m: FloatArray) -> FloatArray:
+        """Corners [4, 3] of the rectangle between two points [2] in the plane's coordinates."""
+        (u0, v0), (u1, v1) = low_m, high_m
+        return self.lift(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]))
+
     def region(self, margin_m: float = MARGIN_M) -> Any:
         """Area (shapely, in the plane's coordinates) of its patches and a margin around them."""
         hulls = shapely.convex_hull(shapely.multipoints(self.flat(self.patches_m)))

@@ -140,9 +140,9 @@ def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]
         raw = xy_m[number == i]
         if i and times[i] - times[i - 1] <= STANDING_S:
             middle = raw.mean(axis=0)
-            found, mean = canvas.match(field, raw, middle, pose, WITHIN_STOP, 0.0)
+            matched, mean = canvas.match(field, raw, middle, pose, WITHIN_STOP, 0.0)
             if mean >= SAME_STOP:
-                pose = found
+                pose = matched
                 groups[-1].append((raw, _moved(raw, pose, middle)))
                 continue
         pose = np.zeros(3)
@@ -194,15 +194,15 @@ def _seen_from(scan_m: FloatArray, place: FloatArray) -> tuple[int, int]:
 
 def _place(stops: list[_Stop], canvas: _Canvas) -> None:
     """Match each stop to the map of those placed, the largest stop first, then the stop with the most overlap."""
-    rest = sorted(stops, key=lambda s: -len(s.points))
-    image = canvas.image(rest.pop(0).points)
-    while rest:
+    unplaced = sorted(stops, key=lambda stop: -len(stop.points))
+    image = canvas.image(unplaced.pop(0).points)
+    while unplaced:
         rough = canvas.closeness(image, 0.12)
-        stop = max(rest, key=lambda s: float(rough[tuple(canvas.cells(s.points).T)].mean()))
-        rest.remove(stop)
+        stop = max(unplaced, key=lambda stop: float(rough[tuple(canvas.cells(stop.points).T)].mean()))
+        unplaced.remove(stop)
         middle = stop.points.mean(axis=0)
-        some = stop.points[:: max(1, len(stop.points) // COARSE_POINTS)]
-        pose, _ = canvas.match(rough, some, middle, stop.pose, (COARSE,), POSE_WEIGHT)
+        sparse = stop.points[:: max(1, len(stop.points) // COARSE_POINTS)]
+        pose, _ = canvas.match(rough, sparse, middle, stop.pose, (COARSE,), POSE_WEIGHT)
         pose, mean = canvas.match(canvas.closeness(image, 0.08), stop.points, middle, pose, FINE, POSE_WEIGHT)
         if mean >= SAME_PLACE:
             stop.pose = pose

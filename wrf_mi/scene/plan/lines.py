@@ -118,8 +118,8 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
     low = grid.origin_m - half * step
     runs: list[Run] = []
     while True:
-        found = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate((left, left.T))]
-        (score, row, begin, end), axis = max(found, key=lambda f: f[0][0])
+        best = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate((left, left.T))]
+        (score, row, begin, end), axis = max(best, key=lambda run: run[0][0])
         if score <= 0:
             return runs
         image = left if axis == 0 else left.T

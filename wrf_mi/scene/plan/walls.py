@@ -66,7 +66,7 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         InputError: no wall was found.
     """
     grid = without_specks(grid)
-    left, found = grid, []
+    left, walls = grid, list[FloatArray]()
     for pass_ in range(MOST_DIRECTIONS):
         if not left.occupied.any():
             break
@@ -76,19 +76,19 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         if not runs:
             break
         # Things that hide a wall may already have been explained by another direction: the rules use the whole grid.
-        walls = [run.ends_m @ rotation_2d(angle).T for run in _tidy(runs, turned(grid, angle))]
-        pieces = [run.ends_m @ rotation_2d(angle).T for run in runs]
-        found += walls
+        tidy = _tidy(runs, turned(grid, angle))
+        pieces = [run.ends_m @ rotation_2d(angle).T for run in (*runs, *tidy)]
+        walls += pieces[len(runs) :]
         # The occupied cells that lie at these walls are explained.
-        lines = shapely.STRtree(shapely.linestrings(np.array(pieces + walls)))
         cells = shapely.points(left.centres_m(left.occupied))
-        near, occupied = lines.query(cells, predicate="dwithin", distance=CLEARED_M)[0], left.occupied.copy()
+        near = shapely.STRtree(shapely.linestrings(np.array(pieces))).query(cells, "dwithin", CLEARED_M)[0]
+        occupied = left.occupied.copy()
         row, column = np.nonzero(occupied)
         occupied[row[near], column[near]] = False
         left = without_specks(replace(left, occupied=occupied))
-    if not found:
+    if not walls:
         raise InputError("no straight wall was found; is the resolution right, and is it a plan of walls?")
-    walls_m = _without_clutter(joined(np.array(found)))
+    walls_m = _without_clutter(joined(np.array(walls)))
     return walls_m[np.argsort(-np.linalg.norm(walls_m[:, 1] - walls_m[:, 0], axis=-1), kind="stable")]
 
 
@@ -104,14 +104,14 @@ def joined(walls_m: FloatArray) -> FloatArray:
         safe = np.where(corner, sine, 1.0)
         # Where line i meets line j: distance from the start of i along i, and from the start of j along j.
         between = walls_m[:, 0] - walls_m[i, 0]
-        here = _cross(between, unit) / safe
+        meeting = _cross(between, unit) / safe
         other = _cross(between, unit[i]) / safe
         beyond = np.maximum(np.maximum(-other, other - length), 0)
         for end, at in enumerate((0.0, length[i])):
-            way = np.where(corner & (beyond <= REACH_M), np.abs(here - at), np.inf)
+            way = np.where(corner & (beyond <= REACH_M), np.abs(meeting - at), np.inf)
             nearest = int(np.argmin(way))
             if way[nearest] <= REACH_M:
-                result[i, end] = walls_m[i, 0] + here[nearest] * unit[i]
+                result[i, end] = walls_m[i, 0] + meeting[nearest] * unit[i]
     return result[np.linalg.norm(result[:, 1] - result[:, 0], axis=-1) > TOUCHING_M]
 
 
@@ -143,6 +143,11 @@ class _Strips:
     grid: PlanGrid
 
     @cached_property
+    def knows_free(self) -> bool:
+        """Whether cells are known to be free: points without scans do not show it."""
+        return bool(self.grid.free.any())
+
+    @cached_property
     def hiding(self) -> Mask:
         """Cells near enough to an occupied cell for furniture to hide them; in a corner it is a diagonal away."""
         away = ndimage.distance_transform_edt(~self.grid.occupied) * self.grid.resolution_m
@@ -157,6 +162,12 @@ class _Strips:
         rows = slice(max(0, int(np.floor(low))), max(0, int(np.ceil(high))))
         band = image[rows, max(0, round(begin)) : max(0, round(end))]
         return float(band.any(axis=0).mean()) if band.size else 0.0
+
+    def free_beside(self, run: Run) -> float:
+        """Share of a run with free cells at its sides."""
+        return self.share(
+            self.grid.free, run.axis, (run.offset - BESIDE_M, run.offset + BESIDE_M), (run.start, run.end)
+        )
 
     def free_between(self, a: Run, b: Run, along: tuple[float, float]) -> float:
         """Share of a stretch where free cells lie between two parallel runs, without their smears."""
@@ -173,18 +184,14 @@ class _Strips:
 def _tidy(runs: Sequence[Run], grid: PlanGrid) -> list[Run]:
     """Walls from runs of the same turned grid."""
     strips = _Strips(grid)
-    knows_free = bool(grid.free.any())
-    if knows_free:
-        beside = [(run.offset - BESIDE_M, run.offset + BESIDE_M) for run in runs]
-        shares = [strips.share(grid.free, r.axis, b, (r.start, r.end)) for r, b in zip(runs, beside, strict=True)]
-        runs = [run for run, share in zip(runs, shares, strict=True) if share >= SEEN_SHARE]
-    walls = _bridged(_merged(runs, strips), strips, knows_free)
-    if knows_free:
-        walls = _without_fronts(walls, strips)
-        for _ in range(MOST_ROUNDS):
-            before, walls = walls, _without_fronts(_extended(walls, strips), strips)
-            if walls == before:
-                break
+    if not strips.knows_free:
+        return _bridged(_merged(runs, strips), strips)
+    runs = [run for run in runs if strips.free_beside(run) >= SEEN_SHARE]
+    walls = _without_fronts(_bridged(_merged(runs, strips), strips), strips)
+    for _ in range(MOST_ROUNDS):
+        before, walls = walls, _without_fronts(_extended(walls, strips), strips)
+        if walls == before:
+            break
     return walls
 
 
@@ -206,12 +213,12 @@ def _merged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     return walls
 
 
-def _bridged(runs: Sequence[Run], strips: _Strips, knows_free: bool) -> list[Run]:
+def _bridged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     """Collinear runs merged where the gap between them is no opening."""
     walls = sorted(runs, key=lambda r: -r.length)
     i = 0
     while i < len(walls):
-        partner = next((b for b in walls[i + 1 :] if _same_wall(walls[i], b, strips, knows_free)), None)
+        partner = next((b for b in walls[i + 1 :] if _same_wall(walls[i], b, strips)), None)
         if partner is None:
             i += 1
             continue
@@ -223,14 +230,14 @@ def _bridged(runs: Sequence[Run], strips: _Strips, knows_free: bool) -> list[Run
     return walls
 
 
-def _same_wall(a: Run, b: Run, strips: _Strips, knows_free: bool) -> bool:
+def _same_wall(a: Run, b: Run, strips: _Strips) -> bool:
     if a.axis != b.axis or abs(a.offset - b.offset) > SAME_LINE_M:
         return False
     begin, end = min(a.end, b.end), max(a.start, b.start)
     gap = end - begin
     if gap <= 0:
         return True
-    if not knows_free:
+    if not strips.knows_free:
         return gap <= NARROW_GAP_M
     free = strips.on_line(strips.grid.free, a.axis, (a.offset + b.offset) / 2, (begin, end))
     return gap <= min(HIDDEN_GAP_M, a.length + b.length) and free <= FREE_SHARE
@@ -238,10 +245,10 @@ def _same_wall(a: Run, b: Run, strips: _Strips, knows_free: bool) -> bool:
 
 def _without_fronts(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     """Runs without those that stand before a longer parallel run with nothing free between them."""
-    kept = sorted(runs, key=lambda r: r.length)
-    for run in tuple(kept):
+    walls = sorted(runs, key=lambda run: run.length)
+    for run in tuple(walls):
         covered = np.zeros(max(1, round(run.length / strips.grid.resolution_m)), bool)
-        for wall in kept:
+        for wall in walls:
             near = 0 < abs(wall.offset - run.offset) <= FURNITURE_DEPTH_M
             along = max(wall.start, run.start), min(wall.end, run.end)
             if wall.axis != run.axis or wall.length <= run.length or not near or along[0] >= along[1]:
@@ -250,33 +257,38 @@ def _without_fronts(runs: Sequence[Run], strips: _Strips) -> list[Run]:
                 first, last = ((v - run.start) / run.length * len(covered) for v in along)
                 covered[round(first) : round(last)] = True
         if covered.mean() >= HIDING_SHARE:
-            kept.remove(run)
-    return kept
+            walls.remove(run)
+    return walls
 
 
 def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     """Runs extended behind the things that hide their ends, to the nearest wall across."""
     walls = []
     for run in runs:
-        ends = [run.start, run.end]
-        for side, sign in enumerate((-1, 1)):
-            here = ends[side]
-            across = [b for b in runs if b.axis != run.axis]
-            near = [b for b in across if abs(b.offset - here) <= SAME_WALL_M]
-            if any(b.start - SAME_WALL_M <= run.offset <= b.end + SAME_WALL_M for b in near):
+        ends = {-1: run.start, 1: run.end}
+        across = [other for other in runs if other.axis != run.axis]
+        for sign, end in tuple(ends.items()):
+            target = _hidden_corner(run, sign, end, across)
+            if target is None:
                 continue
-            reachable = [
-                b.offset
-                for b in across
-                if 0 < sign * (b.offset - here) <= HIDDEN_GAP_M
-                and b.start - FURNITURE_DEPTH_M <= run.offset <= b.end + FURNITURE_DEPTH_M
-            ]
-            if not reachable:
-                continue
-            there = min(reachable, key=lambda v: abs(v - here))
-            along = (min(here, there), max(here, there))
+            along = min(end, target), max(end, target)
             free, hidden = (strips.on_line(m, run.axis, run.offset, along) for m in (strips.grid.free, strips.hiding))
             if free <= FREE_SHARE and hidden >= HIDING_SHARE:
-                ends[side] = there
-        walls.append(replace(run, start=ends[0], end=ends[1]))
+                ends[sign] = target
+        walls.append(replace(run, start=ends[-1], end=ends[1]))
     return walls
+
+
+def _hidden_corner(run: Run, sign: int, end: float, across: Sequence[Run]) -> float | None:
+    """Where a run would meet the nearest wall across beyond an end; None: it meets one there, or there is none."""
+    for wall in across:
+        spans = wall.start - SAME_WALL_M <= run.offset <= wall.end + SAME_WALL_M
+        if spans and abs(wall.offset - end) <= SAME_WALL_M:
+            return None
+    reachable = [
+        wall.offset
+        for wall in across
+        if 0 < sign * (wall.offset - end) <= HIDDEN_GAP_M
+        and wall.start - FURNITURE_DEPTH_M <= run.offset <= wall.end + FURNITURE_DEPTH_M
+    ]
+    return min(reachable, key=lambda offset: abs(offset - end), default=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,16 @@ ERRORS = 3.0
 """Angle by which planes are turned, in standard errors of their direction."""
 
 
+@dataclass(frozen=True)
+class _Piece:
+    """A plane, its area (shapely), the distance within which its corners are closed, and areas of recesses in it."""
+
+    plane: Plane
+    area: Any
+    reach_m: float
+    recesses: Sequence[Any] = ()
+
+
 def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
@@ -56,55 +66,65 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     points = points_m - shift
     cloud = thin(points)
     planes, noise = find_planes(cloud)
-    points = points.astype(np.float32)
-    # Planes, areas, and ways within which corners are closed; recesses by the number of their wall.
-    pieces, niches = list[tuple[Plane, Any, float]](), dict[int, Any]()
-    # A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
-    free = np.ones(len(points), bool)
-    for stated in _refined(planes, points, noise):
-        plane, parallel = layers(stated, points, free, noise)
-        behind = []
-        for layer in parallel:
-            area, cell = outline(layer.plane, points[layer.rows])
-            if area.area >= SMALLEST_M2:
-                pieces.append((layer.plane, area, 3 * noise + cell))
-                free[layer.rows] = False
-                behind += [] if layer.before else [area]
-        mine = near(plane, points, 2 * noise) & free
-        for layer in parallel:
-            mine[layer.rows] = layer.before  # a wall goes on behind a board
-        index = np.flatnonzero(mine)
-        if len(index) < FEWEST_POINTS:
-            continue
-        area, cell = outline(plane, points[index])
-        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise)]))
-        inside, beside = np.count_nonzero(away < 2 * noise) / 2, np.count_nonzero(away > 3 * noise) / 3
-        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
-            if behind:
-                niches[len(pieces)] = shapely.union_all(behind)
-            pieces.append((plane, area, 3 * noise + cell))
-            free &= ~over(plane, area, points, BAND * noise)
+    pieces = _pieces(planes, points.astype(np.float32), noise)
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
-    kept, areas, reach = (list(column) for column in zip(*pieces, strict=True))
-    roles = kinds([Face(plane, area) for plane, area, _ in pieces], float(np.median(cloud.points_m[:, 2])))
-    reach = [width if kind == "other" else max(width, REACH_M) for width, kind in zip(reach, roles, strict=True)]
-    areas = join(kept, areas, reach)
+    planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
+    roles = kinds(list(map(Face, planes, areas)), float(np.median(cloud.points_m[:, 2])))
+    reach = [
+        piece.reach_m if kind == "other" else max(piece.reach_m, REACH_M)
+        for piece, kind in zip(pieces, roles, strict=True)
+    ]
+    areas = join(planes, areas, reach)
+    # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
     things = np.ones(len(cloud.points_m), bool)
-    for plane, area, kind in zip(kept, areas, roles, strict=True):
+    for plane, area, kind in zip(planes, areas, roles, strict=True):
         if kind != "other":
             things &= ~over(plane, area, cloud.points_m, BAND * noise)
-    standing = cloud.points_m[things]
-    areas = [fill_shadows(*each, standing, noise) for each in zip(kept, areas, roles, strict=True)]
-    areas = [shapely.difference(area, niches[i]) if i in niches else area for i, area in enumerate(areas)]
-    areas = [shapely.simplify(area, STRAIGHT_M) for area in join(kept, areas, reach)]
-    logger.info("%d planes in %d points, noise %.1f mm", len(kept), len(points), 1e3 * noise)
-    order = sorted(range(len(kept)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
+    for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
+        areas[i] = fill_shadows(piece.plane, areas[i], kind, cloud.points_m[things], noise)
+        if piece.recesses:
+            areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
+    areas = [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
+    logger.info("%d planes in %d points, noise %.1f mm", len(planes), len(points), 1e3 * noise)
+    order = sorted(range(len(planes)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
     surfaces = []
     for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
         vertices, faces = triangulated(areas[i])
-        surfaces.append(Surface(name, roles[i], kept[i].lift(vertices) + shift, faces))
+        surfaces.append(Surface(name, roles[i], planes[i].lift(vertices) + shift, faces))
     return surfaces
+
+
+def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[_Piece]:
+    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first.
+
+    A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
+    """
+    pieces = list[_Piece]()
+    free = np.ones(len(points), bool)
+    for refined in _refined(planes, points, noise_m):
+        plane, parallel = layers(refined, points, free, noise_m)
+        recesses = []
+        for layer in parallel:
+            area, cell = outline(layer.plane, points[layer.rows])
+            if area.area >= SMALLEST_M2:
+                pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
+                free[layer.rows] = False
+                recesses += [] if layer.before else [area]
+        in_plane = near(plane, points, 2 * noise_m) & free
+        for layer in parallel:
+            in_plane[layer.rows] = layer.before  # a wall goes on behind a board
+        rows = np.flatnonzero(in_plane)
+        if len(rows) < FEWEST_POINTS:
+            continue
+        area, cell = outline(plane, points[rows])
+        # Densities per standard deviation of distance: within 2, and from 3 to 6, on both sides.
+        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
+        inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
+        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
+            pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
+            free &= ~over(plane, area, points, BAND * noise_m)
+    return pieces
 
 
 def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:

@@ -35,6 +35,8 @@ MEDIAN_ERROR = 1.25
 """Standard error of a median, in that of a mean."""
 TUKEY = 4.685
 """Constant of the biweight."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution in its median absolute deviations."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +78,12 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
     number = np.ravel_multi_index(tuple(cell.T), shape)
     count = np.bincount(number, minlength=int(np.prod(shape)))
     median = np.full(len(count), np.nan)
-    seen = np.flatnonzero(count >= FEWEST_PER_CELL)
-    median[seen] = ndimage.median(away, number, seen)
+    counted = np.flatnonzero(count >= FEWEST_PER_CELL)
+    median[counted] = ndimage.median(away, number, counted)
     error = MEDIAN_ERROR * noise_m / np.sqrt(np.maximum(count, 1))
-    level = _location(median[seen], error[seen])
+    level = _location(median[counted], error[counted])
     step = median - level
-    found = list[tuple[Plane, IntArray, int]]()
+    parallels = list[tuple[Plane, IntArray, int]]()
     for sign in (1, -1):
         ratio = np.nan_to_num(sign * step / np.maximum(error, LEAST_STEP / ERRORS * noise_m)).reshape(shape)
         mask = apply_hysteresis_threshold(ratio, GROWN_ERRORS, ERRORS)
@@ -90,35 +92,31 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
             inside = np.flatnonzero((parts == part).ravel())
             if len(inside) < LEAST_CELLS or len(inside) * side**2 < LEAST_M2:
                 continue
-            here = float(np.median(step[inside]))
-            spread = 1.4826 * float(np.median(np.abs(step[inside] - here)))
+            depth = float(np.median(step[inside]))
+            spread = NORMAL_MAD * float(np.median(np.abs(step[inside] - depth)))
             if spread > FLATNESS * float(np.median(error[inside])):
                 continue
-            chosen = np.isin(number, inside) & (np.abs(away - level - here) < 2 * noise_m)
+            chosen = np.isin(number, inside) & (np.abs(away - level - depth) < 2 * noise_m)
             corners = np.stack(np.unravel_index(inside, shape), axis=1)
-            (u0, v0), (u1, v1) = low + side * corners.min(axis=0), low + side * (corners.max(axis=0) + 1)
-            moved = replace(plane, offset_m=plane.offset_m + level + here)
-            patch = moved.lift(np.array([[[u0, v0], [u1, v0], [u1, v1], [u0, v1]]]))
-            moved = replace(moved, patches_m=patch, centre_m=patch[0].mean(axis=0))
-            found.append((moved, rows[chosen], sign))
-    if not found:
+            parallel = plane.shifted(level).shifted(depth)
+            patch = parallel.rectangle(low + side * corners.min(axis=0), low + side * (corners.max(axis=0) + 1))
+            parallel = replace(parallel, patches_m=patch[None], centre_m=patch.mean(axis=0))
+            parallels.append((parallel, rows[chosen], sign))
+    if not parallels:
         return plane, []
-    inner = np.sign(np.median(plane.distance(points_m)) - level)
-    shift = level * plane.normal
-    plane = replace(
-        plane, offset_m=plane.offset_m + level, patches_m=plane.patches_m + shift, centre_m=plane.centre_m + shift
-    )
-    return plane, [Layer(moved, which, bool(sign == inner)) for moved, which, sign in found]
+    room_side = np.sign(np.median(plane.distance(points_m)) - level)
+    return plane.shifted(level), [Layer(layer, which, bool(sign == room_side)) for layer, which, sign in parallels]
 
 
 def _location(values: NDArray[np.float64], error: FloatArray) -> float:
     """Weighted location of values by Tukey's biweight, from their median."""
-    at = float(np.median(values)) if len(values) else 0.0
-    scale = np.maximum(error, 1.4826 * np.median(np.abs(values - at))) if len(values) else error
+    if not len(values):
+        return 0.0
+    at, weight = float(np.median(values)), np.ones(len(values))
     for _ in range(10):
+        scale = np.maximum(error, NORMAL_MAD * np.median(np.abs(values - at)[weight > 0]))
         weight = np.clip(1 - ((values - at) / (TUKEY * scale)) ** 2, 0, None) ** 2 / error**2
         if weight.sum() <= 0:
             break
         at = float((weight * values).sum() / weight.sum())
-        scale = np.maximum(error, 1.4826 * np.median(np.abs(values - at)[weight > 0]))
     return at

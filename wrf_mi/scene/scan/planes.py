@@ -49,22 +49,21 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         Planes, the one with the most points first, and the standard deviation of the points from them in metres.
     """
     planes: list[Plane] = []
-    rest = np.ones(len(cloud.points_m), bool)
+    free = np.ones(len(cloud.points_m), bool)
     noise = 0.0
     for spread_deg in NORMAL_SPREADS_DEG:
-        boxes = _patches(cloud, rest, spread_deg)
+        boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
-        found = [plane for box in boxes for plane in _layers(cloud, rest, box, noise)]
-        found = [plane for plane in found if not any(_repeats(plane, other, REPEAT * noise) for other in planes)]
-        if not found:
+        candidates = [plane for box in boxes for plane in _layers(cloud, free, box, noise)]
+        candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
+        if not candidates:
             break
-        once: list[Plane] = []
-        for plane in _merge(cloud, [*planes, *found], noise):
-            if not any(_repeats(plane, other, 2 * noise) for other in once):
-                once.append(plane)
-        planes = once
+        merged, planes = _merge(cloud, [*planes, *candidates], noise), []
+        for plane in merged:
+            if not any(_repeats(plane, other, 2 * noise) for other in planes):
+                planes.append(plane)
         for plane in planes:
-            rest &= ~near(plane, cloud.points_m, BAND * noise)
+            free &= ~near(plane, cloud.points_m, BAND * noise)
     return planes, noise
 
 
@@ -94,13 +93,12 @@ def fit(
 
 
 def _fit_near(cloud: Thinned, chosen: Mask, start: Plane, noise_m: float) -> Plane:
-    """A plane fitted to some of the points of a cloud."""
     return fit(cloud.points_m[chosen], cloud.count[chosen], start, noise_m)
 
 
 def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane]:
     """Coplanar neighbours merged and fitted anew, the plane with the most points first."""
-    weight = [cloud.count[near(p, cloud.points_m, 2 * noise_m)].sum() for p in planes]
+    weight = [cloud.count[near(plane, cloud.points_m, 2 * noise_m)].sum() for plane in planes]
     left = [planes[i] for i in np.argsort(weight)[::-1]]
     merged: list[Plane] = []
     while left:
@@ -137,13 +135,13 @@ def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
     return bool(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)))
 
 
-def _patches(cloud: Thinned, rest: Mask, spread_deg: float) -> list[Any]:
+def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:
     """Boxes around the flat patches of a part of a cloud."""
-    if np.count_nonzero(rest) < FEWEST_VOXELS:
+    if np.count_nonzero(free) < FEWEST_VOXELS:
         return []
     o3d = lidar_package("open3d")
-    part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m[rest]))
-    part.normals = o3d.utility.Vector3dVector(cloud.normals[rest])
+    part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m[free]))
+    part.normals = o3d.utility.Vector3dVector(cloud.normals[free])
     boxes = part.detect_planar_patches(
         normal_variance_threshold_deg=spread_deg,
         coplanarity_deg=75,
@@ -166,10 +164,10 @@ def _box_plane(box: Any) -> tuple[Plane, float]:
     return with_axes(plane), float(np.prod(box.extent[wide]))
 
 
-def _inner(plane: Plane, cloud: Thinned, rest: Mask) -> tuple[FloatArray, FloatArray]:
+def _inner(plane: Plane, cloud: Thinned, free: Mask) -> tuple[FloatArray, FloatArray]:
     """Offsets and counts of the points about a patch, without its rim, where neighbours begin."""
     size = np.linalg.norm(np.diff(plane.patches_m[0, [0, 1, 2]], axis=0), axis=1).min()
-    inside = rest & near(plane, cloud.points_m, SEARCH_M, -min(0.1 * size, 0.1))
+    inside = free & near(plane, cloud.points_m, SEARCH_M, -min(0.1 * size, 0.1))
     return plane.distance(cloud.points_m[inside]), cloud.count[inside]
 
 
@@ -192,19 +190,19 @@ def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
     return float(np.clip(np.quantile(widths, 0.5, weights=areas, method="inverted_cdf"), *NOISE_RANGE_M))
 
 
-def _layers(cloud: Thinned, rest: Mask, box: Any, noise_m: float) -> list[Plane]:
+def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
     """The parallel planes within a patch, none where it is bent.
 
     The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
     all points about it may run across two real layers. The sharper of both is used.
     """
     middle, _ = _box_plane(box)
-    fitted = _fit_near(cloud, rest & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
+    fitted = _fit_near(cloud, free & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
     step = max(noise_m / 4, 0.002)
     bins = np.arange(-SEARCH_M, SEARCH_M + step, step)
     sharpest, best = 0.0, None
     for plane in (middle, fitted):
-        offsets, count = _inner(plane, cloud, rest)
+        offsets, count = _inner(plane, cloud, free)
         if len(offsets) >= FEWEST_VOXELS / 2:
             density = gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
             sharpness = float((density**2).sum() / density.sum() ** 2)
@@ -222,14 +220,11 @@ def _layers(cloud: Thinned, rest: Mask, box: Any, noise_m: float) -> list[Plane]
         return []
     planes = []
     for offset in at:
-        shift = middle.normal * offset
-        patches, centre = middle.patches_m + shift, middle.centre_m + shift
-        start = replace(middle, offset_m=middle.offset_m + offset, patches_m=patches, centre_m=centre)
-        inside = rest & near(start, cloud.points_m, BAND * noise_m, 0.0)
+        layer = middle.shifted(offset)
+        inside = free & near(layer, cloud.points_m, BAND * noise_m, 0.0)
         if np.count_nonzero(inside) >= FEWEST_VOXELS / 2:
             if len(at) > 1:
-                (left, low), (right, high) = np.quantile(start.flat(cloud.points_m[inside]), LAYER_CORE, axis=0)
-                corners = np.array([[(left, low), (right, low), (right, high), (left, high)]])
-                start = replace(start, patches_m=start.lift(corners))
-            planes.append(_fit_near(cloud, inside, start, noise_m))
+                bounds = np.quantile(layer.flat(cloud.points_m[inside]), LAYER_CORE, axis=0)
+                layer = replace(layer, patches_m=layer.rectangle(*bounds)[None])
+            planes.append(_fit_near(cloud, inside, layer, noise_m))
     return planes
