@@ -21,7 +21,7 @@ from ..scene.plan.sources import Mask, read_layout
 from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
 from ..tracing.devices import winding_number
-from .placements import placements
+from .plans import placements
 from .repeats import named_rows
 from .units import Found
 

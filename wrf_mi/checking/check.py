@@ -13,7 +13,7 @@ from ..models.checks import check_parts
 from ..synthetic import load_record
 from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
-from .distances import distance_law
+from .plans import distance_law
 from .reception import few_rows, not_heard
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
 from .report import DataReport, Suspicion

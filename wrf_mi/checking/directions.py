@@ -17,7 +17,7 @@ import numpy as np
 from ..core import Record
 from ..core.angles import FloatArray, azimuth_elevation, solid_angles
 from ..core.types import IntArray
-from .placements import other_plans
+from .plans import other_plans
 from .units import Found
 
 Images = Any

@@ -12,8 +12,7 @@ import shapely
 import trimesh
 
 from ...core.angles import FloatArray
-from .planes import THICKEST_M, Mask, Plane, with_axes
-from .roles import STOREY_M, UPRIGHT, WALL_SHARE, Face, kinds, least_level_area
+from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
 from .surfaces import KINDS, Kind, Surface, number_names
 from .surfaces import bodies as connected_bodies
 
@@ -57,7 +56,7 @@ class _Facet(Face):
 def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     """The surfaces of a mesh split into floors, ceilings, walls and the rest.
 
-    The roles are those of planes in a scan (`wrf_mi.scene.mesh.roles.kinds`). A closed body within another body, such
+    The roles are those of planes in a scan (`wrf_mi.scene.mesh.planes.kinds`). A closed body within another body, such
     as a cupboard, is furniture unless it reaches from floor to ceiling. The direction of normals has no influence,
     except that a closed body with inward normals within a body with outward normals, clear of its floor and ceiling,
     is a cavity: a room in a solid building.

@@ -13,11 +13,9 @@ import shapely
 from ...core import InputError
 from ...core.angles import FloatArray
 from ..mesh.outline import fill_shadows, join, outline, triangulated
-from ..mesh.planes import Plane, near, over, with_axes
-from ..mesh.roles import Face, kinds
+from ..mesh.planes import Face, Plane, kinds, near, over, with_axes
 from ..mesh.surfaces import KINDS, Surface, number_names
-from .layers import layers
-from .planes import BAND, find_planes, fit
+from .planes import BAND, find_planes, fit, layers
 from .points import thin
 
 logger = logging.getLogger(__name__)

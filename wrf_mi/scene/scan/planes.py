@@ -1,20 +1,25 @@
 """Planes of a building in a noisy point cloud: flat patches, split into layers, merged, and fitted to all their points.
 
-Patches are those of Open3D (Araujo and Oliveira 2020, Pattern Recognit. 107).
+Patches are those of Open3D (Araujo and Oliveira 2020, Pattern Recognit. 107). Parallel layers of a plane that the noise
+blurs (boards on walls, recesses) are found by cells: two layers three standard deviations of the noise apart are one to
+single points, but the error of a cell's median falls with the root of the number of its points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import shapely
-from scipy.ndimage import gaussian_filter1d
+from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.signal import find_peaks
+from skimage.filters import apply_hysteresis_threshold
 
 from ...core.angles import FloatArray
+from ...core.types import IntArray
 from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
 from .points import Thinned, lidar_package
 
@@ -40,6 +45,25 @@ MERGE_GAP_M = 1.0
 MERGE_ANGLE_RAD = float(np.radians(1.0))
 SHORTEST_EDGE_M = 0.2
 FEWEST_VOXELS = 60
+POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8
+"""Mean and least number of points of a cell."""
+CELL_RANGE_M = (0.1, 0.4)
+AROUND = 6.0
+"""Half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise."""
+LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
+"""Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
+GROWN_ERRORS = 2.0
+"""The same of cells beside."""
+LAYER_M2, LAYER_CELLS = 0.3, 8
+"""Least size of a layer."""
+FLATNESS = 2.0
+"""Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
+MEDIAN_ERROR = 1.25
+"""Standard error of a median, in that of a mean."""
+TUKEY = 4.685
+"""Constant of the biweight."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution in its median absolute deviations."""
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
@@ -204,7 +228,7 @@ def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]
     for plane in (middle, fitted):
         offsets, count = _inner(plane, cloud, free)
         if len(offsets) >= FEWEST_VOXELS / 2:
-            density = gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
+            density = ndimage.gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
             sharpness = float((density**2).sum() / density.sum() ** 2)
             if sharpness > sharpest:
                 sharpest, best = sharpness, (plane, offsets, count, density)
@@ -228,3 +252,86 @@ def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]
                 layer = replace(layer, patches_m=layer.rectangle(*bounds)[None])
             planes.append(_fit_near(cloud, inside, layer, noise_m))
     return planes
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A part of the points about a plane that lies in a parallel one.
+
+    Attributes:
+        plane: the parallel plane.
+        rows: numbers of its points.
+        before: whether it lies on the side of the plane where most points are: the plane goes on behind it.
+    """
+
+    plane: Plane
+    rows: IntArray
+    before: bool
+
+
+def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tuple[Plane, list[Layer]]:
+    """The plane of most cells, and the layers of others.
+
+    Args:
+        plane: a plane with its axes.
+        points_m: points of the scan [n, 3], metres.
+        free: points that belong to no other plane [n].
+        noise_m: standard deviation of points from planes.
+    """
+    reach = min(AROUND * noise_m, SEARCH_M)
+    rows = np.flatnonzero(free & near(plane, points_m, reach))
+    if len(rows) < LAYER_CELLS * POINTS_PER_CELL:
+        return plane, []
+    away, flat = plane.distance(points_m[rows]).astype(float), plane.flat(points_m[rows]).astype(float)
+    low = flat.min(axis=0)
+    density = len(rows) / max(
+        len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0)) * CELL_RANGE_M[0] ** 2, 1e-9
+    )
+    side = float(np.clip(np.sqrt(POINTS_PER_CELL / density), *CELL_RANGE_M))
+    cell = np.floor((flat - low) / side).astype(int)
+    shape = tuple(cell.max(axis=0) + 1)
+    number = np.ravel_multi_index(tuple(cell.T), shape)
+    count = np.bincount(number, minlength=int(np.prod(shape)))
+    median = np.full(len(count), np.nan)
+    counted = np.flatnonzero(count >= FEWEST_PER_CELL)
+    median[counted] = ndimage.median(away, number, counted)
+    error = MEDIAN_ERROR * noise_m / np.sqrt(np.maximum(count, 1))
+    level = _location(median[counted], error[counted])
+    step = median - level
+    parallels = list[tuple[Plane, IntArray, int]]()
+    for sign in (1, -1):
+        ratio = np.nan_to_num(sign * step / np.maximum(error, LEAST_STEP / LAYER_ERRORS * noise_m)).reshape(shape)
+        mask = apply_hysteresis_threshold(ratio, GROWN_ERRORS, LAYER_ERRORS)
+        parts, most = ndimage.label(ndimage.binary_opening(mask, np.ones((2, 2))))  # strips are rims of neighbours
+        for part in range(1, most + 1):
+            inside = np.flatnonzero((parts == part).ravel())
+            if len(inside) < LAYER_CELLS or len(inside) * side**2 < LAYER_M2:
+                continue
+            depth = float(np.median(step[inside]))
+            spread = NORMAL_MAD * float(np.median(np.abs(step[inside] - depth)))
+            if spread > FLATNESS * float(np.median(error[inside])):
+                continue
+            chosen = np.isin(number, inside) & (np.abs(away - level - depth) < 2 * noise_m)
+            corners = np.stack(np.unravel_index(inside, shape), axis=1)
+            parallel = plane.shifted(level).shifted(depth)
+            patch = parallel.rectangle(low + side * corners.min(axis=0), low + side * (corners.max(axis=0) + 1))
+            parallel = replace(parallel, patches_m=patch[None], centre_m=patch.mean(axis=0))
+            parallels.append((parallel, rows[chosen], sign))
+    if not parallels:
+        return plane, []
+    room_side = np.sign(np.median(plane.distance(points_m)) - level)
+    return plane.shifted(level), [Layer(layer, which, bool(sign == room_side)) for layer, which, sign in parallels]
+
+
+def _location(values: NDArray[np.float64], error: FloatArray) -> float:
+    """Weighted location of values by Tukey's biweight, from their median."""
+    if not len(values):
+        return 0.0
+    at, weight = float(np.median(values)), np.ones(len(values))
+    for _ in range(10):
+        scale = np.maximum(error, NORMAL_MAD * np.median(np.abs(values - at)[weight > 0]))
+        weight = np.clip(1 - ((values - at) / (TUKEY * scale)) ** 2, 0, None) ** 2 / error**2
+        if weight.sum() <= 0:
+            break
+        at = float((weight * values).sum() / weight.sum())
+    return at

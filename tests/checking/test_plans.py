@@ -10,8 +10,7 @@ import pytest
 from checked_records import channels, strengths
 from scipy.spatial.distance import cdist
 
-from wrf_mi.checking.distances import distance_law, explained, levels_db
-from wrf_mi.checking.placements import placements
+from wrf_mi.checking.plans import distance_law, explained, levels_db, placements
 from wrf_mi.checking.units import distances_m
 from wrf_mi.core import Record
 
