@@ -6,9 +6,10 @@ of a ROS map, is its top (largest y); an NPZ file states on which side its row 0
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,8 @@ Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")
+"""Arrays of numbers in an NPZ file."""
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
 FREE_PROBABILITY = 0.196
@@ -184,45 +187,61 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         content = stored_arrays(path)
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
-    numbers = {}
-    for key in ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s"):
-        if key in content and content[key].dtype.kind not in "biuf":
-            raise InputError(f"{path}: {key} holds no numbers but {content[key].dtype}")
-        if key in content:
-            numbers[key] = content[key].astype(float)
+    numbers = {key: values for key, values in content.items() if key in NUMBERS}
+    for key, values in numbers.items():
+        if values.dtype.kind not in "biuf":
+            raise InputError(f"{path}: {key} holds no numbers but {values.dtype}")
+        numbers[key] = values.astype(float)
     if "log_odds" in numbers:
-        if resolution_m is None:
-            if "resolution_m" not in numbers:
-                raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
-            resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
-        origin = numbers.get("origin_m", np.zeros(2))
-        if origin.shape != (2,) or not np.isfinite(origin).all():
-            raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
-        values = numbers["log_odds"]
-        known = values[~np.isnan(values)]
-        if known.size and (known.min() < 0 or known.max() > 1):
-            values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
-        if row_0 is None:
-            if "row_0" not in content:
-                way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
-                raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
-            stated = content["row_0"]
-            word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
-            row_0 = next((side for side in get_args(Row0) if side == word.strip().lower()), None)
-            if row_0 is None:
-                text = f"row_0 is {one_line(word)[:40]!r}"
-                raise InputError(f"{path}: {text}; give top (largest y) or bottom (smallest y)")
-        return grid_from_probability(values, resolution_m, row_0, origin, str(path))
-    if "xy_m" in numbers:
-        if row_0 is not None:
-            raise _no_rows(path, "it holds points, which have no rows")
-        xy, time = numbers["xy_m"], numbers.get("time_s")
-        if xy.ndim != 2 or xy.shape[1] != 2:
-            raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
-        if time is not None and time.shape != xy.shape[:1]:
-            raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
-        return PlanPoints(xy, time)
-    raise InputError(f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}; give one of them")
+        return _grid_of_arrays(path, numbers, resolution_m, row_0, content.get("row_0"))
+    if "xy_m" not in numbers:
+        text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
+        raise InputError(f"{text}; give one of them")
+    if row_0 is not None:
+        raise _no_rows(path, "it holds points, which have no rows")
+    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
+
+
+def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
+    if time is not None and time.shape != xy.shape[:1]:
+        raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
+    return PlanPoints(xy, time)
+
+
+def _grid_of_arrays(
+    path: Path,
+    numbers: Mapping[str, FloatArray],
+    resolution_m: float | None,
+    row_0: Row0 | None,
+    stated_row_0: NDArray[Any] | None,
+) -> PlanGrid:
+    if resolution_m is None:
+        if "resolution_m" not in numbers:
+            raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
+        resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
+    origin = numbers.get("origin_m", np.zeros(2))
+    if origin.shape != (2,) or not np.isfinite(origin).all():
+        raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
+    values = numbers["log_odds"]
+    known = values[~np.isnan(values)]
+    if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
+        values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+    row_0 = row_0 or _stated_side(path, stated_row_0)
+    return grid_from_probability(values, resolution_m, row_0, origin, str(path))
+
+
+def _stated_side(path: Path, stated: NDArray[Any] | None) -> Row0:
+    """Side of the plan where the first row of an NPZ grid lies, as the file states it."""
+    if stated is None:
+        way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
+        raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
+    word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
+    for side in get_args(Row0):
+        if side == word.strip().lower():
+            return cast(Row0, side)
+    raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
 
 
 def _no_rows(path: Path, why: str) -> InputError:
@@ -261,15 +280,14 @@ def _read_text(path: Path) -> PlanPoints:
     rows = []
     for number, line in enumerate(text_lines(path), 1):
         words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            try:
-                x, y = (float(word) for word in words)
-                if not np.isfinite([x, y]).all():
-                    raise ValueError("not finite")
-            except ValueError:
-                text = f"line {number}: expected two numbers x, y, found {' '.join(words)!r}"
-                raise InputError(f"{path}: {text}") from None
-            rows.append((x, y))
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            rows.append([])
+        if len(rows[-1]) != 2 or not np.isfinite(rows[-1]).all():
+            raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}")
     if not rows:
         raise InputError(f"{path}: no points; give rows x y in metres")
     return PlanPoints(np.array(rows))
