@@ -95,13 +95,13 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     record, faults = collect_faults(read)
     if record is None:
         return DataReport(name, source, None, tuple(faults), ())
-    found = [suspicion for check in OF_VALUES for suspicion in check(record)]
+    suspected = [suspicion for check in OF_VALUES for suspicion in check(record)]
     wrong_unit = list(degrees(record)) or list(position_unit(record))
-    found += wrong_unit
+    suspected += wrong_unit
     if all(name in ignore for name, _ in wrong_unit):
-        found += [suspicion for check in OF_PLACES for suspicion in check(record)]
-        found += _of_building(record)
-    suspicions = tuple(Suspicion(name, text) for name, text in found if name not in ignore)
+        suspected += [suspicion for check in OF_PLACES for suspicion in check(record)]
+        suspected += _of_building(record)
+    suspicions = tuple(Suspicion(name, text) for name, text in suspected if name not in ignore)
     notes = tuple(note for note in (far_from_origin(record),) if note)
     return DataReport(name, record.source, record, (), suspicions, notes)
 
@@ -136,8 +136,8 @@ def _of_building(record: Record) -> Found:
         yield "building", f"{error}"
         return
     # Transmitters in another plan are in its walls, too.
-    if found := list(plan_against_walls(record, building)):
-        yield from found
+    if wrong_plan := list(plan_against_walls(record, building)):
+        yield from wrong_plan
         return
     yield from inside_solids(record, building)
     yield from at_vertices(record, building)

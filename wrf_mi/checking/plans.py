@@ -100,8 +100,8 @@ def distance_law(record: Record) -> Found:
     best: dict[str, tuple[float, float, str, str]] = {}
     for placement in other_plans(record):
         share, exponent = explained(levels, distances_m(replace(record, tx_pos_m=placement.positions_m)))
-        found = share, exponent, placement.motion, placement.remedy
-        best[placement.motion] = max(best.get(placement.motion, (0.0, 0.0, "", "")), found)
+        candidate = share, exponent, placement.motion, placement.remedy
+        best[placement.motion] = max(best.get(placement.motion, candidate), candidate)
     (share, exponent, plan, remedy), (second, *_) = sorted(best.values(), reverse=True)[:2]
     gain = share - max(stated, second)
     if gain < SHARE / np.sqrt(len(record.receivers)) or not EXPONENTS[0] <= exponent <= EXPONENTS[1]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +57,14 @@ class DataReport:
         Args:
             most: largest number of lines for faults of one kind in one file.
         """
-        found = list(self._fault_lines(most))
-        found += [f"suspicion {one.name}: {one.text}" for one in self.suspicions]
-        found += [f"note: {text}" for text in self.notes]
+        lines = list(self._fault_lines(most))
+        lines += [f"suspicion {suspicion.name}: {suspicion.text}" for suspicion in self.suspicions]
+        lines += [f"note: {text}" for text in self.notes]
         if self.faults:
             summary = f"{_count(len(self.faults), 'fault')}; suspicions are looked for when there is none"
         else:
             summary = f"no fault, {_count(len(self.suspicions), 'suspicion')}"
-        return [*found, f"{self.dataset}: {summary}"]
+        return [*lines, f"{self.dataset}: {summary}"]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with every fault."""
@@ -76,7 +76,7 @@ class DataReport:
             "task": None if record is None else record.task,
             "rows": None if record is None else len(record),
             "faults": [_plain(fault) for fault in self.faults],
-            "suspicions": [{"name": one.name, "text": one.text} for one in self.suspicions],
+            "suspicions": [asdict(suspicion) for suspicion in self.suspicions],
             "notes": list(self.notes),
         }
 
@@ -84,7 +84,8 @@ class DataReport:
         kinds: dict[object, list[InputError]] = {}
         for fault in self.faults:
             kinds.setdefault(fault.kind if isinstance(fault, DataFault) else fault, []).append(fault)
-        base = self._base()
+        source = Path(self.source)
+        base = source if source.is_dir() else source.parent  # files are named in the folder of the data
         for faults in kinds.values():
             for fault in faults[:most]:
                 yield f"fault: {_line(fault, base)}"
@@ -93,13 +94,8 @@ class DataReport:
                 where = f", up to {last.place}" if last.place else ""
                 yield f"fault: {_relative(file, base)}: {len(faults) - most} more of this kind{where}; {remedy}"
 
-    def _base(self) -> Path | None:
-        """Folder that files are named in."""
-        source = Path(self.source)
-        return None if not self.source else source if source.is_dir() else source.parent
 
-
-def _line(fault: InputError, base: Path | None) -> str:
+def _line(fault: InputError, base: Path) -> str:
     """A fault as ``FILE, row N: what; remedy``."""
     if not isinstance(fault, DataFault):
         return str(fault)
@@ -113,8 +109,8 @@ def _plain(fault: InputError) -> dict[str, Any]:
     return {"file": str(fault.file), "place": fault.place, "row": fault.row, "text": fault.text}
 
 
-def _relative(file: Path, base: Path | None) -> str:
-    return str(file) if base is None or base not in file.parents else str(file.relative_to(base))
+def _relative(file: Path, base: Path) -> str:
+    return str(file.relative_to(base)) if base in file.parents else str(file)
 
 
 def _count(number: int, what: str) -> str:

@@ -89,7 +89,7 @@ def parts_within(folder: str | Path, low_m: ArrayLike, high_m: ArrayLike) -> tup
     """
     low, high = np.asarray(low_m, float), np.asarray(high_m, float)
     surfaces, _ = read_surfaces(folder)
-    inside = [((one.vertices_m >= low) & (one.vertices_m <= high)).all() for one in surfaces]
+    inside = [((surface.vertices_m >= low) & (surface.vertices_m <= high)).all() for surface in surfaces]
     return tuple(surface.name for surface, within in zip(surfaces, inside, strict=True) if within)
 
 
@@ -134,7 +134,7 @@ def edit_scene(
         moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
     _check_moves(unmoved, left, moved_names)
-    kept = {surface.name: materials.surfaces[surface.name] for surface in left}
+    entries = {surface.name: materials.surfaces[surface.name] for surface in left}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
     return write_scene(
@@ -142,7 +142,7 @@ def edit_scene(
         left,
         frame=f"that of {folder}",
         source=str(folder),
-        materials=replace(materials, surfaces=kept),
+        materials=replace(materials, surfaces=entries),
         description=f"An edited scene: {'; '.join(changes)}",
         replace=replace_folder,
     )

@@ -101,11 +101,11 @@ def thin(points_m: FloatArray) -> Thinned:
         voxel *= 1.25
         mean, count = _cells(points_m, voxel)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
-    cloud, kept = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
-    if len(kept) < STRAY_NEIGHBOURS:
-        raise InputError(f"only {len(kept)} points have neighbours; give a denser point cloud")
+    cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
+    if len(rows) < STRAY_NEIGHBOURS:
+        raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS_M * voxel / VOXEL_M, NORMAL_NEIGHBOURS))
-    return Thinned(np.asarray(cloud.points), count[kept], np.asarray(cloud.normals))
+    return Thinned(np.asarray(cloud.points), count[rows], np.asarray(cloud.normals))
 
 
 def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:

@@ -54,11 +54,11 @@ def simulate_scan(scene: Any, poses_m: ArrayLike, *, rays_per_pose: int = RAYS_P
         directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1)
         ray = mi.Ray3f(mi.Point3f(*pose.tolist()), to_vectors(directions, mi.Vector3f))
         distance = np.array(scene.ray_intersect_preliminary(ray).t, float)
-        seen = np.isfinite(distance)
-        distance = distance[seen] + rng.normal(0, RANGE_NOISE_M, np.count_nonzero(seen))
+        hit = np.isfinite(distance)
+        distance = distance[hit] + rng.normal(0, RANGE_NOISE_M, np.count_nonzero(hit))
         stray = rng.random(len(distance)) < OUTLIERS
         distance[stray] *= rng.random(np.count_nonzero(stray))
-        parts.append(pose + directions[seen] * distance[:, None])
+        parts.append(pose + directions[hit] * distance[:, None])
     points = np.concatenate(parts)
     if not len(points):
         raise InputError("simulated scan: no ray met the scene; put the scanner inside it")
