@@ -14,9 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.mesh.files import mesh_parts
+from wrf_mi.scene.mesh.files import mesh_parts, triangles_of
 from wrf_mi.scene.mesh.polygon_files import Polygons
-from wrf_mi.scene.mesh.triangulation import triangles_of
 
 ROUNDING = 1e-6
 """Relative error of areas of float32 coordinates."""
