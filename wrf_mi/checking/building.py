@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from ..core import Record
+from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
 from ..scene.mesh.facets import planes_of_mesh
-from ..scene.mesh.files import SUFFIXES, read_mesh
+from ..scene.mesh.files import SUFFIXES, mesh_parts, read_mesh, sound_surfaces
 from ..scene.mesh.surfaces import Surface, bodies, box_of
 from ..scene.plan.sources import Mask, read_layout
 from ..scene.plan.storey import plan_surfaces
@@ -83,8 +83,14 @@ def read_building(path: Path) -> Building:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
         return Building(path, plan_surfaces(vertices, height_m=HEIGHT_M, name=str(path)), (), walls)
-    files = sorted((path / "meshes").glob("*.ply")) if path.is_dir() else [path]
-    raw = [surface for file in files for surface in read_mesh(file)]
+    if path.is_dir():
+        # Surfaces of a scene together have the extent of a building; those of furniture are smaller than any room.
+        parts = [part for file in sorted((path / "meshes").glob("*.ply")) for part in mesh_parts(file)]
+        if not parts:
+            raise InputError(f"{path}: a scene folder without faces in meshes/*.ply; write the scene anew")
+        raw = sound_surfaces(parts, 1.0, path)
+    else:
+        raw = read_mesh(path)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
     closed_bodies = [corners[faces] for faces, closed, volume in bodies(corners) if closed and volume]
     solids = [body for body in closed_bodies if np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,8 +125,8 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
 
     Args:
         path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
-        units: unit of its coordinates, a key of `wrf_mi.scene.scan.points.UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.mesh.surfaces.mesh_parts`.
+        units: unit of its coordinates, a key of `wrf_mi.scene.coordinates.UNITS_M`.
+        up: axis that is up in it, see `mesh_parts`.
 
     Raises:
         InputError: missing or damaged, points without a surface, only degenerate faces, coordinates that are not
@@ -136,10 +137,23 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
     if not parts:
         remedy = "make a scene of points with wrf-mi mesh" if file.suffix.lower() == ".ply" else POINTS_ELSEWHERE
         raise InputError(f"{file}: has no faces, so no surface; {remedy}")
-    require_precise(np.concatenate([part.vertices for part in parts]), UNITS_M[units], file)
+    surfaces = sound_surfaces(parts, UNITS_M[units], file)
+    check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
+    return surfaces
+
+
+def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | Path) -> list[Surface]:
+    """The surfaces of parts of a mesh without degenerate and doubled faces, see `read_mesh`.
+
+    Args:
+        parts: parts of one mesh, in their unit.
+        unit_m: length of the unit, metres.
+        name: name of the mesh, for messages.
+    """
+    require_precise(np.concatenate([part.vertices for part in parts]), unit_m, name)
     surfaces = []
-    for name, part in zip(part_names(len(parts)), parts, strict=True):
-        vertices = np.asarray(part.vertices, float) * UNITS_M[units]
+    for part_name, part in zip(part_names(len(parts)), parts, strict=True):
+        vertices = np.asarray(part.vertices, float) * unit_m
         faces = np.asarray(part.faces, np.int64)
         solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
         # Copies may have other vertices: STL has no shared vertices.
@@ -147,12 +161,11 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
         _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
         for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
             if count:
-                logger.warning("%s: %d %s faces of %s left out", file, count, what, name)
+                logger.warning("%s: %d %s faces of %s left out", name, count, what, part_name)
         if len(first):
-            surfaces.append(Surface(name, "other", vertices, solid[np.sort(first)]))
+            surfaces.append(Surface(part_name, "other", vertices, solid[np.sort(first)]))
     if not surfaces:
-        raise InputError(f"{file}: every face is degenerate (no area); export it anew, or give its --units")
-    check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
+        raise InputError(f"{name}: every face is degenerate (no area); export it anew, or give its --units")
     return surfaces
 
 
