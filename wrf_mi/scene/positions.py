@@ -146,9 +146,11 @@ def reflections(
         flips = [(axis, float(totals[axis]), remedies[axis]) for axis in (1, 0)]
     else:
         totals = box_of(surfaces).sum(axis=0)
-        flips = [(axis, 0.0, f"change the sign of its {'xy'[axis]}") for axis in (1, 0)]
-        for axis, letter in ((1, "y"), (0, "x")):
-            flips.append((axis, float(totals[axis]), f"replace its {letter} by {totals[axis]:.6g} - {letter}"))
+        axes = ((1, "y"), (0, "x"))
+        flips = [(axis, 0.0, f"change the sign of its {letter}") for axis, letter in axes]
+        flips += [
+            (axis, totals[axis], f"replace its {letter} by {totals[axis]:.6g} - {letter}") for axis, letter in axes
+        ]
     if known_walls_m is not None:
         del flips[1:]  # all reflections are the same once they are registered
     scenes = []

@@ -10,7 +10,8 @@ import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage, optimize, signal
 from scipy.spatial import cKDTree
-from skimage.transform import estimate_transform
+from skimage.transform import EuclideanTransform, estimate_transform
+from trimesh.transformations import planar_matrix_to_3D
 
 from ..core import InputError
 from ..core.angles import FloatArray
@@ -93,15 +94,12 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             better = f"lengths times {similar.scale:.3f} would fit better ({scaled:.2f} m rms)"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
-    return _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
+    return np.asarray(rigid.params if dimension == 3 else planar_matrix_to_3D(rigid.params))
 
 
-def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
-    """Matrix [4, 4] of a rotation [n, n] and a shift [n], n = 2 or 3."""
-    n = len(shift)
-    matrix = np.eye(4)
-    matrix[:n, :n], matrix[:n, 3] = rotation, shift
-    return matrix
+def _motion(pose: FloatArray) -> FloatArray:
+    """Matrix [4, 4] of a pose (x, y, angle)."""
+    return np.asarray(planar_matrix_to_3D(EuclideanTransform(rotation=pose[2], translation=pose[:2]).params))
 
 
 def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
@@ -126,7 +124,7 @@ def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """The turn about z and shift [4, 4] in which points [n, 2] fit walls [m, 2, 2] best, however badly."""
     pose, _ = _find_poses(points_m, walls_m)[0]
-    return _motion(rotation_2d(pose[2]), pose[:2])
+    return _motion(pose)
 
 
 def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> FloatArray:
@@ -172,7 +170,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
             turn = np.degrees(other[2] - pose[2]) % 360
             text = f"two poses fit the walls alike, {turn:.0f} degrees apart"
             raise InputError(f"{name}: {text}; give pairs of points instead")
-    return _motion(rotation_2d(pose[2]), pose[:2])
+    return _motion(pose)
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
