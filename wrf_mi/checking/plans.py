@@ -103,7 +103,7 @@ def distance_law(record: Record) -> Found:
         candidate = share, exponent, placement.motion, placement.remedy
         best[placement.motion] = max(best.get(placement.motion, candidate), candidate)
     (share, exponent, plan, remedy), (second, *_) = sorted(best.values(), reverse=True)[:2]
-    gain = share - max(stated, second)
+    gain = share - max(stated, second)  # clear of the second-best motion, too, or neither is known
     if gain < SHARE / np.sqrt(len(record.receivers)) or not EXPONENTS[0] <= exponent <= EXPONENTS[1]:
         return
     evidence = f"distance then explains {share:.0%} of the variance of the signal strengths, as stated {stated:.0%}"

@@ -209,7 +209,7 @@ def _depth(triangles: FloatArray, cut: FloatArray) -> float:
         start, end = starts[first : first + step, None], ends[first : first + step, None]
         # Signed distances [edges, triangles] of both ends from the planes.
         before, after = (((point - cut[:, 0]) * normal).sum(axis=-1) for point in (start, end))
-        edge, triangle = np.nonzero(before * after < 0)
+        edge, triangle = np.nonzero(before * after < 0)  # both ends are on different sides of the plane
         d = before[edge, triangle], after[edge, triangle]
         met = start[edge, 0] + (d[0] / (d[0] - d[1]))[:, None] * (end - start)[edge, 0]
         within = (trimesh.triangles.points_to_barycentric(cut[triangle], met) >= 0).all(axis=1)

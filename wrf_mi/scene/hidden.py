@@ -177,6 +177,7 @@ def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
         for members, _, _ in bodies(triangles):
             corners = triangles[members].reshape(-1, 3)
             centre = corners.mean(axis=0)
+            # The direction in which the corners spread least.
             normal = np.linalg.svd(corners - centre, full_matrices=False)[2][2]
             axes = _axes(normal, corners)
             if axes is None or np.abs((corners - centre) @ normal).max() > FLAT_M:

@@ -91,6 +91,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
     if not level:
         return crossings, 0
     corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in level])
+    # Triangles are widened by a micrometre first: rounding leaves slits between them.
     area = shapely.buffer(shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6)), OUTSIDE_M)
     return crossings, int(np.count_nonzero(~shapely.contains_xy(area, places)))
 

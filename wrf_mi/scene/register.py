@@ -231,6 +231,7 @@ def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[Float
     peaks: list[tuple[float, FloatArray]] = []
     for angle in np.arange(TURNS) * (2 * np.pi / TURNS):
         kernel = _image(centred @ rotation_2d(angle).T / cell + half, np.array([2 * half + 1] * 2))
+        # A convolution with the reversed picture is the correlation with it.
         match = signal.fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
         for _ in range(PEAKS):
             peak = np.array(np.unravel_index(np.argmax(match), match.shape))

@@ -52,6 +52,7 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
     flat = plane.flat(points_m).astype(float)
     coarse = 0.1
     _, number = np.unique(np.floor(flat / coarse).astype(int), axis=0, return_counts=True)
+    # Cells with a single point are strays; the sparse fifth, far from the scanner, sets the size of cells.
     sparse = np.quantile(number[number > 1], 0.2) if (number > 1).any() else 1.0
     cell = float(np.clip(coarse * np.sqrt(POINTS_PER_CELL / sparse), *CELL_RANGE_M))
     low = flat.min(axis=0) - (CLOSED_CELLS + 2) * cell
@@ -152,6 +153,7 @@ def _end_at(a: Plane, area: Any, b: Plane, other: Any, reach: float) -> Any:
         t0, _, t1, _ = stretch.bounds
         if t1 - t0 < reach:
             continue
+        # An area that reaches both sides of the line goes through, one that reaches one side ends there.
         share = [
             shapely.intersection(turned, shapely.box(t0, s, t1, s + reach)).area / (reach * (t1 - t0))
             for s in (reach, -2 * reach)
@@ -200,6 +202,7 @@ def large_parts(mask: Mask, cells: float, structure: NDArray[Any] | None = None)
 def _covered(count: NDArray[Any], cell: float) -> Mask:
     """Cells that a plane covers, from the number of points in each."""
     # Cells about as full as those around them; a stray beside an edge is not.
+    # The usual number in the neighbourhood is that of a point's cell, sum n^2 / sum n, which empty cells do not lower.
     full = count.astype(float)
     total = ndimage.uniform_filter(full, AROUND_CELLS, mode="constant")
     squares = ndimage.uniform_filter(full * full, AROUND_CELLS, mode="constant")

@@ -103,6 +103,7 @@ class _Canvas:
                 at = (turned[None] + shift[:, None] - self.low) / POINT_CELL_M - 0.5
                 values = ndimage.map_coordinates(field, at.reshape(-1, 2).T, order=1)
                 value = values.reshape(len(shift), -1).mean(axis=1)
+                # The log of a normal prior about the stated pose: a wrong wall matches as well a metre away.
                 off = ((start[:2] + shift) ** 2).sum(axis=1) / POSE_DEVIATION_M**2 + (angle / POSE_DEVIATION_RAD) ** 2
                 score = value - weight * off
                 i = int(np.argmax(score))
@@ -175,6 +176,7 @@ def sensor_of(scan_m: FloatArray) -> FloatArray | None:
     hidden, uneven = np.array([_seen_from(scan_m, place) for place in places]).T
     if hidden.min() > HIDDEN_SHARE * len(scan_m):
         return None
+    # In a convex room all places see all returns: among those that hide as few, the evenest is taken.
     possible = hidden <= hidden.min() + 0.01 * len(scan_m)
     return np.asarray(places[possible][np.argmin(uneven[possible])])
 

@@ -139,6 +139,7 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
 def _best(image: Mask, half: int, hole: int, shortest: float) -> tuple[float, int, int, int]:
     """Score, row, first and last + 1 column of the best run along the rows of an image; score 0 if there is none."""
     window = 2 * half + 1
+    # A row is supported by the cells within the blur of a wall on both sides of it.
     near = ndimage.maximum_filter1d(image, window, axis=0)
     padded = np.pad(near, ((0, 0), (hole + 1, hole + 1)))
     closed = ndimage.binary_closing(padded, np.ones((1, hole + 1)))[:, hole + 1 : -hole - 1]

@@ -44,6 +44,7 @@ def floor_of(walls_m: FloatArray) -> BaseGeometry:
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
     areas = [_filled(rooms)]
+    # Openings are closed by growing and shrinking, doors first: a wider closing rounds off more of the outline.
     for half in CLOSING_M:
         grown = shapely.buffer(lines, half, cap_style="square", join_style="mitre")
         areas.append(shapely.buffer(_filled(grown), -half, join_style="mitre"))

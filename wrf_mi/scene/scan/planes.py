@@ -139,6 +139,7 @@ def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plan
 
 
 def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
+    # Within three standard errors of both directions, but a degree at least (registration) and five at most.
     error = 3 * float(np.hypot(a.angle_error_rad, b.angle_error_rad))
     angle = float(np.arccos(min(abs(float(a.normal @ b.normal)), 1.0)))
     if angle > min(max(error, MERGE_ANGLE_RAD), 5 * MERGE_ANGLE_RAD):
@@ -229,6 +230,7 @@ def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]
         offsets, count = _inner(plane, cloud, free)
         if len(offsets) >= FEWEST_VOXELS / 2:
             density = ndimage.gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
+            # 1 over the number of bins that a level distribution with this sum of squares would fill.
             sharpness = float((density**2).sum() / density.sum() ** 2)
             if sharpness > sharpest:
                 sharpest, best = sharpness, (plane, offsets, count, density)
@@ -284,6 +286,7 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
         return plane, []
     away, flat = plane.distance(points_m[rows]).astype(float), plane.flat(points_m[rows]).astype(float)
     low = flat.min(axis=0)
+    # Density where there are points: the rectangle around them may be mostly empty.
     density = len(rows) / max(
         len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0)) * CELL_RANGE_M[0] ** 2, 1e-9
     )
@@ -309,6 +312,7 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
                 continue
             depth = float(np.median(step[inside]))
             spread = NORMAL_MAD * float(np.median(np.abs(step[inside] - depth)))
+            # Medians of a layer differ by their own errors alone.
             if spread > FLATNESS * float(np.median(error[inside])):
                 continue
             chosen = np.isin(number, inside) & (np.abs(away - level - depth) < 2 * noise_m)
