@@ -81,9 +81,8 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         walls += pieces[len(runs) :]
         # The occupied cells that lie at these walls are explained.
         cells = shapely.points(left.centres_m(left.occupied))
-        near = shapely.STRtree(shapely.linestrings(np.array(pieces))).query(
-            cells, predicate="dwithin", distance=CLEARED_M
-        )[0]
+        lines = shapely.STRtree(shapely.linestrings(np.array(pieces)))
+        near = lines.query(cells, predicate="dwithin", distance=CLEARED_M)[0]
         occupied = left.occupied.copy()
         row, column = np.nonzero(occupied)
         occupied[row[near], column[near]] = False
