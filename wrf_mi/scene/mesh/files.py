@@ -21,7 +21,7 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, source_file, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
-from .surfaces import Surface
+from .surfaces import Surface, number_names
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
             with file.open("rb") as stream:
                 dump: list[Any] = trimesh.load_scene(stream, file_type=suffix[1:], process=False).dump()
             parts = [part for part in dump if len(getattr(part, "faces", ()))]
-        for name, part in zip(part_names(len(parts)), parts, strict=True):
+        for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
             faces, count = np.asarray(part.faces), len(part.vertices)
             if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
                 raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
@@ -80,11 +80,6 @@ def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
         raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
     return parts
-
-
-def part_names(count: int) -> list[str]:
-    """Names of the parts of a mesh file: ``mesh``, or ``mesh_01``, ``mesh_02``, ..."""
-    return ["mesh"] if count == 1 else [f"mesh_{index + 1:02d}" for index in range(count)]
 
 
 def _polygon_parts(polygons: Polygons) -> list[trimesh.Trimesh]:
@@ -152,7 +147,7 @@ def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | 
     """
     require_precise(np.concatenate([part.vertices for part in parts]), unit_m, name)
     surfaces = []
-    for part_name, part in zip(part_names(len(parts)), parts, strict=True):
+    for part_name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * unit_m
         faces = np.asarray(part.faces, np.int64)
         solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -42,12 +43,12 @@ class Surface:
         return trimesh.Trimesh(self.vertices_m, self.faces, process=False)
 
 
-def number_names(kinds: Sequence[Kind]) -> list[str]:
-    """A unique name for each surface: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
-    names, number = [], dict.fromkeys(KINDS, 0)
+def number_names(kinds: Sequence[str]) -> list[str]:
+    """A unique name for each part: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
+    names, total, number = [], Counter(kinds), Counter[str]()
     for kind in kinds:
         number[kind] += 1
-        names.append(kind if kinds.count(kind) == 1 else f"{kind}_{number[kind]:02d}")
+        names.append(kind if total[kind] == 1 else f"{kind}_{number[kind]:02d}")
     return names
 
 
