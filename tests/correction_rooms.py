@@ -13,7 +13,7 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.correction.frame import rigid_motions
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.corrected_scene import write_corrected_scene

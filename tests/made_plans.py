@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from wrf_mi.scene.plan_sources import PlanGrid, grid_from_points
+from wrf_mi.scene.plan.sources import PlanGrid, grid_from_points
 
 WIDTH_M, DEPTH_M, INNER_M = 6.0, 4.0, 3.5
 DOOR_M = (1.0, 1.9)

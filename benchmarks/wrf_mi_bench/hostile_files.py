@@ -210,7 +210,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
     place = Path(folder)
     warm()
     _limit_memory()
-    for user in ("wrf_mi.scene.points", "wrf_mi.datasets.deepmimo", "wrf_mi.viewer.map_layer"):
+    for user in ("wrf_mi.scene.scan.points", "wrf_mi.datasets.deepmimo", "wrf_mi.viewer.map_layer"):
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):

@@ -39,10 +39,10 @@ from wrf_mi.runs.prediction_file import read_inputs
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.materials import read_materials
-from wrf_mi.scene.mesh import read_mesh
-from wrf_mi.scene.plan_sources import read_plan
-from wrf_mi.scene.points import read_points
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.files import read_mesh
+from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.plan.sources import read_plan
+from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene
 from wrf_mi.training.checkpoint import cut_log, read_checkpoint
 from wrf_mi.viewer.map_layer import read_map

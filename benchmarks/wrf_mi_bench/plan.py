@@ -10,10 +10,10 @@ import shapely
 
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.scene.plan import layout_walls
-from wrf_mi.scene.plan_align import grid_from_scans
-from wrf_mi.scene.plan_sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
-from wrf_mi.scene.plan_walls import find_walls
+from wrf_mi.scene.plan.alignment import grid_from_scans
+from wrf_mi.scene.plan.sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
+from wrf_mi.scene.plan.storey import layout_walls
+from wrf_mi.scene.plan.walls import find_walls
 from wrf_mi.scene.register import best_scale, register_walls, sample_walls
 
 from .comparison import data_folder, line

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from changed_folders import DATA, needs
 
-from wrf_mi.scene.plan import layout_walls
-from wrf_mi.scene.plan_sources import PlanGrid, read_layout
-from wrf_mi.scene.plan_walls import find_walls
+from wrf_mi.scene.plan.sources import PlanGrid, read_layout
+from wrf_mi.scene.plan.storey import layout_walls
+from wrf_mi.scene.plan.walls import find_walls
 
 
 @needs("flat-ble/lidar")
 def test_walls_from_a_robots_map_agree_with_the_layout():
     from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 
-    from wrf_mi.scene.plan_sources import read_plan
+    from wrf_mi.scene.plan.sources import read_plan
     from wrf_mi.scene.register import best_scale, register_walls, sample_walls
 
     home = Path(DATA, "flat-ble")

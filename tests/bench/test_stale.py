@@ -63,7 +63,7 @@ def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_p
     for name, folder in PACKAGES.items():
         ignored = shutil.ignore_patterns("__pycache__", "results", "[!_]*.[!p]*")
         shutil.copytree(CHECKOUT / folder / name, tmp_path / folder / name, ignore=ignored)
-    for name, line in (("wrf_mi/core/files.py", "# why"), ("wrf_mi/scene/plan.py", "MADE = 1")):
+    for name, line in (("wrf_mi/core/files.py", "# why"), ("wrf_mi/scene/plan/storey.py", "MADE = 1")):
         with (tmp_path / name).open("a") as file:
             file.write(f"{line}\n")
     out = tmp_path / "benchmarks" / "results"
@@ -75,4 +75,4 @@ def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_p
     for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "one"]):
         subprocess.run([*git, *words], check=True, env={**os.environ, **dates})
     found = {one["name"]: one["changed"] for one in stale(out)[0]}
-    assert found == {"flat-plan": ["wrf_mi/scene"], "rooms": UNKNOWN}
+    assert found == {"flat-plan": ["wrf_mi/scene/plan"], "rooms": UNKNOWN}

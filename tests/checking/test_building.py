@@ -15,7 +15,7 @@ from made_flat import write_flat
 from wrf_mi.checking import building as module
 from wrf_mi.checking import check_data
 from wrf_mi.checking.building import building_file, in_solid, in_wall, inside_solids, read_building
-from wrf_mi.core import Record
+from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_ble_folder
 
 HALL_M = [[0, 0], [12, 0], [12, 8], [7, 8], [7, 4.2], [6.8, 4.2], [6.8, 8], [0, 8], [0, 0]]
@@ -98,6 +98,21 @@ def test_a_few_transmitters_inside_walls_are_errors_of_position(hall: Record) ->
     assert text.startswith("3 of 200 transmitters lie inside walls or solids of layout.csv: rows 6, 7, 8;")
     many = replace(rows, tx_pos_m=np.concatenate([rows.tx_pos_m] + 5 * [hall.tx_pos_m]))
     assert list(inside_solids(many, building)) == []
+
+
+def test_scene_folders_with_small_surfaces_are_read_whole(tmp_path: Path) -> None:
+    """A room with a stool: 0.3 m wide, which alone would be no room in metres."""
+    room = trimesh.creation.box(bounds=[[0, 0, 0], [5, 4, 2.6]])
+    stool = trimesh.creation.box(bounds=[[1, 1, 0], [1.3, 1.3, 0.4]])
+    (tmp_path / "meshes").mkdir()
+    with pytest.raises(InputError, match="a scene folder without faces"):
+        read_building(tmp_path)
+    for name, mesh in {"room": room, "stool": stool}.items():
+        mesh.export(tmp_path / "meshes" / f"{name}.ply")
+    building = read_building(tmp_path)
+    assert {surface.kind for surface in building.surfaces} == {"floor", "ceiling", "wall", "other"}
+    (solid,) = building.solids
+    assert np.ptp(solid.reshape(-1, 3), axis=0) == pytest.approx([0.3, 0.3, 0.4], abs=1e-6)
 
 
 def test_walls_are_pairs_of_parallel_lines() -> None:

@@ -30,7 +30,7 @@ from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.scene.correction_data import read_correction_data
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene

@@ -14,9 +14,9 @@ from wrf_mi.core import InputError
 from wrf_mi.core.files import inside, one_line
 from wrf_mi.core.yaml_files import read_yaml
 from wrf_mi.datasets import load
-from wrf_mi.scene.plan_sources import read_plan
-from wrf_mi.scene.points import read_points
-from wrf_mi.scene.surfaces import mesh_parts
+from wrf_mi.scene.mesh.files import mesh_parts
+from wrf_mi.scene.plan.sources import read_plan
+from wrf_mi.scene.scan.points import read_points
 from wrf_mi.scene.xml_file import read_scene_xml
 
 

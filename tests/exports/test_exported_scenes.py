@@ -19,7 +19,7 @@ from wrf_mi.runs.api import train
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.materials import Materials
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.corrected_scene import write_corrected_scene
 from wrf_mi.tracing.material_parameters import name_of

@@ -20,7 +20,7 @@ from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
 from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, reset_opacity
-from wrf_mi.scene.points import read_points
+from wrf_mi.scene.scan.points import read_points
 from wrf_mi.training.config import InitialConfig
 from wrf_mi.training.initial import initial_gaussians
 from wrf_mi.training.state import FitState

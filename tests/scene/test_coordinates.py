@@ -18,9 +18,9 @@ from wrf_mi.core import InputError
 from wrf_mi.maps.grid import surface_of
 from wrf_mi.scene.coordinates import Y_UP, looks_y_up, require_fine, require_near, require_precise
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.points import read_points
-from wrf_mi.scene.surfaces import mesh_parts
-from wrf_mi.scene.surfaces import sampled as points_on
+from wrf_mi.scene.mesh.files import mesh_parts
+from wrf_mi.scene.mesh.surfaces import sampled as points_on
+from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene
 from wrf_mi.viewer.scene_layer import read_scene
 
@@ -189,7 +189,7 @@ def test_a_scan_in_a_national_grid_keeps_its_walls(tmp_path: Path, monkeypatch: 
     low = GRID - LOCAL
     np.testing.assert_allclose(extent(made.folder), [low, low + np.array([5.0, 4.0, 2.8])], atol=WALLS_M)
     # Without a search for planes, which takes minutes for large scans.
-    monkeypatch.delattr("wrf_mi.scene.cloud.find_planes")
+    monkeypatch.delattr("wrf_mi.scene.scan.cloud.find_planes")
     with pytest.raises(InputError, match=r"scan.las: coordinates up to 4485518 m.*--origin 701300,4485500,1600"):
         make_scene(file, tmp_path / "refused")
 

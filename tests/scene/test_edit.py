@@ -18,7 +18,7 @@ from wrf_mi.receivers.instruments import ChannelInstrument
 from wrf_mi.scene.edit import Move, box_of, edit_scene, parts_within, read_surfaces
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.materials import Materials
-from wrf_mi.scene.surfaces import Kind, Surface
+from wrf_mi.scene.mesh.surfaces import Kind, Surface
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 

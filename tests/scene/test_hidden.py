@@ -14,7 +14,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.hidden import boxes, with_hidden_faces
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
 
 EXACT_M = 1e-6
 """Corners of faces of exact boxes, metres, rounding apart."""

@@ -17,8 +17,8 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.materials import Materials, read_materials
+from wrf_mi.scene.mesh.surfaces import Surface, number_names
 from wrf_mi.scene.scan import simulate_scan
-from wrf_mi.scene.surfaces import Surface, number_names
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.materials import perfect_reflector
 

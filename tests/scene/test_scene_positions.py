@@ -14,9 +14,9 @@ from made_plans import TWO_ROOMS_M, grid_of
 
 from wrf_mi.core import InputError
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.plan_sources import read_layout
+from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.plan.sources import read_layout
 from wrf_mi.scene.positions import conflicts, read_positions
-from wrf_mi.scene.surfaces import Surface
 
 OFFICE_M = np.array([[0, 0], [9, 0], [9, 3], [5, 3], [5, 7], [0, 7], [0, 0]], float)
 """An office whose wings have different widths; with `PARTITIONS_M`."""

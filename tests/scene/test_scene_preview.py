@@ -9,9 +9,9 @@ from PIL import Image
 
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.paths import Paths
-from wrf_mi.scene.plan import plan_surfaces
+from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.plan.storey import plan_surfaces
 from wrf_mi.scene.preview import GaussianCloud, draw_scene
-from wrf_mi.scene.surfaces import Surface
 
 
 def room():

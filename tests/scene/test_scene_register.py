@@ -8,7 +8,7 @@ from made_plans import L_ROOM_M, TWO_ROOMS_M, box, turn
 from scipy.spatial.transform import Rotation
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan import layout_walls, plan_surfaces
+from wrf_mi.scene.plan.storey import layout_walls, plan_surfaces
 from wrf_mi.scene.register import (
     best_scale,
     distance_to_walls,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wrf_mi.scene.folder import write_scene
-from wrf_mi.scene.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.corrected_scene import moved_triangles
 from wrf_mi.tracing.plane_parameters import SHIFT

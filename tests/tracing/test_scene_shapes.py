@@ -16,7 +16,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
-from wrf_mi.scene.surfaces import mesh_parts
+from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.scene_shapes import SEGMENTS
 from wrf_mi.tracing.surfaces import Surfaces, scene_surfaces

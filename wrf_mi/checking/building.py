@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from ..core import Record
+from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
-from ..scene.mesh import SUFFIXES, planes_of_mesh, read_mesh
-from ..scene.plan import plan_surfaces
-from ..scene.plan_sources import Mask, read_layout
+from ..scene.mesh.facets import planes_of_mesh
+from ..scene.mesh.files import SUFFIXES, mesh_parts, read_mesh, sound_surfaces
+from ..scene.mesh.surfaces import Surface, bodies, box_of
+from ..scene.plan.sources import Mask, read_layout
+from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-from ..scene.surfaces import Surface, bodies, box_of
 from ..tracing.devices import winding_number
-from .placements import placements
+from .plans import placements
 from .repeats import named_rows
 from .units import Found
 
@@ -68,8 +69,8 @@ def building_file(source: str | Path) -> Path | None:
     if (path / LAYOUT).is_file():
         return path / LAYOUT
     scenes = [facts.parent for facts in sorted(path.glob(f"*/{FACTS_FILE}")) if (facts.parent / XML_FILE).is_file()]
-    found = scenes or [file for file in sorted(path.iterdir()) if has_faces(file)]
-    return found[0] if len(found) == 1 else None
+    candidates = scenes or [file for file in sorted(path.iterdir()) if has_faces(file)]
+    return candidates[0] if len(candidates) == 1 else None
 
 
 def read_building(path: Path) -> Building:
@@ -82,14 +83,17 @@ def read_building(path: Path) -> Building:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
         return Building(path, plan_surfaces(vertices, height_m=HEIGHT_M, name=str(path)), (), walls)
-    files = sorted((path / "meshes").glob("*.ply")) if path.is_dir() else [path]
-    raw = [surface for file in files for surface in read_mesh(file)]
+    if path.is_dir():
+        # Surfaces of a scene together have the extent of a building; those of furniture are smaller than any room.
+        parts = [part for file in sorted((path / "meshes").glob("*.ply")) for part in mesh_parts(file)]
+        if not parts:
+            raise InputError(f"{path}: a scene folder without faces in meshes/*.ply; write the scene anew")
+        raw = sound_surfaces(parts, 1.0, path)
+    else:
+        raw = read_mesh(path)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
-    solids = []
-    for faces, closed, volume in bodies(corners):
-        body = corners[faces]
-        if closed and volume and np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M:
-            solids.append(body)
+    closed_bodies = [corners[faces] for faces, closed, volume in bodies(corners) if closed and volume]
+    solids = [body for body in closed_bodies if np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M]
     return Building(path, planes_of_mesh(raw), solids, np.empty((0, 2, 2)))
 
 
@@ -121,11 +125,11 @@ def inside_solids(record: Record, building: Building) -> Found:
         for solid in building.solids:
             within |= in_solid(places[known], solid)
         within |= in_wall(places[known, :2], building.walls_m)
-        found = known[within]
-        if len(found) <= (TOLERATED_SHARE * len(places) if what == "transmitters" else 0):
+        rows = known[within]
+        if len(rows) <= (TOLERATED_SHARE * len(places) if what == "transmitters" else 0):
             continue
-        names = named_rows(found) if what == "transmitters" else ", ".join(record.receivers[k].name for k in found)
-        text = f"{len(found)} of {len(places)} {what} lie inside walls or solids of {building.source.name}: {names}"
+        names = named_rows(rows) if what == "transmitters" else ", ".join(record.receivers[k].name for k in rows)
+        text = f"{len(rows)} of {len(places)} {what} lie inside walls or solids of {building.source.name}: {names}"
         yield "inside-solids", f"{text}; correct their positions, or the frame of the building"
 
 
@@ -134,14 +138,14 @@ def at_vertices(record: Record, building: Building) -> Found:
     if not len(building.walls_m):
         return
     vertices = building.walls_m.reshape(-1, 2)
-    found = []
+    named = []
     for receiver in record.receivers:
-        apart = np.linalg.norm(vertices - receiver.position_m[:2], axis=1)
-        if apart.min() <= AT_VERTEX_M:
-            found.append(f"{receiver.name} at ({receiver.position_m[0]:g}, {receiver.position_m[1]:g})")
-    if found:
-        text = f"{len(found)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
-        yield "wall-vertices", f"{text}: {', '.join(found)}; give the antenna's position, in front of the wall"
+        x, y = receiver.position_m[:2]
+        if np.linalg.norm(vertices - [x, y], axis=1).min() <= AT_VERTEX_M:
+            named.append(f"{receiver.name} at ({x:g}, {y:g})")
+    if named:
+        text = f"{len(named)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
+        yield "wall-vertices", f"{text}: {', '.join(named)}; give the antenna's position, in front of the wall"
 
 
 def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
@@ -154,12 +158,12 @@ def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:
     to = places_m[:, None] - walls[:, 0]
     foot, side = (to * along).sum(axis=-1), to[..., 1] * along[:, 0] - to[..., 0] * along[:, 1]
     near = (foot >= 0) & (foot <= length) & (np.abs(side) >= DEEP_M)
-    for one, other in combinations(range(len(walls)), 2):
-        cosine = along[one] @ along[other]
+    for i, j in combinations(range(len(walls)), 2):
+        cosine = along[i] @ along[j]
         if abs(cosine) > PARALLEL:
-            between = side[:, one] * side[:, other] * cosine < 0  # the left of one is the right of one that runs back
-            thin = np.abs(side[:, one]) + np.abs(side[:, other]) <= THICKEST_WALL_M
-            inside |= near[:, one] & near[:, other] & between & thin
+            between = side[:, i] * side[:, j] * cosine < 0  # the left of a wall is the right of one that runs back
+            thin = np.abs(side[:, i]) + np.abs(side[:, j]) <= THICKEST_WALL_M
+            inside |= near[:, i] & near[:, j] & between & thin
     return inside
 
 
@@ -168,7 +172,9 @@ def in_solid(places_m: FloatArray, body_m: FloatArray) -> Mask:
     inside = np.zeros(len(places_m), bool)
     low, high = body_m.min(axis=(0, 1)) + DEEP_M, body_m.max(axis=(0, 1)) - DEEP_M
     near = np.flatnonzero(((places_m >= low) & (places_m <= high)).all(axis=1))
-    for k in near[winding_number(body_m, places_m[near]) > 0.5]:
-        nearest = trimesh.triangles.closest_point(body_m, np.broadcast_to(places_m[k], (len(body_m), 3)))
-        inside[k] = np.linalg.norm(nearest - places_m[k], axis=1).min() >= DEEP_M
+    near = near[winding_number(body_m, places_m[near]) > 0.5]
+    if len(near):
+        body = trimesh.Trimesh(**trimesh.triangles.to_kwargs(body_m), process=False)
+        _, depth_m, _ = trimesh.proximity.closest_point_naive(body, places_m[near])
+        inside[near] = depth_m >= DEEP_M
     return inside

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from ..core import InputError, Record
+from ..core import DataFault, InputError, Record
 from ..datasets.faults import collect_faults
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
 from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
-from .distances import distance_law
+from .plans import distance_law
 from .reception import few_rows, not_heard
 from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
-from .report import DataReport, Suspicion
 from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
 logger = logging.getLogger(__name__)
@@ -60,6 +61,90 @@ WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
 OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
 """Suspicions about directions and distances, which need the unit of positions."""
+MOST_LINES = 10
+"""Faults of one kind in one file that are printed; the others are counted."""
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Data that read well but are likely wrong.
+
+    Attributes:
+        name: kind of the suspicion, a key of `wrf_mi.checking.SUSPICIONS`.
+        text: evidence, what the data are instead, and the remedy.
+    """
+
+    name: str
+    text: str
+
+
+@dataclass(frozen=True)
+class DataReport:
+    """What `check_data` found.
+
+    Attributes:
+        dataset: name or folder that was checked.
+        source: path of the data's folder or file; empty where it is not known.
+        record: the data, None if there is a fault.
+        faults: what the reader refuses, in the order in which it was found.
+        suspicions: data that are likely wrong; only looked for where there is no fault.
+        notes: properties of the data that are no mistake, but count for some models.
+    """
+
+    dataset: str
+    source: str
+    record: Record | None
+    faults: tuple[InputError, ...]
+    suspicions: tuple[Suspicion, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data set can be read."""
+        return not self.faults
+
+    def lines(self, most: int = MOST_LINES) -> list[str]:
+        """A line for each fault, suspicion and note, and a summary.
+
+        Args:
+            most: largest number of lines for faults of one kind in one file.
+        """
+        lines = list(self._fault_lines(most))
+        lines += [f"suspicion {suspicion.name}: {suspicion.text}" for suspicion in self.suspicions]
+        lines += [f"note: {text}" for text in self.notes]
+        if self.faults:
+            summary = f"{_count(len(self.faults), 'fault')}; suspicions are looked for when there is none"
+        else:
+            summary = f"no fault, {_count(len(self.suspicions), 'suspicion')}"
+        return [*lines, f"{self.dataset}: {summary}"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, with every fault."""
+        record = self.record
+        return {
+            "dataset": self.dataset,
+            "ok": self.ok,
+            "source": self.source,
+            "task": None if record is None else record.task,
+            "rows": None if record is None else len(record),
+            "faults": [_plain(fault) for fault in self.faults],
+            "suspicions": [asdict(suspicion) for suspicion in self.suspicions],
+            "notes": list(self.notes),
+        }
+
+    def _fault_lines(self, most: int) -> Iterator[str]:
+        kinds: dict[object, list[InputError]] = {}
+        for fault in self.faults:
+            kinds.setdefault(fault.kind if isinstance(fault, DataFault) else fault, []).append(fault)
+        source = Path(self.source)
+        base = source if source.is_dir() else source.parent  # files are named in the folder of the data
+        for faults in kinds.values():
+            for fault in faults[:most]:
+                yield f"fault: {_line(fault, base)}"
+            if len(faults) > most and isinstance(last := faults[-1], DataFault):
+                file, remedy = Path(last.kind[0]), last.kind[1]
+                where = f", up to {last.place}" if last.place else ""
+                yield f"fault: {_relative(file, base)}: {len(faults) - most} more of this kind{where}; {remedy}"
 
 
 def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progress: bool = False) -> DataReport:
@@ -95,13 +180,13 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     record, faults = collect_faults(read)
     if record is None:
         return DataReport(name, source, None, tuple(faults), ())
-    found = [suspicion for check in OF_VALUES for suspicion in check(record)]
+    suspected = [suspicion for check in OF_VALUES for suspicion in check(record)]
     wrong_unit = list(degrees(record)) or list(position_unit(record))
-    found += wrong_unit
+    suspected += wrong_unit
     if all(name in ignore for name, _ in wrong_unit):
-        found += [suspicion for check in OF_PLACES for suspicion in check(record)]
-        found += _of_building(record)
-    suspicions = tuple(Suspicion(name, text) for name, text in found if name not in ignore)
+        suspected += [suspicion for check in OF_PLACES for suspicion in check(record)]
+        suspected += _of_building(record)
+    suspicions = tuple(Suspicion(name, text) for name, text in suspected if name not in ignore)
     notes = tuple(note for note in (far_from_origin(record),) if note)
     return DataReport(name, record.source, record, (), suspicions, notes)
 
@@ -136,8 +221,30 @@ def _of_building(record: Record) -> Found:
         yield "building", f"{error}"
         return
     # Transmitters in another plan are in its walls, too.
-    if found := list(plan_against_walls(record, building)):
-        yield from found
+    if wrong_plan := list(plan_against_walls(record, building)):
+        yield from wrong_plan
         return
     yield from inside_solids(record, building)
     yield from at_vertices(record, building)
+
+
+def _line(fault: InputError, base: Path) -> str:
+    """A fault as ``FILE, row N: what; remedy``."""
+    if not isinstance(fault, DataFault):
+        return str(fault)
+    file = _relative(fault.file, base)
+    return f"{file}, {fault.place}: {fault.text}" if fault.place else f"{file}: {fault.text}"
+
+
+def _plain(fault: InputError) -> dict[str, Any]:
+    if not isinstance(fault, DataFault):
+        return {"file": None, "place": "", "row": None, "text": str(fault)}
+    return {"file": str(fault.file), "place": fault.place, "row": fault.row, "text": fault.text}
+
+
+def _relative(file: Path, base: Path) -> str:
+    return str(file.relative_to(base)) if base in file.parents else str(file)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number or 'no'} {what}{'s' if number > 1 else ''}"

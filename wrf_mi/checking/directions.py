@@ -17,7 +17,7 @@ import numpy as np
 from ..core import Record
 from ..core.angles import FloatArray, azimuth_elevation, solid_angles
 from ..core.types import IntArray
-from .placements import other_plans
+from .plans import other_plans
 from .units import Found
 
 Images = Any
@@ -53,8 +53,6 @@ OTHERS = 6
 """Transmitters of other groups that a row's own is compared with."""
 
 
-_Reading = tuple[str, str, str, Record]
-"""Another reading: name of the suspicion, what is wrong, the remedy, and the record so read."""
 REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at azimuth 0, counter-clockwise"
 
 
@@ -104,15 +102,16 @@ def _line_of_sight(record: Record) -> Found:
         return
     better = []
     for name, what, remedy, reading in _readings(part):
-        found = brightness(reading)
-        if found.mean() >= BRIGHT and _is_brighter(found, stated, groups) and _moves(reading, found, groups):
-            better.append((name, what, remedy, found))
+        shares = brightness(reading)
+        if shares.mean() >= BRIGHT and _is_brighter(shares, stated, groups) and _moves(reading, shares, groups):
+            better.append((name, what, remedy, shares))
     if not better:
         return
     # Several readings may put transmitters where they are in the best one: the first of these is named.
-    best = max((found for *_, found in better), key=np.mean)
-    (name, what, remedy, found), *others = [one for one in better if not _is_brighter(best, one[-1], groups)]
-    evidence = f"{found.mean():.0%} of the hemisphere is then darker than the direction of the transmitter"
+    best = max((shares for *_, shares in better), key=np.mean)
+    equal = [reading for reading in better if not _is_brighter(best, reading[-1], groups)]
+    (name, what, remedy, shares), *others = equal
+    evidence = f"{shares.mean():.0%} of the hemisphere is then darker than the direction of the transmitter"
     also = [text for other, text, *_ in others if other != name]
     hint = f" (or: {also[0]})" if also else ""
     yield name, f"{what}: {evidence}, as stated {stated.mean():.0%}; {remedy}{hint}"
@@ -139,8 +138,8 @@ def brightness(record: Record) -> FloatArray:
     height, width = record.observation.shape[2:]
     weight = solid_angles(height, width).astype(np.float32)
     weight /= weight.sum()
-    found = np.full((len(record.receivers), len(record)), CHANCE)
-    for receiver, spectra, shares in zip(record.receivers, record.observation, found, strict=True):
+    darker = np.full((len(record.receivers), len(record)), CHANCE)
+    for receiver, spectra, shares in zip(record.receivers, record.observation, darker, strict=True):
         azimuth, elevation = azimuth_elevation((record.tx_pos_m - receiver.position_m) @ receiver.to_world)
         # The zenith lies half a pixel or more above the last row.
         row = np.minimum(np.rint(elevation * (2 * height / np.pi)).astype(int), height - 1)
@@ -148,19 +147,19 @@ def brightness(record: Record) -> FloatArray:
         for k in np.flatnonzero(elevation >= 0):
             image, value = spectra[k].ravel(), spectra[k, row[k], column[k]]
             shares[k] = weight[image < value].sum() + weight[image == value].sum() / 2
-    return found
+    return darker
 
 
-def _is_brighter(found: FloatArray, stated: FloatArray, groups: IntArray) -> bool:
+def _is_brighter(shares: FloatArray, stated: FloatArray, groups: IntArray) -> bool:
     """Whether one brightness [n_rx, n] is clearly above another one, in most groups [n] of rows."""
-    darker = 1 - stated.mean() >= DARKER * (1 - found.mean())
-    return bool(darker) and _is_positive(found - stated, groups)
+    darker = 1 - stated.mean() >= DARKER * (1 - shares.mean())
+    return bool(darker) and _is_positive(shares - stated, groups)
 
 
-def _moves(record: Record, own: FloatArray, groups: IntArray) -> bool:
+def _moves(record: Record, shares: FloatArray, groups: IntArray) -> bool:
     """Whether spectra are brighter in the direction of their own transmitter than in those of other transmitters."""
     rng = np.random.default_rng(0)
-    gain = np.zeros_like(own)
+    gain = np.zeros_like(shares)
     for _ in range(OTHERS):
         # A transmitter of another group: from the rows in the order of their groups, more than a group away.
         order = np.argsort(groups, kind="stable")
@@ -168,7 +167,7 @@ def _moves(record: Record, own: FloatArray, groups: IntArray) -> bool:
         shift = int(rng.integers(size, len(order) - size + 1))
         other = np.empty_like(order)
         other[order] = np.roll(order, shift)
-        gain += (own - brightness(replace(record, tx_pos_m=record.tx_pos_m[other]))) / OTHERS
+        gain += (shares - brightness(replace(record, tx_pos_m=record.tx_pos_m[other]))) / OTHERS
     return _is_positive(gain, groups)
 
 
@@ -203,7 +202,8 @@ def _groups(positions_m: FloatArray) -> IntArray:
     return number
 
 
-def _readings(record: Record) -> Iterator[_Reading]:
+def _readings(record: Record) -> Iterator[tuple[str, str, str, Record]]:
+    """Other readings: name of the suspicion, what is wrong, the remedy, and the record so read."""
     for text, image in COLUMNS.items():
         yield "spectrum-axes", text, REMEDY, replace(record, observation=image(record.observation))
     for text, turn in ORIENTATIONS.items():
@@ -215,18 +215,12 @@ def _readings(record: Record) -> Iterator[_Reading]:
         yield "plan", what, placement.remedy, replace(record, tx_pos_m=placement.positions_m)
 
 
-def _half_turn(images: Images) -> Images:
-    return np.roll(images, images.shape[-1] // 2, axis=-1)
-
-
-def _clockwise(images: Images) -> Images:
-    return np.roll(images[..., ::-1], 1, axis=-1)
-
-
 COLUMNS: dict[str, Callable[[Images], Images]] = {
-    "image columns count from -180 degrees": _half_turn,
-    "image columns count clockwise": _clockwise,
-    "image columns count clockwise from 180 degrees": lambda images: _clockwise(_half_turn(images)),
+    "image columns count from -180 degrees": lambda images: np.roll(images, images.shape[-1] // 2, axis=-1),
+    "image columns count clockwise": lambda images: np.roll(images[..., ::-1], 1, axis=-1),
+    "image columns count clockwise from 180 degrees": (
+        lambda images: np.roll(images[..., ::-1], 1 - images.shape[-1] // 2, axis=-1)
+    ),
 }
 """Other readings of image columns, and how each one becomes the stated one."""
 ORIENTATIONS: dict[str, Callable[[FloatArray], FloatArray]] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Record
+from ..core.digest import content_digest
 from ..core.types import IntArray
 from .units import Found
 
@@ -95,11 +95,6 @@ def _received_values(record: Record) -> IntArray:
 
 def _first_equal(parts: Sequence[NDArray[Any]]) -> IntArray:
     """Number of the first row that is equal in all parts [n, ...], for each row; NaN equals NaN."""
-    keys: dict[bytes, int] = {}
-    first = []
-    for row, values in enumerate(zip(*parts, strict=True)):
-        digest = hashlib.blake2b(digest_size=16)
-        for value in values:
-            digest.update(np.ascontiguousarray(value).tobytes())
-        first.append(keys.setdefault(digest.digest(), row))
-    return np.array(first, np.int64)
+    rows: dict[str, int] = {}
+    digests = (content_digest(*values) for values in zip(*parts, strict=True))
+    return np.array([rows.setdefault(digest, row) for row, digest in enumerate(digests)], np.int64)

@@ -81,6 +81,7 @@ def heading_unit(record: Record) -> Found:
             return
         if stated >= AGREEMENT:
             return
+    # Headings that count turns may exceed 2 pi, but change by less than half a turn from row to row.
     jumps = np.mean(np.abs(np.diff(heading)) > np.pi)
     if np.ptp(heading) >= WIDEST_RAD and jumps > CONTINUOUS_SHARE:
         yield "headings", f"{text}, and {jumps:.0%} of the steps between rows are above pi: {in_degrees}"

@@ -26,7 +26,7 @@ from ..scene.correction_data import CorrectionData
 from ..scene.folder import read_scene_folder
 from ..scene.hidden import Boxes, with_hidden_faces
 from ..scene.materials import FILE as MATERIALS_FILE
-from ..scene.surfaces import KINDS, Kind
+from ..scene.mesh.surfaces import KINDS, Kind
 from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene

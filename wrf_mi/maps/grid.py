@@ -19,7 +19,7 @@ from ..core.angles import FloatArray
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..scene.coordinates import require_near
-from ..scene.surfaces import mesh_parts
+from ..scene.mesh.files import mesh_parts
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
     """Triangles of a mesh file, halved until no edge is longer than a step.
 
     Args:
-        mesh: a format of `wrf_mi.scene.surfaces.mesh_parts`, in metres and the frame of the data.
+        mesh: a format of `wrf_mi.scene.mesh.files.mesh_parts`, in metres and the frame of the data.
         step_m: longest edge of a triangle, metres; None: the faces as they are.
 
     Raises:

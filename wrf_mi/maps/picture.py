@@ -23,8 +23,8 @@ from ..runs.figures import without_formulas
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..runs.scene_view import surfaces_of
+from ..scene.mesh.surfaces import cut_lines
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
-from ..scene.surfaces import cut_lines
 from ..tasks import task_of
 from .dataset import POWER
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from ..core.angles import FloatArray
 from ..gaussians.parameters import Gaussians
 from ..models.ray_tracing import PATHS
+from ..scene.mesh.surfaces import KINDS, Kind, Surface
 from ..scene.preview import GaussianCloud, draw_scene
-from ..scene.surfaces import KINDS, Kind, Surface
 from ..tracing import load_trace
 from ..tracing.surfaces import scene_surfaces
 from .api import open_run

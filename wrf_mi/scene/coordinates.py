@@ -1,4 +1,4 @@
-"""Coordinates of meshes and scans: which axis is up, how far from the origin they are, how finely they are stored."""
+"""Coordinates of meshes and scans: units, the axis that is up, distance from the origin, how finely they are stored."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from ..core.angles import FloatArray
 logger = logging.getLogger(__name__)
 
 Up = Literal["y", "z"]
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+"""Length of each unit that a scan or mesh may be in."""
+FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"
+"""Files that points are read from."""
+LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
+"""Bounds of the extent of a building; outside them the units are wrong."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
 Y_UP_SUFFIXES = (".glb", ".gltf")
@@ -94,6 +100,18 @@ def warn_of_up(points_m: FloatArray, name: str | Path, up: Up) -> None:
         logger.warning("%s, and is read with %s up; state it by wrf-mi mesh --up %s, or --up %s", text, up, other, up)
 
 
+def check_extent(points_m: FloatArray, name: str | Path) -> None:
+    """Refuse coordinates [n, 3] of a named source that are not metres of a room or a building."""
+    size = np.ptp(extent(points_m), axis=0)
+    text = f"{name}: extent {' x '.join(f'{side:.4g}' for side in size)} m"
+    if size.max() > LARGEST_M:
+        raise InputError(f"{text} looks like millimetres; give --units mm (or cut out one building)")
+    if size[2] > HIGHEST_M:
+        raise InputError(f"{text} looks like centimetres; give --units cm (or cut out one building)")
+    if size.max() < SMALLEST_M:
+        raise InputError(f"{text} is too small for a room; give its --units ({', '.join(UNITS_M)})")
+
+
 def require_near(points_m: FloatArray, name: str | Path) -> None:
     """Refuse points [n, 3] so far from the origin that single precision would move them by a millimetre.
 
@@ -158,3 +176,12 @@ def _step(values: FloatArray) -> float:
         return 0.0
     ratio = gaps / gaps.min()
     return float(gaps.min()) if np.abs(ratio - np.round(ratio)).max() < STEP_TOLERANCE else 0.0
+
+
+def source_file(path: str | Path, units: str, wanted: str) -> Path:
+    """The path of a file; an `InputError` for unknown units or a missing file, whose message ends with ``wanted``."""
+    if units not in UNITS_M:
+        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; give {wanted}")
+    return Path(path)

@@ -55,8 +55,8 @@ def read_correction_data(scene: str | Path | None) -> CorrectionData | None:
     if scene is None or not path.is_file():
         return None
     with readable(path, f"{path}: missing", "correct the scene again"):
-        found = json.loads(path.read_text(encoding="utf-8")).get(KEY)
-        if found is None:  # nothing was changed, or the file is older than the entry
+        facts = json.loads(path.read_text(encoding="utf-8")).get(KEY)
+        if facts is None:  # nothing was changed, or the file is older than the entry
             return None
-        rows = np.asarray(found["rows"], np.int64).reshape(-1)
-        return CorrectionData(str(found["name"]), rows, max(float(found["error_ratio"]), 1.0))
+        rows = np.asarray(facts["rows"], np.int64).reshape(-1)
+        return CorrectionData(str(facts["name"]), rows, max(float(facts["error_ratio"]), 1.0))

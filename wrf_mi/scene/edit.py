@@ -17,7 +17,8 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
-from .surfaces import KINDS, Kind, Surface, box_of, mesh_parts, moved
+from .mesh.files import mesh_parts
+from .mesh.surfaces import KINDS, Kind, Surface, box_of, moved
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +89,7 @@ def parts_within(folder: str | Path, low_m: ArrayLike, high_m: ArrayLike) -> tup
     """
     low, high = np.asarray(low_m, float), np.asarray(high_m, float)
     surfaces, _ = read_surfaces(folder)
-    inside = [((one.vertices_m >= low) & (one.vertices_m <= high)).all() for one in surfaces]
+    inside = [((surface.vertices_m >= low) & (surface.vertices_m <= high)).all() for surface in surfaces]
     return tuple(surface.name for surface, within in zip(surfaces, inside, strict=True) if within)
 
 
@@ -120,7 +121,7 @@ def edit_scene(
     surfaces, materials = read_surfaces(folder)
     if not moves and not remove:
         raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
-    stated, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
+    unmoved, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
         text = f"move {','.join(move.parts)}"
@@ -129,11 +130,11 @@ def edit_scene(
         if both := sorted(names & gone):
             raise InputError(f"{text}: {both[0]} is also removed; omit one of the two")
         matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
-        surfaces = [moved([one], matrix)[0] if one.name in names else one for one in surfaces]
+        surfaces = [moved([part], matrix)[0] if part.name in names else part for part in surfaces]
         moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
-    _check_moves(stated, left, moved_names)
-    kept = {surface.name: materials.surfaces[surface.name] for surface in left}
+    _check_moves(unmoved, left, moved_names)
+    entries = {surface.name: materials.surfaces[surface.name] for surface in left}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
     return write_scene(
@@ -141,7 +142,7 @@ def edit_scene(
         left,
         frame=f"that of {folder}",
         source=str(folder),
-        materials=replace(materials, surfaces=kept),
+        materials=replace(materials, surfaces=entries),
         description=f"An edited scene: {'; '.join(changes)}",
         replace=replace_folder,
     )
@@ -149,22 +150,22 @@ def edit_scene(
 
 def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[str]) -> set[str]:
     """Names of the surfaces that match some patterns; every pattern has to match one."""
-    found: set[str] = set()
+    chosen: set[str] = set()
     for pattern in patterns:
         names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
         if not names:
             known = ", ".join(surface.name for surface in surfaces)
             raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
-        found |= names
-    return found
+        chosen |= names
+    return chosen
 
 
 def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[str]) -> None:
     """Refuse a moved part that is wholly outside of the scene, and warn of one partly out of it, or in others."""
-    parts, others = ([one for one in after if (one.name in names) == chosen] for chosen in (True, False))
+    parts, others = ([part for part in after if (part.name in names) == chosen] for chosen in (True, False))
     if not parts or not others:
         return  # a scene that is moved as a whole has no inside
-    earlier = {one.name: one for one in before}
+    earlier = {part.name: part for part in before}
     low, high = box_of(before)
     for part in parts:
         first, last = box_of([part])
@@ -208,7 +209,7 @@ def _depth(triangles: FloatArray, cut: FloatArray) -> float:
         start, end = starts[first : first + step, None], ends[first : first + step, None]
         # Signed distances [edges, triangles] of both ends from the planes.
         before, after = (((point - cut[:, 0]) * normal).sum(axis=-1) for point in (start, end))
-        edge, triangle = np.nonzero(before * after < 0)
+        edge, triangle = np.nonzero(before * after < 0)  # both ends are on different sides of the plane
         d = before[edge, triangle], after[edge, triangle]
         met = start[edge, 0] + (d[0] / (d[0] - d[1]))[:, None] * (end - start)[edge, 0]
         within = (trimesh.triangles.points_to_barycentric(cut[triangle], met) >= 0).all(axis=1)

@@ -27,7 +27,7 @@ from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
-from .surfaces import Surface, box_of
+from .mesh.surfaces import Surface, box_of
 from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)
@@ -91,11 +91,11 @@ def write_scene(
     names = [surface.name for surface in surfaces]
     if len(set(names)) < len(names):
         raise ValueError("write_scene: two surfaces have the same name")
-    given = materials or Materials()
-    if unknown := [name for name in given.surfaces if name not in names]:
+    materials = materials or Materials()
+    if unknown := [name for name in materials.surfaces if name not in names]:
         raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
     require_near(box_of(surfaces), source)
-    full = given.complete({surface.name: surface.kind for surface in surfaces})
+    full = materials.complete({surface.name: surface.kind for surface in surfaces})
     matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
         "description": description or f"{len(surfaces)} surfaces made from {Path(source).name}",
@@ -122,10 +122,12 @@ def write_scene(
     return folder
 
 
-def plain_name(name: str, odd: str, taken: Collection[str]) -> str:
-    """A name without the characters of a pattern, which become ``_``, and numbered where it is taken."""
+def plain_name(name: str, odd: str, names_in_use: Collection[str]) -> str:
+    """A name without the characters of a pattern, which become ``_``, and numbered where it is in use."""
     plain = re.sub(odd, "_", name)
-    return next(free for free in chain([plain], (f"{plain}_{number}" for number in count(2))) if free not in taken)
+    return next(
+        free for free in chain([plain], (f"{plain}_{number}" for number in count(2))) if free not in names_in_use
+    )
 
 
 def read_scene_folder(folder: str | Path) -> SceneFolder:
@@ -167,15 +169,18 @@ def scene_file(folder: Path, facts: Mapping[Any, Any]) -> Path:
 def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
     """Material of each surface, and constants of those that are used and of the scene's own."""
     used = materials.by_surface()
-    own = {name: values for name, values in materials.constants.items() if name in used.values()}
-    return used, {name: {key: float(f"{values[key]:.9g}") for key in PERFECT_CONSTANTS} for name, values in own.items()}
+    return used, {
+        name: {key: float(f"{values[key]:.9g}") for key in PERFECT_CONSTANTS}  # as many digits as a scene file has
+        for name, values in materials.constants.items()
+        if name in used.values()
+    }
 
 
 def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
     """Material of each shape of a scene file by the shape's name, and constants of materials of its own."""
     try:
         root = parsed_xml(xml)
-        own = {
+        constants = {
             bsdf.get("id", "").removeprefix("mat-"): {
                 value.get("name", ""): float(value.get("value", "nan")) for value in bsdf.findall("float")
             }
@@ -183,6 +188,6 @@ def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]
         }
     except (OSError, ElementTree.ParseError, ValueError, DefusedXmlException):
         return {}, {}
-    own.pop(PERFECT, None)
+    constants.pop(PERFECT, None)
     references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in root.findall("shape")}
-    return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}, own
+    return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}, constants

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import combinations, count
+from itertools import combinations, count, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from ..core.angles import FloatArray
 from .edit import read_surfaces
 from .folder import write_scene
 from .materials import FILE
-from .surfaces import Surface, bodies
+from .mesh.surfaces import Surface, bodies
 
 PREFIX = "hidden_"
 """Names of supposed faces begin with it."""
@@ -107,19 +107,24 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
     """
-    if not (Path(scene) / FILE).is_file():
-        yield scene, Boxes([], [])
+    supposed = Boxes([], [])
+    if (Path(scene) / FILE).is_file():
+        surfaces, materials = read_surfaces(scene)
+        supposed = boxes(surfaces)
+    if not supposed.hidden:
+        yield scene, supposed
         return
-    surfaces, materials = read_surfaces(scene)
-    found = boxes(surfaces)
-    if not found.hidden:
-        yield scene, found
-        return
-    stated = replace(materials, surfaces={**materials.surfaces, **{face.name: face.kind for face in found.hidden}})
+    kinds = {**materials.surfaces, **{face.name: face.kind for face in supposed.hidden}}
     with TemporaryDirectory() as place:
         folder = Path(place) / "scene"
-        write_scene(folder, [*surfaces, *found.hidden], frame=f"that of {scene}", source=str(scene), materials=stated)
-        yield folder, found
+        write_scene(
+            folder,
+            [*surfaces, *supposed.hidden],
+            frame=f"that of {scene}",
+            source=str(scene),
+            materials=replace(materials, surfaces=kinds),
+        )
+        yield folder, supposed
 
 
 def boxes(surfaces: Sequence[Surface]) -> Boxes:
@@ -130,23 +135,26 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
     Args:
         surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
     """
-    furniture = list(_faces([one for one in surfaces if one.kind == "other"]))
-    around = list(_faces([one for one in surfaces if one.kind != "other"]))
-    taken = {surface.name for surface in surfaces}
-    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in taken)
+    furniture, around = (
+        list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))
+        for is_furniture in (True, False)
+    )
+    names_in_use = {surface.name for surface in surfaces}
+    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in names_in_use)
     hidden, members = list[Rectangle](), dict[frozenset[str], None]()
     for base, low, high in _boxes(furniture):
         sizes = np.linalg.norm(base[1:3] - base[:2], axis=1)
         if min(*sizes, high - low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
             continue
-        own = set[str]()
+        box_names = set[str]()
         for face in _faces_of_box(base, low, high):
-            there = [other.name for other in (*furniture, *hidden) if face.covered_by(other)]
-            if not there and not any(map(face.covered_by, around)):
+            in_place = [other.name for other in (*furniture, *hidden) if face.covered_by(other)]
+            # Walls and floors in its place hide a face for good, and belong to no box.
+            if not in_place and not any(map(face.covered_by, around)):
                 hidden.append(replace(face, name=next(names)))
-                there = [hidden[-1].name]
-            own.update(there)
-        members[frozenset(own)] = None
+                in_place = [hidden[-1].name]
+            box_names.update(in_place)
+        members[frozenset(box_names)] = None
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     return Boxes([Surface(face.name, "other", face.corners, halves) for face in hidden], list(members))
 
@@ -169,25 +177,28 @@ def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
         for members, _, _ in bodies(triangles):
             corners = triangles[members].reshape(-1, 3)
             centre = corners.mean(axis=0)
+            # The direction in which the corners spread least.
             normal = np.linalg.svd(corners - centre, full_matrices=False)[2][2]
-            if np.abs((corners - centre) @ normal).max() > FLAT_M:
-                continue
-            if abs(normal[2]) < UPRIGHT:
-                along = np.array([-normal[1], normal[0], 0.0]) / np.hypot(*normal[:2])
-                axes = np.stack([along, [0.0, 0.0, 1.0]])
-            elif np.hypot(*normal[:2]) < UPRIGHT:
-                outline = shapely.get_coordinates(shapely.MultiPoint(corners[:, :2]).minimum_rotated_rectangle)
-                if len(outline) < 4:
-                    continue
-                side = np.append(outline[1] - outline[0], 0.0)
-                side /= np.linalg.norm(side)
-                axes = np.stack([side, np.array([-side[1], side[0], 0.0])])
-            else:
+            axes = _axes(normal, corners)
+            if axes is None or np.abs((corners - centre) @ normal).max() > FLAT_M:
                 continue
             flat = (corners - centre) @ axes.T
             low, high = flat.min(axis=0), flat.max(axis=0)
             if (high - low > FLAT_M).all():
                 yield Rectangle(centre + (low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes, surface.name)
+
+
+def _axes(normal: FloatArray, corners: FloatArray) -> FloatArray | None:
+    """Unit vectors [2, 3] along the sides of an upright or level face; None for a face that is neither."""
+    if abs(normal[2]) < UPRIGHT:
+        along = np.array([-normal[1], normal[0], 0.0]) / np.hypot(*normal[:2])
+        return np.stack([along, [0.0, 0.0, 1.0]])
+    outline = shapely.get_coordinates(shapely.MultiPoint(corners[:, :2]).minimum_rotated_rectangle)
+    if np.hypot(*normal[:2]) >= UPRIGHT or len(outline) < 4:
+        return None
+    side = np.append(outline[1] - outline[0], 0.0)
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.array([-side[1], side[0], 0.0])])
 
 
 def _boxes(faces: Sequence[Rectangle]) -> Iterator[tuple[FloatArray, float, float]]:
@@ -197,54 +208,51 @@ def _boxes(faces: Sequence[Rectangle]) -> Iterator[tuple[FloatArray, float, floa
         for side in sides:
             if _is_below(top, side):
                 yield top.corners[:, :2], side.heights_m[0], top.centre[2]
-    for one, other in combinations(sides, 2):
-        base = _corner(one, other)
-        base = _between(one, other) if base is None else base
+    for first, second in combinations(sides, 2):
+        base = _corner(first, second)
+        base = _between(first, second) if base is None else base
         if base is not None:
-            heights = np.concatenate([one.heights_m, other.heights_m])
+            heights = np.concatenate([first.heights_m, second.heights_m])
             yield base, heights.min(), heights.max()
 
 
 def _is_below(top: Rectangle, side: Rectangle) -> bool:
     """Whether a side stands below an edge of a top."""
-    for edge, half in ((top.sides[0], top.sides[1]), (top.sides[1], top.sides[0])):
-        for sign in (-1, 1):
-            length = np.linalg.norm(edge)
-            along, away = edge / length, side.centre + side.sides[1] - (top.centre + sign * half)
+    for edge, half in (top.sides, top.sides[::-1]):
+        length = np.linalg.norm(edge)
+        along = edge / length
+        for middle in (top.centre - half, top.centre + half):
+            away = side.centre + side.sides[1] - middle  # from the edge to the side's upper end
             near = abs(away @ half) / np.linalg.norm(half) < TOUCH_M and abs(away[2]) < TOUCH_M
             if abs(side.normal @ along) < UPRIGHT and near and abs(away @ along) < length:
                 return True
     return False
 
 
-def _corner(one: Rectangle, other: Rectangle) -> FloatArray | None:
+def _corner(first: Rectangle, second: Rectangle) -> FloatArray | None:
     """Base [4, 2] of the box of two sides that meet; None: they do not, or not at right angles."""
-    if abs(one.normal @ other.normal) > UPRIGHT:
+    lows, highs = np.stack([first.heights_m, second.heights_m], axis=1)
+    if abs(first.normal @ second.normal) > UPRIGHT or highs.min() - lows.max() < LEAST_SIDE_M:
         return None
-    (low, high), (other_low, other_high) = one.heights_m, other.heights_m
-    if min(high, other_high) - max(low, other_low) < LEAST_SIDE_M:
-        return None
-    a, b = one.sides[0, :2], other.sides[0, :2]
-    for s in (-1, 1):
-        for t in (-1, 1):
-            end, begin = one.centre[:2] + s * a, other.centre[:2] + t * b
-            if np.linalg.norm(end - begin) < TOUCH_M:
-                corner = (end + begin) / 2
-                across = -2 * t * (b - (b @ a) / (a @ a) * a)
-                along = -2 * s * a
-                return np.stack([corner, corner + along, corner + along + across, corner + across])
+    for a, b in product((first.sides[0, :2], -first.sides[0, :2]), (second.sides[0, :2], -second.sides[0, :2])):
+        end, begin = first.centre[:2] - a, second.centre[:2] - b
+        if np.linalg.norm(end - begin) < TOUCH_M:
+            corner = (end + begin) / 2
+            along = 2 * a
+            across = 2 * (b - (b @ a) / (a @ a) * a)  # square to the first side, as long as the second
+            return np.stack([corner, corner + along, corner + along + across, corner + across])
     return None
 
 
-def _between(one: Rectangle, other: Rectangle) -> FloatArray | None:
+def _between(first: Rectangle, second: Rectangle) -> FloatArray | None:
     """Base [4, 2] of the box between two sides of equal outline; None: they are not opposite."""
-    a, gap = one.sides[0, :2], other.centre - one.centre
+    a, gap = first.sides[0, :2], second.centre - first.centre
     size = np.linalg.norm(a)
     along, across = float(gap[:2] @ a / size), gap[:2] - (gap[:2] @ a) / size**2 * a
-    longer = np.linalg.norm(one.sides, axis=1) - np.linalg.norm(other.sides, axis=1)
-    if abs(one.normal @ other.normal) < np.sqrt(1 - UPRIGHT**2) or np.linalg.norm(across) < SAME_M:
+    longer = np.linalg.norm(first.sides, axis=1) - np.linalg.norm(second.sides, axis=1)
+    if abs(first.normal @ second.normal) < np.sqrt(1 - UPRIGHT**2) or np.linalg.norm(across) < SAME_M:
         return None
     if max(abs(along), abs(gap[2]), *np.abs(longer)) > TOUCH_M:
         return None
-    corner = one.centre[:2] - a
+    corner = first.centre[:2] - a
     return np.stack([corner, corner + 2 * a, corner + 2 * a + across, corner + across])

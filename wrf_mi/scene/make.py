@@ -14,18 +14,19 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .cloud import surfaces_from_points
-from .coordinates import Up, require_fine, require_near, up_of, warn_of_up
+from .coordinates import Up, check_extent, require_fine, require_near, up_of, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
-from .mesh import SUFFIXES, planes_of_mesh, read_mesh
-from .plan import layout_walls, plan_surfaces
-from .plan_sources import PlanGrid, Row0, read_layout, read_plan
-from .points import check_extent, read_points
-from .polygon_files import FACES, LONGEST_HEADER, ply_header
+from .mesh.facets import planes_of_mesh
+from .mesh.files import SUFFIXES, read_mesh
+from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
+from .mesh.surfaces import Surface, moved, sampled
+from .plan.sources import PlanGrid, Row0, read_layout, read_plan
+from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
-from .surfaces import Surface, moved, sampled
+from .scan.cloud import surfaces_from_points
+from .scan.points import read_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -53,8 +54,8 @@ def make_scene(
     r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
-        points_file: a 3D scan (`wrf_mi.scene.points.read_points`); a plan in two dimensions
-            (`wrf_mi.scene.plan_sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
+        points_file: a 3D scan (`wrf_mi.scene.scan.points.read_points`); a plan in two dimensions
+            (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
         units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
@@ -67,7 +68,7 @@ def make_scene(
         floor_m: z of a plan's floor.
         resolution_m: side of a plan's cell; overrides that of the file.
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.
-        register_walls_of: a layout file (`wrf_mi.scene.plan_sources.read_layout`) to whose walls the scene is
+        register_walls_of: a layout file (`wrf_mi.scene.plan.sources.read_layout`) to whose walls the scene is
             registered (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
         positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
             source whose walls they cross, or that they fit better when mirrored, is refused.
@@ -98,38 +99,29 @@ def make_scene(
     file, out = Path(points_file), Path(out)
     if out.exists() and not replace:
         raise InputError(f"{out}: exists; remove it or choose another folder")
-    if isinstance(materials, str | Path):
-        materials = read_materials(materials)
     if registration is not None and register_walls_of is not None:
         raise InputError(f"{file}: registration by pairs and to walls: give one of them")
-    matrix = None if registration is None else np.asarray(registration, float)
-    if matrix is not None:
-        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
-            raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
-        rotation = matrix[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
-            raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
-    if origin_m is not None and (len(origin_m) != 3 or not np.isfinite(origin_m).all()):
-        raise InputError(f"{file}: origin {tuple(origin_m)}: give three finite numbers of metres, x, y and z")
     if up not in (None, "y", "z"):
         raise InputError(f"{file}: {up!r} is up: give y or z")
+    materials = read_materials(materials) if isinstance(materials, str | Path) else materials
+    matrix = None if registration is None else _rigid(registration)
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
-    surfaces, points, grid = _read(file, units, up, height_m, floor_m, resolution_m, row_0)
-    shift = np.eye(4) if origin_m is None else trimesh.transformations.translation_matrix(-np.asarray(origin_m, float))
-    if points is not None:
-        if matrix is None and known_walls is None:
-            require_near(trimesh.transform_points(points, shift), file)  # before minutes are spent on its planes
+    shift = _shift(file, origin_m)
+    points = grid = None
+    if is_plan(file):
+        surfaces, grid = _read_plan(file, units, up, height_m, floor_m, resolution_m, row_0)
+    elif height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
+    elif has_faces(file):
+        surfaces = _read_faces(file, units, up)
+    else:
+        points = _read_scan(file, units, up, None if matrix is not None or known_walls is not None else shift)
         surfaces = surfaces_from_points(points)
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
-    sample, counts = None, {}
-    if points is not None:
-        # Every k-th point would show the scanner's pattern.
-        chosen = np.random.default_rng(1).integers(len(points), size=min(PREVIEW_POINTS, len(points)))
-        sample, counts = trimesh.transform_points(points[chosen], motion), {"points": len(points)}
     if measured is not None:
         mirrored = reflections(surfaces, file, grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
@@ -143,14 +135,38 @@ def make_scene(
         source=str(file),
         materials=materials,
         registration=matrix,
-        points_m=sample,
-        counts=counts,
+        points_m=None if points is None else trimesh.transform_points(_sample(points), motion),
+        counts={} if points is None else {"points": len(points)},
         replace=replace,
     )
     return read_scene_folder(out)
 
 
-def _read(
+def _shift(file: Path, origin_m: Sequence[float] | None) -> FloatArray:
+    """Matrix [4, 4] that makes a point the origin."""
+    origin = np.zeros(3) if origin_m is None else np.asarray(origin_m, float)
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise InputError(f"{file}: origin {tuple(origin.tolist())}: give three finite numbers of metres, x, y and z")
+    return np.asarray(trimesh.transformations.translation_matrix(-origin))
+
+
+def _rigid(registration: ArrayLike) -> FloatArray:
+    """A rigid motion [4, 4]; `InputError` for another matrix."""
+    matrix = np.asarray(registration, float)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise InputError(f"registration: give a 4 x 4 matrix with the last row 0 0 0 1, not shape {matrix.shape}")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
+        raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
+    return matrix
+
+
+def _sample(points_m: FloatArray) -> FloatArray:
+    """Points of a scan for the preview; every k-th point would show the scanner's pattern."""
+    return points_m[np.random.default_rng(1).integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
+
+
+def _read_plan(
     file: Path,
     units: str,
     up: Up | None,
@@ -158,35 +174,40 @@ def _read(
     floor_m: float,
     resolution_m: float | None,
     row_0: Row0 | None,
-) -> tuple[list[Surface], FloatArray | None, PlanGrid | None]:
-    """The surfaces of a plan or mesh, the points of a scan, and the cells of an occupancy grid."""
-    if is_plan(file):
-        if file.suffix.lower() == ".csv" and _has_heights(file):
-            text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
-            raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
-        if height_m is None:
-            raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
-        if units != "m":
-            raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
-        if up is not None:
-            raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
-        plan = read_plan(file, resolution_m, row_0)
-        walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
-        return walls, None, plan if isinstance(plan, PlanGrid) else None
-    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
-        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
-    if has_faces(file):
-        surfaces = read_mesh(file, units, up)
-        if up is None:
-            triangles_m = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
-            warn_of_up(sampled(triangles_m), file, up_of(file, up))
-        return planes_of_mesh(surfaces), None, None
+) -> tuple[list[Surface], PlanGrid | None]:
+    """The surfaces of a plan, and the cells of an occupancy grid."""
+    if file.suffix.lower() == ".csv" and _has_heights(file):
+        text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
+        raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
+    if height_m is None:
+        raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
+    if units != "m":
+        raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
+    if up is not None:
+        raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
+    plan = read_plan(file, resolution_m, row_0)
+    walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
+    return walls, plan if isinstance(plan, PlanGrid) else None
+
+
+def _read_faces(file: Path, units: str, up: Up | None) -> list[Surface]:
+    surfaces = read_mesh(file, units, up)
+    if up is None:
+        triangles_m = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+        warn_of_up(sampled(triangles_m), file, up_of(file, up))
+    return planes_of_mesh(surfaces)
+
+
+def _read_scan(file: Path, units: str, up: Up | None, motion: FloatArray | None) -> FloatArray:
+    """Points [n, 3] of a scan, refused where the motion [4, 4] to the scene, if it is known, leaves them far away."""
     points = read_points(file, units, up)
     check_extent(points, file)
     require_fine(points, file)
     if up is None:
         warn_of_up(points, file, up_of(file, up))
-    return [], points, None
+    if motion is not None:
+        require_near(trimesh.transform_points(points, motion), file)  # before minutes are spent on its planes
+    return points
 
 
 def is_plan(path: str | Path) -> bool:
@@ -212,14 +233,9 @@ def _has_heights(file: Path) -> bool:
     try:
         with file.open(encoding="utf-8-sig") as stream:
             row = re.split(r"[,;\s]+", stream.readline().strip().lower())[:3]
+        return row == ["x", "y", "z"] or len([float(cell) for cell in row]) == 3
     except (OSError, ValueError):
-        return False  # the reader of plans raises
-    if row == ["x", "y", "z"]:
-        return True
-    try:
-        return len([float(cell) for cell in row]) == 3
-    except ValueError:
-        return False
+        return False  # the reader of plans raises, and a header of names is no row of numbers
 
 
 def has_faces(file: Path) -> bool:

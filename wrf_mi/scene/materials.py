@@ -30,7 +30,7 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 from ..core import InputError
 from ..core.yaml_files import read_yaml
 from ..datasets.folder_files import SINGLE_MAX, shown
-from .surfaces import KINDS
+from .mesh.surfaces import KINDS
 
 FILE = "materials.yml"
 KEYS = ("rules", "surfaces", "thickness_m", "constants")
@@ -115,23 +115,22 @@ def read_materials(path: str | Path) -> Materials:
 
     for name, values in parts["constants"].items():
         _check_constants(file, name, values)
-    own = tuple(parts["constants"])
-
-    def check(material: Any, where: str, also: Sequence[str] = own) -> None:
-        if material not in (*also, *KNOWN):
-            known = ", ".join([*also, *KNOWN])
-            raise InputError(f"{file}: {where}: unknown material {shown(material)}; known are {known}")
-
+    known = (*parts["constants"], *KNOWN)
     for kind, material in parts["rules"].items():
         if kind not in KINDS:
             raise InputError(f"{file}: rules: no kind {kind!r}; known are {', '.join(KINDS)}")
-        check(material, f"rules: {kind}")
+        _check_material(f"{file}: rules: {kind}", material, known)
     for name, entry in parts["surfaces"].items():
         if not isinstance(name, str) or not SURFACE_NAME.fullmatch(name):
             raise InputError(f"{file}: surfaces: {shown(name)} names no mesh; use letters, digits, _, - and .")
-        check(entry, f"surfaces: {name}", (*KINDS, *own))
+        _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *known))
     thicknesses(file, parts["thickness_m"])
     return Materials(**parts)
+
+
+def _check_material(where: str, material: Any, known: Sequence[str]) -> None:
+    if material not in known:
+        raise InputError(f"{where}: unknown material {shown(material)}; known are {', '.join(known)}")
 
 
 def thicknesses(file: Path, stated: Any) -> dict[str, float]:

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..datasets.folder_files import read_csv
-from .plan_sources import PlanGrid
+from .mesh.surfaces import Surface, box_of, cut_lines, moved
+from .plan.sources import PlanGrid
 from .register import best_motion, wall_points
-from .surfaces import Surface, box_of, cut_lines, moved
 
 logger = logging.getLogger(__name__)
 
@@ -91,6 +91,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
     if not level:
         return crossings, 0
     corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in level])
+    # Triangles are widened by a micrometre first: rounding leaves slits between them.
     area = shapely.buffer(shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6)), OUTSIDE_M)
     return crossings, int(np.count_nonzero(~shapely.contains_xy(area, places)))
 
@@ -108,12 +109,10 @@ def check_positions(
     """
     count = len(distinct(positions_m))
     crossings, outside = conflicts(positions_m, surfaces)
-    others = [(remedy, conflicts(positions_m, those)) for remedy, those in mirrored]
+    others = [(remedy, conflicts(positions_m, reflection)) for remedy, reflection in mirrored]
     remedy, best = min(others, key=lambda pair: sum(pair[1]))
-    text = (
-        f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions lie"
-    )
-    text += f" outside; mirrored it is {best[0]} and {best[1]}"
+    text = f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions"
+    text += f" lie outside; mirrored it is {best[0]} and {best[1]}"
     tolerated = TOLERATED + TOLERATED_SHARE * count
     if crossings + outside > 2 * sum(best) + tolerated:
         raise InputError(f"{text}: {remedy}")
@@ -148,19 +147,21 @@ def reflections(
         flips = [(axis, float(totals[axis]), remedies[axis]) for axis in (1, 0)]
     else:
         totals = box_of(surfaces).sum(axis=0)
-        flips = [(axis, 0.0, f"change the sign of its {'xy'[axis]}") for axis in (1, 0)]
-        for axis, letter in ((1, "y"), (0, "x")):
-            flips.append((axis, float(totals[axis]), f"replace its {letter} by {totals[axis]:.6g} - {letter}"))
+        axes = ((1, "y"), (0, "x"))
+        flips = [(axis, 0.0, f"change the sign of its {letter}") for axis, letter in axes]
+        flips += [
+            (axis, totals[axis], f"replace its {letter} by {totals[axis]:.6g} - {letter}") for axis, letter in axes
+        ]
     if known_walls_m is not None:
         del flips[1:]  # all reflections are the same once they are registered
-    found = []
+    scenes = []
     for axis, total, remedy in flips:
         flip = np.eye(4)
         flip[axis, axis], flip[axis, 3] = -1, total
         mirrored = moved(surfaces, flip)
         placing = motion if known_walls_m is None else best_motion(wall_points(mirrored), known_walls_m)
-        found.append((remedy, mirrored if placing is None else moved(mirrored, placing)))
-    return found
+        scenes.append((remedy, moved(mirrored, placing)))
+    return scenes
 
 
 def distinct(positions_m: FloatArray) -> FloatArray:

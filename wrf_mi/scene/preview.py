@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.paths import Paths
-from .surfaces import Surface, box_of, cut_lines
+from .mesh.surfaces import Surface, box_of, cut_lines
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
@@ -173,13 +173,10 @@ def _coloured(figure: Figure, strength: FloatArray, colours: str, label: str, al
     return shades.to_rgba(strength, alpha=alpha)
 
 
-def _unit_normals(corners: FloatArray) -> FloatArray:
-    normal = trimesh.triangles.cross(corners)
-    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12))
-
-
-def _level(normal: FloatArray) -> NDArray[np.bool_]:
-    return np.abs(normal[:, 2]) > 0.9
+def _normals(corners: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Unit normals [f, 3] of triangles, zero for those without an area, and which triangles are level."""
+    normals = trimesh.util.unitize(trimesh.triangles.cross(corners))
+    return normals, np.abs(normals[:, 2]) > 0.9
 
 
 def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
@@ -194,7 +191,7 @@ def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArra
         return np.full(len(surface.faces), surface.kind == "ceiling")
     corners = surface.vertices_m[surface.faces]
     high_up = corners[..., 2].mean(axis=1) > low[2] + TOP * (high[2] - low[2])
-    return _level(_unit_normals(corners)) & high_up
+    return _normals(corners)[1] & high_up
 
 
 def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
@@ -207,11 +204,11 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
     if len(surface.faces) > MOST_OUTLINED:
         return np.empty((0, 2, 3))
     edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)
-    found = edges[trimesh.grouping.group_rows(edges, require_count=1)]
+    outer = edges[trimesh.grouping.group_rows(edges, require_count=1)]
     if creases:
         mesh = surface.mesh
-        found = np.concatenate([found, mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_RAD]])
-    return np.asarray(surface.vertices_m[found], float).reshape(-1, 2, 3)
+        outer = np.concatenate([outer, mesh.face_adjacency_edges[mesh.face_adjacency_angles > CREASE_RAD]])
+    return np.asarray(surface.vertices_m[outer], float).reshape(-1, 2, 3)
 
 
 def _draw_slant(
@@ -225,8 +222,8 @@ def _draw_slant(
         if surface.kind == "ceiling":
             continue
         corners = surface.vertices_m[surface.faces]
-        normal, centre = _unit_normals(corners), corners.mean(axis=1)
-        level, kept = _level(normal), ~ceiling_faces(surface, low, high)
+        (normal, level), centre = _normals(corners), corners.mean(axis=1)
+        drawn_faces = ~ceiling_faces(surface, low, high)
         light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
         if surface.kind == "floor":
             front = np.zeros(len(corners), bool)
@@ -236,8 +233,8 @@ def _draw_slant(
             front = (place - middle)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
         shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
         faces, rgba = drawn[surface.kind != "floor"]
-        faces.append(corners[kept])
-        rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[kept])
+        faces.append(corners[drawn_faces])
+        rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[drawn_faces])
     for order, (corners, shades) in enumerate(([np.concatenate(part) for part in pair] for pair in drawn), start=1):
         if len(largest := np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]):
             flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}

@@ -10,14 +10,15 @@ import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage, optimize, signal
 from scipy.spatial import cKDTree
-from skimage.transform import estimate_transform
+from skimage.transform import EuclideanTransform, estimate_transform
+from trimesh.transformations import planar_matrix_to_3D
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.folder_files import read_columns
-from .plan_lines import rotation_2d
-from .surfaces import Surface
+from .mesh.surfaces import Surface
+from .plan.lines import rotation_2d
 
 LEAST_AGREEMENT = 0.5
 """Least agreement of a fit. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""
@@ -93,15 +94,12 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             better = f"lengths times {similar.scale:.3f} would fit better ({scaled:.2f} m rms)"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
-    return _motion(rigid.params[:dimension, :dimension], rigid.params[:dimension, dimension])
+    return np.asarray(rigid.params if dimension == 3 else planar_matrix_to_3D(rigid.params))
 
 
-def _motion(rotation: FloatArray, shift: FloatArray) -> FloatArray:
-    """Matrix [4, 4] of a rotation [n, n] and a shift [n], n = 2 or 3."""
-    n = len(shift)
-    matrix = np.eye(4)
-    matrix[:n, :n], matrix[:n, 3] = rotation, shift
-    return matrix
+def _motion(pose: FloatArray) -> FloatArray:
+    """Matrix [4, 4] of a pose (x, y, angle)."""
+    return np.asarray(planar_matrix_to_3D(EuclideanTransform(rotation=pose[2], translation=pose[:2]).params))
 
 
 def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
@@ -110,24 +108,23 @@ def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
     Raises:
         InputError: there is no wall.
     """
-    pieces: list[FloatArray] = []
+    walls = []
     for surface in surfaces:
-        if surface.kind != "wall":
-            continue
-        xy = surface.vertices_m[:, :2]
-        middle = xy.mean(axis=0)
-        along = np.linalg.svd(xy - middle, full_matrices=False)[2][0]
-        reach = (xy - middle) @ along
-        pieces.append(np.stack([middle + reach.min() * along, middle + reach.max() * along]))
-    if not pieces:
+        if surface.kind == "wall":
+            xy = surface.vertices_m[:, :2]
+            middle = xy.mean(axis=0)
+            along = np.linalg.svd(xy - middle, full_matrices=False)[2][0]
+            reach = (xy - middle) @ along
+            walls.append(middle + np.array([[reach.min()], [reach.max()]]) * along)
+    if not walls:
         raise InputError("registration to walls: the scene has no wall; register by pairs of points")
-    return sample_walls(np.array(pieces))
+    return sample_walls(np.array(walls))
 
 
 def best_motion(points_m: FloatArray, walls_m: FloatArray) -> FloatArray:
     """The turn about z and shift [4, 4] in which points [n, 2] fit walls [m, 2, 2] best, however badly."""
     pose, _ = _find_poses(points_m, walls_m)[0]
-    return _motion(rotation_2d(pose[2]), pose[:2])
+    return _motion(pose)
 
 
 def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene") -> FloatArray:
@@ -149,14 +146,14 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     if len(points) < 3 or not len(walls):
         raise InputError(f"{name}: registration to walls needs points and walls, got {len(points)} and {len(walls)}")
     points = points[:: -(-len(points) // MOST_POINTS)]
-    fits = _find_poses(points, walls)
-    pose, score = fits[0]
+    (pose, score), *others = _find_poses(points, walls)
     _, mirrored = _find_poses(points * [-1, 1], walls)[0]
     if mirrored > max(score + CLEAR_LEAD, LEAST_AGREEMENT):
-        raise InputError(
-            f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
+        text = f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
+        text += (
             "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
+        raise InputError(text)
     if score < LEAST_AGREEMENT:
         scale, agreement = best_scale(points, pose, walls)
         share = np.mean(distance_to_walls(_moved(points, pose), walls) <= NEAR_M)
@@ -167,14 +164,13 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
             raise InputError(f"{text}; {better}: check resolution and units, or give pairs")
         remedy = "check that the walls are of this place, and its units, or give pairs"
         raise InputError(f"{text}, and slightly other lengths fit no better: {remedy}")
-    for other, other_score in fits[1:]:
+    for other, other_score in others:
         apart = np.linalg.norm(_moved(points, pose) - _moved(points, other), axis=1)
         if np.sqrt(np.mean(apart**2)) > SAME_M and other_score > score - CLEAR_LEAD:
             turn = np.degrees(other[2] - pose[2]) % 360
-            raise InputError(
-                f"{name}: two poses fit the walls alike, {turn:.0f} degrees apart; give pairs of points instead"
-            )
-    return _motion(rotation_2d(pose[2]), pose[:2])
+            text = f"two poses fit the walls alike, {turn:.0f} degrees apart"
+            raise InputError(f"{name}: {text}; give pairs of points instead")
+    return _motion(pose)
 
 
 def sample_walls(walls_m: ArrayLike, step_m: float = SAMPLE_M) -> FloatArray:
@@ -211,8 +207,8 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
         for width in (cell + radius * np.pi / TURNS, NEAR_M / 2):
             pose = optimize.least_squares(misfit, pose, loss="cauchy", f_scale=width, max_nfev=30).x
         # The pose for the points themselves: R (x - middle) + t = R x + (t - R middle).
-        whole = np.append(pose[:2] - rotation_2d(pose[2]) @ middle, pose[2])
-        fits.append((whole, _agreement(_moved(centred, pose), targets, walls)))
+        about_origin = np.append(pose[:2] - rotation_2d(pose[2]) @ middle, pose[2])
+        fits.append((about_origin, _agreement(_moved(centred, pose), targets, walls)))
     return sorted(fits, key=lambda fit: -fit[1])
 
 
@@ -220,9 +216,9 @@ def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> fl
     """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows, each point
     weighted by exp(-(d / 0.1 m)^2 / 2).
     """
-    there = np.exp(-0.5 * (distance_to_walls(placed, walls) / (NEAR_M / 2)) ** 2)
-    back = np.exp(-0.5 * (cKDTree(placed).query(targets)[0] / (NEAR_M / 2)) ** 2)
-    return float((there.mean() + back.mean()) / 2)
+    to_walls, to_points = distance_to_walls(placed, walls), cKDTree(placed).query(targets)[0]
+    near, shown = (np.exp(-0.5 * (away / (NEAR_M / 2)) ** 2) for away in (to_walls, to_points))
+    return float((near.mean() + shown.mean()) / 2)
 
 
 def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[FloatArray]:
@@ -232,17 +228,18 @@ def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[Float
     shape = np.ceil((targets.max(axis=0) + 2 * radius - low) / cell).astype(int) + 1
     half = int(np.ceil(radius / cell))
     wall_image = ndimage.gaussian_filter(_image((targets - low) / cell, shape), 2.0)
-    found: list[tuple[float, FloatArray]] = []
+    peaks: list[tuple[float, FloatArray]] = []
     for angle in np.arange(TURNS) * (2 * np.pi / TURNS):
         kernel = _image(centred @ rotation_2d(angle).T / cell + half, np.array([2 * half + 1] * 2))
+        # A convolution with the reversed picture is the correlation with it.
         match = signal.fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
         for _ in range(PEAKS):
             peak = np.array(np.unravel_index(np.argmax(match), match.shape))
-            found.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))
+            peaks.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))
             match[tuple(slice(max(0, p - APART_CELLS), p + APART_CELLS + 1) for p in peak)] = 0
-    found.sort(key=lambda f: -f[0])
+    peaks.sort(key=lambda peak: -peak[0])
     starts: list[FloatArray] = []
-    for _, pose in found:
+    for _, pose in peaks:
         turn = [abs((pose[2] - s[2] + np.pi) % (2 * np.pi) - np.pi) for s in starts]
         shift = [np.linalg.norm(pose[:2] - s[:2]) for s in starts]
         if not any(t < APART_RAD and d < APART_CELLS * cell for t, d in zip(turn, shift, strict=True)):

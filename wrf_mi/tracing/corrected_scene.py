@@ -26,7 +26,7 @@ from ..core.types import IntArray
 from ..scene.folder import plain_name, write_scene
 from ..scene.materials import CARRIER, THICKNESS_M, Materials
 from ..scene.materials import EXPONENT as LAW
-from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
+from ..scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
 from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
 from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT

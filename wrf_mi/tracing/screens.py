@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from ..core.angles import FloatArray
-from ..scene.surfaces import shared_edges
+from ..scene.mesh.surfaces import shared_edges
 
 ENLARGED = 4e-5
 """Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are

@@ -24,7 +24,7 @@ NEAR = 1e-5
 times that within which rays do not count them (`wrf_mi.tracing.visibility.WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
 """Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
-leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
+leave which were modelled one by one, `wrf_mi.scene.mesh.surfaces.SAME_CORNER_M`."""
 PAIRS_TOGETHER = 1 << 20
 """Pairs of points and planes, or faces, in a chunk."""
 UNKNOWN_FACE = (1 << 31) - 1

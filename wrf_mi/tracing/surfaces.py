@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.angles import FloatArray
 from ..core.digest import content_digest
 from ..core.types import IntArray
-from ..scene.surfaces import bodies
+from ..scene.mesh.surfaces import bodies
 from .screens import ENLARGED, scale_m, screens
 
 COPLANAR_M = 2e-5

@@ -20,7 +20,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_gaussians
 from ..scene.coordinates import require_near
-from ..scene.points import read_points
+from ..scene.scan.points import read_points
 from ..tracing import open_scene, trace_paths
 from ..tracing.scenes import MESHES
 from ..tracing.surfaces import scene_surfaces

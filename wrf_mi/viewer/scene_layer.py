@@ -11,8 +11,8 @@ import trimesh
 
 from ..core import InputError
 from ..runs.scene_view import surfaces_of
+from ..scene.mesh.surfaces import Surface
 from ..scene.preview import ceiling_faces, free_edges
-from ..scene.surfaces import Surface
 from ..tracing import open_scene
 from ..tracing.scenes import MESHES
 from .content import MaterialMesh, SceneContent

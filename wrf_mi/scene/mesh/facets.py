@@ -1,0 +1,204 @@
+"""Meshes of others (CAD, photogrammetry), checked, and split into floor, ceiling, walls and the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import permutations
+
+import numpy as np
+import shapely
+import trimesh
+
+from ...core.angles import FloatArray
+from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
+from .surfaces import KINDS, Kind, Surface, number_names
+from .surfaces import bodies as connected_bodies
+
+FLAT_M = 0.01
+"""Largest distance of the vertices of a facet's triangles from its plane."""
+PARALLEL = np.cos(np.radians(2))
+SMALLEST_M2 = 0.05
+"""Least area of a facet that bounds a room."""
+MOST_FACETS = 400
+"""Facets of a body; the rest of a curved or measured surface stays as it is."""
+INSIDE_M = 0.01
+REACHES = 0.95
+"""Least share of the room's height of a solid that is part of the building: a column, a partition."""
+LAYERS_M = 0.5
+"""Largest distance between both faces of a floor or roof."""
+
+
+@dataclass(frozen=True)
+class _Body:
+    """Triangles [f, 3, 3] that are connected by their edges, see `wrf_mi.scene.mesh.surfaces.bodies`."""
+
+    corners_m: FloatArray
+    closed: bool
+    volume_m3: float
+
+    @cached_property
+    def bounds_m(self) -> FloatArray:
+        """Lowest and highest coordinates, shape [2, 3]."""
+        return _bounds(self.corners_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Facet(Face):
+    """A flat part of a body: its triangles, the number of the body, and which of the body's triangles they are."""
+
+    corners_m: FloatArray
+    body: int
+    rows: Mask
+
+
+def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
+    """The surfaces of a mesh split into floors, ceilings, walls and the rest.
+
+    The roles are those of planes in a scan (`wrf_mi.scene.mesh.planes.kinds`). A closed body within another body, such
+    as a cupboard, is furniture unless it reaches from floor to ceiling. The direction of normals has no influence,
+    except that a closed body with inward normals within a body with outward normals, clear of its floor and ceiling,
+    is a cavity: a room in a solid building.
+
+    Args:
+        surfaces: surfaces of a mesh, z upwards, metres.
+
+    Returns:
+        Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.
+    """
+    triangles = [surface.vertices_m[surface.faces] for surface in surfaces]
+    bodies = [
+        _Body(corners[faces], closed, volume_m3)
+        for corners in triangles
+        for faces, closed, volume_m3 in connected_bodies(corners)
+    ]
+    facets = _room_facets(bodies)
+    if not facets:
+        return list(surfaces)
+    low, high = _bounds(np.concatenate([facet.corners_m for facet in facets]))[:, 2]
+    roles = _same_on_both_sides(facets, kinds(facets, float(low + high) / 2))
+    parts: list[tuple[Kind, FloatArray]] = []
+    without_role = [np.ones(len(body.corners_m), bool) for body in bodies]
+    for role, facet in zip(roles, facets, strict=True):
+        if role != "other":
+            parts.append((role, facet.corners_m))
+            without_role[facet.body] &= ~facet.rows
+    if not parts:
+        return list(surfaces)
+    parts += [("other", body.corners_m[rows]) for body, rows in zip(bodies, without_role, strict=True) if rows.any()]
+    parts.sort(key=lambda part: (KINDS.index(part[0]), -trimesh.triangles.area(part[1]).sum()))
+    split = []
+    for name, (kind, corners) in zip(number_names([kind for kind, _ in parts]), parts, strict=True):
+        vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+        split.append(Surface(name, kind, vertices, faces.reshape(-1, 3)))
+    return split
+
+
+def _room_facets(bodies: Sequence[_Body]) -> list[_Facet]:
+    """Facets that may be floors, ceilings and walls: sheets and slabs, and flat parts of bodies that bound rooms."""
+    slabs = {index: slab for index, body in enumerate(bodies) if (slab := _slab(body, index))}
+    others = {index: body for index, body in enumerate(bodies) if index not in slabs}
+    shell_m = [_bounds(np.concatenate([slab.corners_m for slab in slabs.values()]))] if slabs else []
+    facets = [*slabs.values()]
+    for index, body in others.items():
+        if _bounds_rooms(body, [other for other in others.values() if other is not body], shell_m):
+            facets += _facets(body, index)
+    return [facet for facet in facets if _is_large(facet)]
+
+
+def _slab(body: _Body, index: int) -> _Facet | None:
+    """A body that is a sheet or slab as one facet in its middle, or None."""
+    cross = trimesh.triangles.cross(body.corners_m)
+    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
+    normal = normal / np.linalg.norm(normal)
+    away = body.corners_m @ normal
+    if np.ptp(away) > THICKEST_M:
+        return None
+    return _facet(body, np.ones(len(away), bool), normal, float(away.min() + away.max()) / 2, index)
+
+
+def _facets(body: _Body, index: int) -> Iterator[_Facet]:
+    """Flat parts of a body, whichever way their normals point, each about the largest triangle that is left."""
+    cross = trimesh.triangles.cross(body.corners_m)
+    size = np.linalg.norm(cross, axis=-1)
+    normals = cross / size[:, None]
+    left = np.ones(len(size), bool)
+    for _ in range(MOST_FACETS):
+        if not left.any():
+            return
+        seed = int(np.argmax(np.where(left, size, 0)))
+        normal = normals[seed]
+        offset = float(body.corners_m[seed].mean(axis=0) @ normal)
+        inside = left & (np.abs(normals @ normal) > PARALLEL)
+        inside[inside] = (np.abs(body.corners_m[inside] @ normal - offset) < FLAT_M).all(axis=-1)
+        inside[seed] = True  # rounding may put a large triangle's corners out of its own plane
+        left &= ~inside
+        yield _facet(body, inside, normal, offset, index)
+
+
+def _facet(body: _Body, rows: Mask, normal: FloatArray, offset_m: float, index: int) -> _Facet:
+    corners = body.corners_m[rows]
+    plane = with_axes(Plane(normal, offset_m, corners[:, [0, 1, 2, 2]], corners.mean(axis=(0, 1)), 0.0))
+    flat = shapely.polygons(plane.flat(corners))
+    # Triangles seen along their plane have no area, and would make the union invalid.
+    return _Facet(plane, shapely.union_all(flat[shapely.area(flat) > 1e-8]), corners, index, rows)
+
+
+def _is_large(facet: _Facet) -> bool:
+    """Whether a facet may bound a room: neither small, nor upright and low as the sides of furniture are."""
+    low = facet.slope < UPRIGHT and np.ptp(facet.corners_m[..., 2]) < WALL_SHARE * STOREY_M
+    return facet.area.area >= SMALLEST_M2 and not low
+
+
+def _bounds_rooms(body: _Body, others: Sequence[_Body], shell_m: Sequence[FloatArray]) -> bool:
+    """Whether the facets of a body may be floors, ceilings and walls.
+
+    ``others`` are the other bodies but for slabs, and ``shell_m`` the bounds [2, 3] of all slabs, if there are any.
+    """
+    if not body.closed:
+        return True
+    height_m = np.ptp(body.bounds_m[:, 2])
+    if height_m < STOREY_M:
+        return False
+    around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
+    if any(_is_cavity(body, other) for other in around):
+        return True
+    outer_m = [other.bounds_m for other in around] + [bounds for bounds in shell_m if _within(body.bounds_m, bounds)]
+    return all(height_m >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer_m)
+
+
+def _is_cavity(body: _Body, outer: _Body) -> bool:
+    """Whether a body is a room in a solid around it: normals face each other, and it is clear of floor and ceiling."""
+    (low, high), (floor, ceiling) = body.bounds_m[:, 2], outer.bounds_m[:, 2]
+    clear = low > floor + INSIDE_M and high < ceiling - INSIDE_M  # furniture stands on the floor
+    return bool(outer.closed and body.volume_m3 < 0 < outer.volume_m3 and clear)
+
+
+def _bounds(corners_m: FloatArray) -> FloatArray:
+    """Lowest and highest coordinates [2, 3] of triangles [f, 3, 3]."""
+    return np.stack([corners_m.min(axis=(0, 1)), corners_m.max(axis=(0, 1))])
+
+
+def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:
+    """Whether a box [2, 3] lies within a larger one."""
+    inside = (inner_m[0] > outer_m[0] - INSIDE_M).all() and (inner_m[1] < outer_m[1] + INSIDE_M).all()
+    return bool(inside and np.prod(np.ptp(inner_m, axis=0)) < 0.99 * np.prod(np.ptp(outer_m, axis=0)))
+
+
+def _same_on_both_sides(faces: Sequence[Face], roles: Sequence[Kind]) -> list[Kind]:
+    """Roles with both faces of a floor or roof given the same role; a scan sees only one face."""
+    same = list(roles)
+    height = [float(np.mean(face.span_m)) for face in faces]
+    level = [i for i, face in enumerate(faces) if face.slope > PARALLEL]
+    least_m2 = least_level_area([faces[i] for i in level])
+    highest_m = max((height[i] for i in level if roles[i] == "ceiling"), default=-np.inf)
+    for i, j in permutations(level, 2):
+        apart_m = abs(height[i] - height[j])
+        if faces[i].area.area < least_m2 or apart_m > LAYERS_M or not faces[i].overlaps(faces[j], 0.5):
+            continue
+        # A floor just above a ceiling, without a ceiling over it, is the upper face of a roof.
+        is_roof = roles[i] == "floor" and roles[j] == "ceiling" and height[i] > height[j]
+        if (roles[i] == "other" and roles[j] != "other") or (is_roof and highest_m <= height[i] + STOREY_M):
+            same[i] = roles[j]
+    return same

@@ -1,0 +1,239 @@
+"""Extents of planes: areas with holes that their points cover, with shadows filled and corners closed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy import ndimage
+from shapely import affinity
+
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from .planes import Mask, Plane
+from .surfaces import Kind
+
+CELL_RANGE_M = (0.04, 0.25)
+POINTS_PER_CELL = 8
+"""Number of points in the cells of the sparse fifth of the area, which sets the cells' size."""
+SHARE = 0.2
+"""Least number of points of an occupied cell, relative to those around it: half of the last cell is on the plane."""
+EDGE_SHARE = 0.3
+"""Share of a cell by which an edge is found too far out: a last cell filled to a share x of `SHARE` to 1 counts, and
+the mean of 1 - x times its chance is 0.32."""
+AROUND_CELLS = 5
+CLOSED_CELLS = 1
+"""Gaps of up to twice this many cells are noise."""
+STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
+"""A stray part of an area is smaller than this share of the whole and sparser than this share."""
+SMALL_HOLE_M2 = 0.1
+SMALLEST_M2 = 0.04
+RECTANGLE_SHARE = 0.88
+"""Least share of its tightest rectangle that a rectangular area fills."""
+SCAN_LINES = 31
+SHADOW_CELL_M = 0.1
+BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
+"""Largest distance from a surface of what hides it: cupboards; tables and lamps."""
+HIDDEN_SHARE = 0.5
+"""Least share of a gap before which something stands, for the gap to be filled."""
+SMALLEST_GAP_M2 = 0.02
+STEEPEST = np.cos(np.radians(20))
+"""Planes that meet at a smaller angle have no reliable line in common."""
+GRID_M = 1e-5
+PASSES = 2
+"""Number of passes over all pairs of planes; the second pass closes the corner of three planes."""
+
+
+def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
+    """The area (shapely, in the plane's coordinates) that points [n, 3] of a plane cover, and the edge of its cells."""
+    flat = plane.flat(points_m).astype(float)
+    coarse = 0.1
+    _, number = np.unique(np.floor(flat / coarse).astype(int), axis=0, return_counts=True)
+    # Cells with a single point are strays; the sparse fifth, far from the scanner, sets the size of cells.
+    sparse = np.quantile(number[number > 1], 0.2) if (number > 1).any() else 1.0
+    cell = float(np.clip(coarse * np.sqrt(POINTS_PER_CELL / sparse), *CELL_RANGE_M))
+    low = flat.min(axis=0) - (CLOSED_CELLS + 2) * cell
+    bins = np.ceil((flat.max(axis=0) - low) / cell).astype(int) + CLOSED_CELLS + 2
+    index = ((flat - low) / cell).astype(int)
+    count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
+    mask = _covered(count, cell)
+    # One rectangle for each run of marked cells.
+    steps = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(steps == 1)
+    _, stop = np.nonzero(steps == -1)
+    x, y0, y1 = low[0] + row * cell, low[1] + start * cell, low[1] + stop * cell
+    area = shapely.union_all(shapely.box(x, y0, x + cell, y1), grid_size=cell * 1e-3)
+    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
+    # Edges are moved inwards because a cell that the edge crosses counts as a whole.
+    return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
+
+
+def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
+    """The area of a floor, ceiling or wall with its shadows filled: gaps before which things stand.
+
+    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. ``points_m`` [n,
+    3] are those of things alone: floors, ceilings and walls are seen through a gap and do not hide it.
+    """
+    if kind == "other":
+        return area
+    distance = np.abs(plane.distance(points_m))
+    before = (distance > max(0.05, 4 * noise_m)) & (distance < BEFORE_M[kind])
+    flat = plane.flat(points_m[before])
+    filled = [area]
+    for gap in polygons(shapely.difference(shapely.envelope(area), area)):
+        if gap.area < SMALLEST_GAP_M2:
+            continue
+        inside = flat[shapely.contains_xy(gap, flat)]
+        cells = len(np.unique(np.floor(inside / SHADOW_CELL_M), axis=0))
+        if cells * SHADOW_CELL_M**2 >= HIDDEN_SHARE * gap.area:
+            filled.append(gap)
+    return shapely.union_all(filled, grid_size=GRID_M)
+
+
+def polygons(area: Any) -> list[Any]:
+    """The polygons of an area, the largest first."""
+    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and not part.is_empty]
+    return sorted(parts, key=lambda part: -part.area)
+
+
+def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]) -> list[Any]:
+    """Extend or cut areas to the lines where their planes meet.
+
+    Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
+    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
+    coordinates of their planes.
+    """
+    areas = list(areas)
+    corners = [_corners(plane, area) for plane, area in zip(planes, areas, strict=True)]
+    for _ in range(PASSES):
+        for i, a in enumerate(planes):
+            for j, b in enumerate(planes):
+                reach = min(reach_m[i], reach_m[j])
+                if i == j or abs(a.normal @ b.normal) >= STEEPEST or _beside(b, corners[i], reach):
+                    continue
+                if _beside(a, corners[j], reach):
+                    continue
+                areas[i] = _end_at(a, areas[i], b, areas[j], reach)
+                corners[i] = _corners(a, areas[i])
+    return areas
+
+
+def _corners(plane: Plane, area: Any) -> FloatArray:
+    """Corners [4, 3] of a rectangle of a plane around an area; not finite for an empty one."""
+    low_u, low_v, high_u, high_v = area.bounds
+    return plane.rectangle(np.array([low_u, low_v]), np.array([high_u, high_v]))
+
+
+def _beside(plane: Plane, corners_m: FloatArray, reach_m: float) -> bool:
+    """Whether all of a rectangle lies on one side of a plane and out of reach: no further than a line of the plane."""
+    distance = plane.distance(corners_m)
+    return bool(distance.min() > reach_m + GRID_M or distance.max() < -reach_m - GRID_M)
+
+
+def _end_at(a: Plane, area: Any, b: Plane, other: Any, reach: float) -> Any:
+    along = np.cross(a.normal, b.normal)
+    along /= np.linalg.norm(along)
+    point = np.linalg.solve(np.stack([a.normal, b.normal, along]), np.array([a.offset_m, b.offset_m, 0.0]))
+
+    def to_line(plane: Plane) -> tuple[FloatArray, FloatArray]:
+        """Transform to coordinates (t, s): t along the line, s away from it."""
+        rows = np.stack([along, np.cross(plane.normal, along)])
+        return rows @ np.stack([plane.u, plane.v], axis=1), rows @ (plane.normal * plane.offset_m - point)
+
+    matrix, shift = to_line(a)
+    turned, other_turned = _transformed(area, matrix, shift), _transformed(other, *to_line(b))
+    stretches = shapely.intersection(
+        shapely.buffer(_stretches(other_turned, reach), reach, cap_style="square"), _stretches(turned, reach)
+    )
+    changed = turned
+    for stretch in polygons(stretches):
+        t0, _, t1, _ = stretch.bounds
+        if t1 - t0 < reach:
+            continue
+        # An area that reaches both sides of the line goes through, one that reaches one side ends there.
+        share = [
+            shapely.intersection(turned, shapely.box(t0, s, t1, s + reach)).area / (reach * (t1 - t0))
+            for s in (reach, -2 * reach)
+        ]
+        if (share[0] > 0.25) == (share[1] > 0.25):
+            continue
+        sign = 1 if share[0] > share[1] else -1
+        # The parts of the strip beside the line that the area comes near are filled up to the line.
+        near = [part.bounds for part in polygons(shapely.intersection(turned, _box(t0, t1, 0, sign * reach)))]
+        fill = [_box(max(s[0], t0), min(s[2], t1), 0, sign * max(abs(s[1]), abs(s[3]))) for s in near]
+        cut = _box(t0, t1, 0, -2 * sign * reach)
+        changed = shapely.difference(shapely.union_all([changed, *fill]), cut)
+    return area if changed is turned else _transformed(changed, matrix.T, -matrix.T @ shift)
+
+
+def _stretches(turned: Any, reach: float) -> Any:
+    """Stretches of the line that an area comes near: a union of boxes of unit height."""
+    low, _, high, _ = turned.bounds
+    strip = shapely.intersection(turned, shapely.box(low, -reach, high, reach))
+    return shapely.union_all([_box(part.bounds[0], part.bounds[2], 0, 1) for part in polygons(strip)])
+
+
+def _box(t0: float, t1: float, s0: float, s1: float) -> Any:
+    return shapely.box(t0, min(s0, s1), t1, max(s0, s1))
+
+
+def _transformed(area: Any, matrix: FloatArray, shift: FloatArray) -> Any:
+    """A transformed area on a fine grid: rounding would let edges that touch cross."""
+    return shapely.set_precision(shapely.make_valid(affinity.affine_transform(area, [*matrix.ravel(), *shift])), GRID_M)
+
+
+def triangulated(area: Any) -> tuple[FloatArray, IntArray]:
+    """Vertices [v, 2] and faces [f, 3] that fill an area (shapely)."""
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(shapely.multipolygons(polygons(area))))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]  # of a ring, whose last is its first
+    vertices, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    return vertices, faces.reshape(-1, 3)
+
+
+def large_parts(mask: Mask, cells: float, structure: NDArray[Any] | None = None) -> Mask:
+    """The connected parts of a mask that have at least a number of cells."""
+    parts, _ = ndimage.label(mask, structure)
+    return mask & (np.bincount(parts.ravel()) >= cells)[parts]
+
+
+def _covered(count: NDArray[Any], cell: float) -> Mask:
+    """Cells that a plane covers, from the number of points in each."""
+    # Cells about as full as those around them; a stray beside an edge is not.
+    # The usual number in the neighbourhood is that of a point's cell, sum n^2 / sum n, which empty cells do not lower.
+    full = count.astype(float)
+    total = ndimage.uniform_filter(full, AROUND_CELLS, mode="constant")
+    squares = ndimage.uniform_filter(full * full, AROUND_CELLS, mode="constant")
+    mask: Mask = count >= np.maximum(2, SHARE * squares / np.maximum(total, 1e-9))
+    disc = np.hypot(*np.mgrid[-CLOSED_CELLS : CLOSED_CELLS + 1, -CLOSED_CELLS : CLOSED_CELLS + 1]) <= CLOSED_CELLS + 0.5
+    mask = ndimage.binary_opening(ndimage.binary_closing(mask, disc), np.ones((2, 2), bool))
+    mask = large_parts(mask, SMALLEST_M2 / cell**2)
+    mask = ~large_parts(~mask, SMALL_HOLE_M2 / cell**2)
+    # Small sparse parts come from surfaces that cross the plane.
+    label, parts = ndimage.label(mask)
+    if parts < 2:
+        return mask
+    size = np.bincount(label.ravel())[1:]
+    density = np.bincount(label.ravel(), weights=count.ravel())[1:] / size
+    stray = (size < STRAY_SIZE * size.sum()) & (density < STRAY_DENSITY * np.median(count[mask]))
+    return mask & ~np.concatenate([[False], stray])[label]
+
+
+def _rectangle(part: Any) -> Any | None:
+    """The rectangle of a polygon that is rectangular but for noise, or None; its sides are medians of the polygon's."""
+    for tight in (shapely.envelope(part), part.minimum_rotated_rectangle):
+        if part.area < RECTANGLE_SHARE * tight.area:
+            continue
+        (x, y), (x1, y1) = tight.exterior.coords[:2]
+        angle, pivot = np.degrees(np.arctan2(y1 - y, x1 - x)), (x, y)
+        level = affinity.rotate(part, -angle, pivot)
+        left, low, right, high = level.bounds
+        rows, columns = (np.linspace(a, b, SCAN_LINES + 2)[1:-1] for a, b in ((low, high), (left, right)))
+        across = shapely.linestrings([[(left, t), (right, t)] for t in rows])
+        along = shapely.linestrings([[(t, low), (t, high)] for t in columns])
+        left, _, right, _ = np.nanmedian(shapely.bounds(shapely.intersection(level, across)), axis=0)
+        _, low, _, high = np.nanmedian(shapely.bounds(shapely.intersection(level, along)), axis=0)
+        return affinity.rotate(shapely.box(left, low, right, high), angle, pivot)
+    return None

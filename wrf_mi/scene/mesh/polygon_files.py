@@ -1,0 +1,270 @@
+"""Polygons of OBJ and PLY files, with all their corners.
+
+Other readers do not serve: trimesh cuts each polygon into a fan, and counts negative indices of OBJ from the end of the
+file, as meshio does; Assimp and OpenMesh have single precision and lose or refuse leading blanks, comments behind
+faces or continued lines; plyfile has the GPL.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+
+PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
+}
+PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+CORNERS = ("vertex_indices", "vertex_index")
+"""Names that writers of PLY give the list of a face's vertices."""
+FACES = ("face", "tristrips")
+"""Elements of PLY that make a mesh of points."""
+LONGEST_HEADER = 1 << 20
+"""Bytes in which a PLY file's header has to end."""
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Polygons of a file.
+
+    Attributes:
+        vertices: shape [v, 3], in the file's unit.
+        corners: vertex indices from 0, polygon after polygon, shape [k].
+        sizes: number of corners of each polygon, shape [n].
+        parts: number of the part that each polygon belongs to, from 0, shape [n].
+        place: where in the file a polygon is, by its number, for messages.
+    """
+
+    vertices: FloatArray
+    corners: IntArray
+    sizes: IntArray
+    parts: IntArray
+    place: Callable[[int], str]
+
+    def __post_init__(self) -> None:
+        """Refuse a polygon without three corners, or with one that is no vertex (`ValueError`)."""
+        if len(few := np.flatnonzero(self.sizes < 3)):
+            raise ValueError(f"{self.place(few[0])} has {self.sizes[few[0]]} corners; a face has three or more")
+        count = len(self.vertices)
+        if len(wrong := np.flatnonzero((self.corners < 0) | (self.corners >= count))):
+            polygon = int(np.searchsorted(np.cumsum(self.sizes), wrong[0], side="right"))
+            raise ValueError(f"a face names a vertex that is not among its {count}: {self.place(polygon)}")
+
+
+def read_obj(path: Path) -> Polygons:
+    """Polygons of a Wavefront OBJ file; faces of one material (``usemtl``) are one part.
+
+    Raises:
+        ValueError: a damaged line, by its number.
+    """
+    vertices: list[list[float]] = []
+    corners: list[int] = []
+    sizes, lines, parts = list[int](), list[int](), list[int]()
+    materials = {"": 0}
+    part = 0
+    for number, words in _obj_statements(path):
+        try:
+            match words[0]:
+                case "v":  # x y z, then perhaps a weight or a colour
+                    vertices.append([float(word) for word in words[1:4]])
+                    if len(words) < 4:
+                        raise ValueError(f"a vertex of {len(words) - 1} numbers; expected 3")
+                case "f" | "fo":  # fo: name of f in old versions
+                    corners += [_obj_index(word, len(vertices)) for word in words[1:]]
+                    sizes.append(len(words) - 1)
+                    lines.append(number)
+                    parts.append(part)
+                case "usemtl":
+                    part = materials.setdefault(" ".join(words[1:]), len(materials))
+        except ValueError as error:
+            raise ValueError(f"line {number}: {error}") from None
+    return Polygons(
+        np.array(vertices, float).reshape(-1, 3),
+        np.array(corners, np.int64),
+        np.array(sizes, np.int64),
+        np.array(parts, np.int64),
+        lambda polygon: f"line {lines[polygon]}",
+    )
+
+
+def _obj_statements(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Words of each statement that is not empty, and its first line from 1."""
+    pending, first = "", 0
+    # Universal line ends; names may be in any encoding, and are not used.
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        for number, line in enumerate(stream, 1):
+            first = first if pending else number
+            text = pending + line.partition("#")[0].rstrip()
+            pending = f"{text[:-1]} " if text.endswith("\\") else ""
+            if not pending and (words := text.split()):
+                yield first, words
+    if words := pending.split():
+        yield first, words
+
+
+def _obj_index(word: str, count: int) -> int:
+    """Vertex index from 0 of a corner such as ``3``, ``3/1/2``, ``3//2`` or ``-1``, after ``count`` vertices."""
+    text = word.partition("/")[0]
+    if not text.lstrip("+-").isdecimal():
+        raise ValueError(f"{word[:20]!r} is no number of a vertex")
+    index = int(text)
+    if index == 0:
+        raise ValueError("names vertex 0, and OBJ counts from 1; add 1 to the indices of all faces")
+    if index > 0:
+        return index - 1  # may be stated further down
+    if index < -count:  # negative indices count back from the vertex above the face
+        raise ValueError(f"names vertex {index}, and only {count} are above it")
+    return count + index
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """An element of a PLY file: its name, number of rows, and properties.
+
+    A property has a name, a NumPy type, and for a list the type of the number before it, else None.
+    """
+
+    name: str
+    count: int
+    properties: list[tuple[str, str, str | None]]
+
+
+def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
+    """Elements of a PLY file, its byte order (``<``, ``>``, or empty for text), and where its body begins.
+
+    Raises:
+        ValueError: no header of a PLY file.
+    """
+    # The line end may be LF, CR LF or CR; of binary data none may be taken for a part of it.
+    begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\n|\r)", content)
+    end = begin and re.compile(rb"end_header[ \t]*" + begin[1]).search(content[:LONGEST_HEADER])
+    if not begin or not end:
+        raise ValueError("no header of a PLY file, or none that ends")
+    order, elements = None, list[PlyElement]()
+    for line in content[begin.end() : end.start()].decode("utf-8", errors="replace").split(begin[1].decode()):
+        match line.split():
+            case ["format", form, _] if form in PLY_ORDERS:
+                order = PLY_ORDERS[form]
+            case ["element", name, count] if count.isdecimal():
+                elements.append(PlyElement(name, int(count), []))
+            case ["property", "list", count, kind, name] if elements and {count, kind} <= set(PLY_TYPES):
+                elements[-1].properties.append((name, PLY_TYPES[kind], PLY_TYPES[count]))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1].properties.append((name, PLY_TYPES[kind], None))
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"line {line[:60]!r} of the header is none of PLY")
+    if order is None:
+        raise ValueError("no known format in the header")
+    return elements, order, end.end()
+
+
+def read_ply(path: Path) -> Polygons:
+    """Polygons of a PLY file as one part.
+
+    Raises:
+        ValueError: a damaged file, or one without vertices.
+
+    Source: G. Turk, "The PLY polygon file format" (1994).
+    """
+    content = path.read_bytes()
+    elements, order, at = ply_header(content)
+    body, columns = content[at:], dict[str, dict[str, Any]]()
+    if not order:
+        # Numbers of text as one binary table, so that both are cut into rows by the same code.
+        body = np.fromstring(body.strip(), float, sep=" ").tobytes()
+        elements = [
+            PlyElement(e.name, e.count, [(name, "f8", count and "f8") for name, _, count in e.properties])
+            for e in elements
+        ]
+    at = 0
+    for element in elements:
+        columns[element.name], at = _ply_columns(body, at, element, order or "=")
+    vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    if not {"x", "y", "z"} <= set(vertex):
+        raise ValueError("no vertices with x, y and z in it")
+    if any(element.name == "tristrips" and element.count for element in elements):
+        raise ValueError("its faces are triangle strips; store them as faces")
+    vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(float)
+    lists = next((face[name] for name in CORNERS if name in face), None)
+    if face and lists is None:
+        raise ValueError(f"faces without a list {' or '.join(CORNERS)}")
+    corners, sizes = lists or (np.empty(0), np.empty(0))
+    return Polygons(
+        vertices,
+        corners.astype(np.int64),
+        sizes.astype(np.int64),
+        np.zeros(len(sizes), np.int64),
+        lambda polygon: f"face {polygon + 1}",
+    )
+
+
+def _ply_columns(body: bytes, at: int, element: PlyElement, order: str) -> tuple[dict[str, Any], int]:
+    """Values of an element's properties by name, and where the next element begins.
+
+    A property is an array [n]; a list is its values, row after row, and the number of them in each row [n].
+    """
+    if not element.count:
+        return {}, at
+    try:
+        table = _ply_table(body, at, element, order)
+        if table is not None:
+            columns = {
+                name: (table[f"{k}"].reshape(-1), table[f"count {k}"]) if count else table[f"{k}"]
+                for k, (name, _, count) in enumerate(element.properties)
+            }
+            return columns, at + table.nbytes
+        rows = []
+        for _ in range(element.count):
+            row, at = _ply_row(body, at, element, order)
+            rows.append(row)
+    except ValueError:
+        text = f"states {element.count} of {element.name} and ends before the last; it is cut off"
+        raise ValueError(text) from None
+    columns = {}
+    for (name, _, count), column in zip(element.properties, zip(*rows, strict=True), strict=True):
+        joined = np.concatenate(column)
+        columns[name] = (joined, np.array([len(entries) for entries in column])) if count else joined
+    return columns, at
+
+
+def _ply_table(body: bytes, at: int, element: PlyElement, order: str) -> NDArray[Any] | None:
+    """Rows of an element whose lists all have the length of the first row's, as most have; else None."""
+    first, _ = _ply_row(body, at, element, order)
+    fields: list[tuple[Any, ...]] = []  # by number: names may come twice
+    for k, (entries, (_, kind, count)) in enumerate(zip(first, element.properties, strict=True)):
+        fields += [(f"count {k}", order + count)] if count else []
+        fields.append((f"{k}", order + kind, (len(entries),) if count else ()))
+    row = np.dtype(fields)
+    if at + row.itemsize * element.count > len(body):
+        return None
+    table = np.frombuffer(body, row, element.count, at)
+    lists = [k for k, (_, _, count) in enumerate(element.properties) if count]
+    return table if all((table[f"count {k}"] == len(first[k])).all() for k in lists) else None
+
+
+def _ply_row(body: bytes, at: int, element: PlyElement, order: str) -> tuple[list[NDArray[Any]], int]:
+    """Entries of each property in the row at a place, and where the next row begins; `ValueError` past the end."""
+    row = []
+    for _, kind, count in element.properties:
+        length = 1
+        if count:
+            length = int(np.frombuffer(body, order + count, 1, at)[0])
+            at += np.dtype(count).itemsize
+        if length < 0:
+            raise ValueError
+        entries = np.frombuffer(body, order + kind, length, at) if length else np.empty(0, order + kind)
+        at += entries.nbytes
+        row.append(entries)
+    return row, at

@@ -1,0 +1,158 @@
+"""Straight runs of occupied cells, the pieces of a plan's walls.
+
+The plan is turned so that the direction of most walls is axis-parallel, and runs are taken greedily, the best supported
+first, along rows and columns. A run is as wide as the blur of the map, so that a thick smear gives a single wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.transform import hough_line
+
+from ...core.angles import FloatArray
+from ..mesh.outline import large_parts
+from .sources import Mask, PlanGrid
+
+HALF_WIDTH_M = 0.1
+"""Largest distance of cells that support a line: half the width of a blurred wall."""
+CLEARED_M = 0.2
+"""Largest distance of cells that are explained by a run; they support no other run along the same stretch."""
+LARGEST_HOLE_M = 0.25
+"""Largest hole in a run, narrower than any door."""
+SHORTEST_RUN_M = 0.4
+"""Least length of a run; shorter pieces may be clutter."""
+FILLED = 0.6
+"""Least share of a run's length that holds occupied cells."""
+LARGEST_RISE_M = 0.2
+"""Cells that rise by more across a run climb through its window: a wall of another direction."""
+SMALLEST_BLOB_CELLS = 4
+"""Least number of connected occupied cells; fewer are stray returns."""
+SMALLEST_ROOM_M2 = 1.0
+"""Least area of a room; smaller free areas are gaps that beams went through."""
+PEAK = 0.1
+"""Share of the range of the sharpness, from the top, that counts as its peak."""
+DIRECTION_STEP_RAD = np.radians(0.25)
+ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
+
+
+@dataclass(frozen=True)
+class Run:
+    """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1)."""
+
+    axis: int
+    offset: float
+    start: float
+    end: float
+
+    @property
+    def length(self) -> float:
+        """Length, metres."""
+        return self.end - self.start
+
+    @property
+    def ends_m(self) -> FloatArray:
+        """Both ends (x, y), shape [2, 2], in the turned plan."""
+        along, across = np.array([self.start, self.end]), np.full(2, self.offset)
+        return np.stack([along, across] if self.axis == 0 else [across, along], axis=-1)
+
+
+def without_specks(grid: PlanGrid) -> PlanGrid:
+    """The grid without stray returns, and free only in rooms, not where beams pass a gap or a window."""
+    occupied = large_parts(grid.occupied, SMALLEST_BLOB_CELLS, np.ones((3, 3)))
+    free = ndimage.binary_opening(grid.free, np.ones((2, 2)))
+    return replace(grid, occupied=occupied, free=large_parts(free, SMALLEST_ROOM_M2 / grid.resolution_m**2))
+
+
+def dominant_direction(occupied: Mask) -> float:
+    """The angle in [0, pi/2) from +x, up to quarter turns, of most straight pieces of a mask [rows, columns].
+
+    There the Hough transform is sharpest: the sum of its squares over all offsets of a direction and its perpendicular
+    (Censi, Iocchi & Grisetti 2005, "Scan matching in the Hough domain"). Rows run with y.
+    """
+    # A line of direction a has its normal at a + pi/2, which is the angle of the transform.
+    quarter = np.arange(0, np.pi / 2, DIRECTION_STEP_RAD)
+    normals = np.concatenate([quarter, quarter - np.pi / 2])
+    votes, _, _ = hough_line(occupied, theta=normals)
+    sharp = np.square(votes.astype(float)).sum(axis=0).reshape(2, -1).sum(axis=0)
+    # The middle of the peak: its top is uncertain by degrees in smeared plans.
+    middle = len(quarter) // 2
+    around = np.roll(sharp, middle - int(np.argmax(sharp)))
+    weight = np.maximum(around - (sharp.max() - PEAK * np.ptp(sharp)), 0)
+    parts, _ = ndimage.label(weight > 0)
+    peak = (parts == parts[middle]) & (parts > 0)
+    off = float(np.sum((np.arange(len(around)) - middle) * weight * peak) / max(np.sum(weight * peak), 1e-12))
+    return float((int(np.argmax(sharp)) + off) * DIRECTION_STEP_RAD % (np.pi / 2))
+
+
+def turned(grid: PlanGrid, angle: float) -> PlanGrid:
+    """The grid in axes turned by an angle, with coordinates R(-angle) x: the angle's direction becomes x."""
+    rotation = rotation_2d(angle)
+    step = grid.resolution_m
+    rows, columns = grid.occupied.shape
+    corners = grid.origin_m + step * np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]])
+    low, high = (corners @ rotation).min(axis=0), (corners @ rotation).max(axis=0)
+    width, height = np.ceil((high - low) / step).astype(int)
+    # Each new cell takes the value of the old one that its centre lies in.
+    new = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1) * step + low
+    column, row = np.moveaxis(np.floor((new @ rotation.T - grid.origin_m) / step).astype(int), -1, 0)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    return PlanGrid(grid.occupied[row, column] & inside, grid.free[row, column] & inside, step, low)
+
+
+def rotation_2d(angle: float) -> FloatArray:
+    """Rotation [2, 2] by an angle from +x towards +y."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
+    """Axis-parallel runs of occupied cells of a turned grid, the best supported first."""
+    step = grid.resolution_m
+    half, rim, hole = (max(0, round(m / step)) for m in (HALF_WIDTH_M, CLEARED_M, LARGEST_HOLE_M))
+    left = np.pad(grid.occupied, half)
+    low = grid.origin_m - half * step
+    runs: list[Run] = []
+    while True:
+        best = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate((left, left.T))]
+        (score, row, begin, end), axis = max(best, key=lambda run: run[0][0])
+        if score <= 0:
+            return runs
+        image = left if axis == 0 else left.T
+        first = max(0, row - half)
+        across, along = np.nonzero(image[first : row + half + 1, begin:end])
+        rise = np.polyfit(along, across, 1)[0] * (end - begin) * step
+        if abs(rise) > LARGEST_RISE_M:
+            # The next direction may explain it.
+            image[first : row + half + 1, begin:end] = False
+            continue
+        middle = float(np.median(across)) + first
+        offset = low[1 - axis] + (middle + 0.5) * step
+        runs.append(Run(axis, offset, low[axis] + begin * step, low[axis] + end * step))
+        image[max(0, int(middle) - rim) : int(np.ceil(middle)) + rim + 1, max(0, begin - 1) : end + 1] = False
+
+
+def _best(image: Mask, half: int, hole: int, shortest: float) -> tuple[float, int, int, int]:
+    """Score, row, first and last + 1 column of the best run along the rows of an image; score 0 if there is none."""
+    window = 2 * half + 1
+    # A row is supported by the cells within the blur of a wall on both sides of it.
+    near = ndimage.maximum_filter1d(image, window, axis=0)
+    padded = np.pad(near, ((0, 0), (hole + 1, hole + 1)))
+    closed = ndimage.binary_closing(padded, np.ones((1, hole + 1)))[:, hole + 1 : -hole - 1]
+    pieces, count = ndimage.label(closed, ALONG_ROWS)
+    if not count:
+        return 0.0, 0, 0, 0
+    flat: NDArray[np.intp] = pieces.ravel()
+    length = np.bincount(flat, minlength=count + 1)
+    support = np.bincount(flat, near.ravel(), count + 1)
+    # Cells near the middle of the window count more: of all rows through a smear the middle one is the wall.
+    mass = np.bincount(flat, ndimage.uniform_filter1d(image.astype(float), window, axis=0).ravel(), count + 1)
+    score = np.where((length >= shortest) & (support >= FILLED * length), support + mass, 0.0)
+    score[0] = 0.0
+    winner = int(np.argmax(score))
+    row, column = np.nonzero(pieces == winner)
+    return float(score[winner]), int(row[0]), int(column.min()), int(column.max()) + 1

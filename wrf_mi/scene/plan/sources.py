@@ -1,0 +1,293 @@
+"""Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices.
+
+Walls are found in a `PlanGrid` of occupied, free and unknown cells, whose rows run with y. Row 0 of a picture, and so
+of a ROS map, is its top (largest y); an NPZ file states on which side its row 0 lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.array_files import stored_arrays
+from ...core.files import inside, one_line, text_lines
+from ...core.pictures import PICTURE_ERRORS, open_picture
+from ...core.yaml_files import read_yaml
+from ...datasets.folder_files import read_columns
+
+Mask = NDArray[np.bool_]
+Row0 = Literal["top", "bottom"]
+"""Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
+
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")
+"""Arrays of numbers in an NPZ file."""
+OCCUPIED_PROBABILITY = 0.65
+"""A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
+FREE_PROBABILITY = 0.196
+"""A cell less likely than this is free (``free_thresh`` there)."""
+POINT_CELL_M = 0.05
+"""Side of the cells that points are counted in, as usual for maps of indoor robots."""
+LARGEST_GRID_CELLS = 4_000_000
+"""100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away."""
+
+
+LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
+"""Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
+
+
+@dataclass(frozen=True)
+class PlanGrid:
+    """A plan in square cells; cell (row, column) has its centre at origin + resolution (column + 1/2, row + 1/2).
+
+    Attributes:
+        occupied: cells where something stands, shape [rows, columns].
+        free: cells seen empty, same shape; without any, openings and hidden places are unknown.
+        resolution_m: side of a cell.
+        origin_m: lower left corner, shape [2].
+    """
+
+    occupied: Mask
+    free: Mask
+    resolution_m: float
+    origin_m: FloatArray
+
+    def centres_m(self, mask: Mask) -> FloatArray:
+        """Centres [n, 2] of the cells of a mask."""
+        row, column = np.nonzero(mask)
+        return self.origin_m + self.resolution_m * (np.stack([column, row], axis=-1) + 0.5)
+
+
+@dataclass(frozen=True)
+class PlanPoints:
+    """LiDAR returns [n, 2] in a horizontal plane and the times [n] of their scans, equal within a scan, or None."""
+
+    xy_m: FloatArray
+    time_s: FloatArray | None = None
+
+
+def grid_from_probability(
+    probability: ArrayLike, resolution_m: float, row_0: Row0, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
+) -> PlanGrid:
+    """A grid from the probability [rows, columns] that a cell is occupied, NaN where that is unknown.
+
+    Raises:
+        InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
+    """
+    p = np.asarray(probability, float)
+    if p.size > LARGEST_PICTURE:
+        raise InputError(f"{name}: {p.size:,} cells; give a plan of at most {LARGEST_PICTURE:,}, with larger cells")
+    if p.ndim != 2 or not p.size:
+        raise InputError(f"{name}: an occupancy grid has two axes (rows, columns), this one has shape {p.shape}")
+    if not (np.isfinite(resolution_m) and resolution_m > 0 and np.isfinite(np.asarray(origin_m, float)).all()):
+        raise InputError(f"{name}: the resolution is {resolution_m}; give the side of a cell in metres, above zero")
+    if row_0 == "top":
+        p = p[::-1]
+    with np.errstate(invalid="ignore"):
+        occupied, free = p > OCCUPIED_PROBABILITY, p < FREE_PROBABILITY
+    if not occupied.any():
+        what = "every cell is NaN" if np.isnan(p).all() else "no cell is occupied"
+        raise InputError(f"{name}: {what}; there is no wall to find, give another map")
+    return PlanGrid(occupied, free, float(resolution_m), np.asarray(origin_m, float))
+
+
+def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> PlanGrid:
+    """A grid of the cells that hold points [n, 2]; none is free, since points do not show which cells are empty.
+
+    Raises:
+        InputError: no points, or more cells than `LARGEST_GRID_CELLS`.
+    """
+    xy = np.asarray(xy_m, float)
+    if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
+        raise InputError(f"points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
+    if not np.isfinite(xy).all():
+        bad = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
+        raise InputError(f"point {bad} is not finite; remove such points")
+    cell = POINT_CELL_M if resolution_m is None else float(resolution_m)
+    # An empty rim keeps every window of the search inside.
+    low = (np.floor(xy.min(axis=0) / cell) - 2) * cell
+    columns, rows = (np.floor((xy.max(axis=0) - low) / cell).astype(int) + 3).tolist()
+    if rows * columns > LARGEST_GRID_CELLS:
+        size = np.ptp(xy, axis=0)
+        raise InputError(
+            f"{size[0]:.0f} m x {size[1]:.0f} m in cells of {cell} m are too many; are the units metres? "
+            "Remove stray points or give a coarser resolution"
+        )
+    occupied = np.zeros((rows, columns), bool)
+    column, row = ((xy - low) / cell).astype(int).T
+    occupied[row, column] = True
+    return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
+
+
+def read_plan(
+    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None
+) -> PlanGrid | PlanPoints | FloatArray:
+    """Any file that shows a plan, recognised by its ending and its content.
+
+    - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
+      ``origin_m`` [2] of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities
+      (log odds of free cells are negative).
+    - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
+    - ``.png``, ``.pgm``: a grey picture, dark where occupied, with or without the ``.yaml`` of a ROS map beside it,
+      which may be given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw], ``negate``
+      (https://wiki.ros.org/map_server). The yaw has to be zero; its thresholds are not used.
+    - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
+    - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
+
+    Args:
+        path: path of the file.
+        resolution_m: side of a cell of a grid; overrides that of the file.
+        row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
+
+    Returns:
+        A grid, points, or wall vertices [n, 2].
+
+    Raises:
+        InputError: missing, unreadable or incomplete, or ``row_0`` for a file whose format fixes it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .yaml, .csv or .xyz")
+    suffix = path.suffix.lower()
+    if row_0 is not None and suffix != ".npz":
+        fixed = suffix in (".png", ".pgm", ".yaml", ".yml")
+        raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
+    match suffix:
+        case ".npz":
+            return _read_arrays(path, resolution_m, row_0)
+        case ".png" | ".pgm" | ".yaml" | ".yml":
+            return _read_picture(path, resolution_m)
+        case ".csv":
+            return read_layout(path)
+        case ".xyz" | ".txt":
+            return _read_text(path)
+    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .yaml, .csv or .xyz")
+
+
+def read_layout(path: str | Path) -> FloatArray:
+    """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
+
+    Raises:
+        InputError: missing file, header or number, or no wall in it.
+    """
+    vertices = read_columns(Path(path), "x,y")
+    if not np.any(np.diff(vertices, axis=0)):
+        raise InputError(f"{path}: no wall; give at least two different vertices")
+    return vertices
+
+
+def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid | PlanPoints:
+    try:
+        content = stored_arrays(path)
+    except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
+        raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
+    numbers = {key: values for key, values in content.items() if key in NUMBERS}
+    for key, values in numbers.items():
+        if values.dtype.kind not in "biuf":
+            raise InputError(f"{path}: {key} holds no numbers but {values.dtype}")
+        numbers[key] = values.astype(float)
+    if "log_odds" in numbers:
+        return _grid_of_arrays(path, numbers, resolution_m, row_0, content.get("row_0"))
+    if "xy_m" not in numbers:
+        text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
+        raise InputError(f"{text}; give one of them")
+    if row_0 is not None:
+        raise _no_rows(path, "it holds points, which have no rows")
+    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
+
+
+def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
+    if time is not None and time.shape != xy.shape[:1]:
+        raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
+    return PlanPoints(xy, time)
+
+
+def _grid_of_arrays(
+    path: Path,
+    numbers: Mapping[str, FloatArray],
+    resolution_m: float | None,
+    row_0: Row0 | None,
+    stated_row_0: NDArray[Any] | None,
+) -> PlanGrid:
+    if resolution_m is None:
+        if "resolution_m" not in numbers:
+            raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
+        resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
+    origin = numbers.get("origin_m", np.zeros(2))
+    if origin.shape != (2,) or not np.isfinite(origin).all():
+        raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
+    values = numbers["log_odds"]
+    known = values[~np.isnan(values)]
+    if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
+        values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+    row_0 = row_0 or _stated_side(path, stated_row_0)
+    return grid_from_probability(values, resolution_m, row_0, origin, str(path))
+
+
+def _stated_side(path: Path, stated: NDArray[Any] | None) -> Row0:
+    """Side of the plan where the first row of an NPZ grid lies, as the file states it."""
+    if stated is None:
+        way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
+        raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
+    word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
+    for side in get_args(Row0):
+        if side == word.strip().lower():
+            return cast(Row0, side)
+    raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
+
+
+def _no_rows(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: --row-0 is for an occupancy grid in an NPZ file, and {why}; leave it out")
+
+
+def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
+    facts: dict[str, Any] = {}
+    origin = np.zeros(2)
+    sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
+    if sheet.is_file():
+        try:
+            facts = read_yaml(sheet)
+            path = inside(sheet.parent, facts["image"], sheet) if path == sheet else path
+            origin = np.array(facts["origin"][:2], float)
+            yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
+            resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            text = f"not the YAML of a ROS map ({one_line(error)})"
+            raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
+        if yaw or not np.isfinite(yaw):
+            raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
+    if resolution_m is None:
+        raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
+    try:
+        with open_picture(path, LARGEST_PICTURE) as picture:
+            grey = np.asarray(picture.convert("L"), float) / 255
+    except PICTURE_ERRORS as error:
+        raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
+    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
+
+
+def _read_text(path: Path) -> PlanPoints:
+    rows = []
+    for number, line in enumerate(text_lines(path), 1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            rows.append([])
+        if len(rows[-1]) != 2 or not np.isfinite(rows[-1]).all():
+            raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}")
+    if not rows:
+        raise InputError(f"{path}: no points; give rows x y in metres")
+    return PlanPoints(np.array(rows))

@@ -1,0 +1,125 @@
+"""Walls, floor and ceiling of a scene from a plan: occupancy grid, LiDAR returns in a plane, or wall vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+from shapely.geometry.base import BaseGeometry
+
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..mesh.outline import triangulated
+from ..mesh.surfaces import Kind, Surface, number_names
+from .alignment import grid_from_scans
+from .sources import PlanGrid, PlanPoints, grid_from_points
+from .walls import find_walls
+
+CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+"""Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
+COVERED = 0.9
+"""Least share of the walls that stand on the floor or at its edge."""
+EDGE_M = 0.1
+"""A wall this near to the floor's edge stands at it."""
+SMALLEST_FLOOR_M2 = 0.5
+
+
+def layout_walls(vertices_m: FloatArray) -> FloatArray:
+    """Straight walls of a path of vertices [n, 2] that may double back and cross: end points [m, 2, 2]."""
+    pieces = np.stack([vertices_m[:-1], vertices_m[1:]], axis=1)
+    pieces = pieces[np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=-1) > 0]
+    # The union cuts at crossings and keeps doubled stretches once; merging undoes needless cuts.
+    lines = shapely.line_merge(shapely.unary_union(shapely.linestrings(pieces)))
+    paths = [shapely.get_coordinates(shapely.simplify(line, 1e-6)) for line in shapely.get_parts(lines)]
+    return np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in paths])
+
+
+def floor_of(walls_m: FloatArray) -> BaseGeometry:
+    """The area (shapely) that walls [n, 2, 2] enclose, openings between them closed; outlines without inner yards.
+
+    Raises:
+        InputError: they enclose nothing.
+    """
+    lines = shapely.unary_union(shapely.linestrings(walls_m))
+    rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
+    areas = [_filled(rooms)]
+    # Openings are closed by growing and shrinking, doors first: a wider closing rounds off more of the outline.
+    for half in CLOSING_M:
+        grown = shapely.buffer(lines, half, cap_style="square", join_style="mitre")
+        areas.append(shapely.buffer(_filled(grown), -half, join_style="mitre"))
+    for area in areas:
+        covered = shapely.length(shapely.intersection(lines, shapely.buffer(area, EDGE_M)))
+        if area.area >= SMALLEST_FLOOR_M2 and covered >= COVERED * lines.length:
+            return shapely.simplify(area, EDGE_M / 2)
+    raise InputError(f"the {len(walls_m)} walls found enclose no floor; give a plan that shows whole rooms")
+
+
+def _filled(area: BaseGeometry) -> BaseGeometry:
+    """Polygons without their holes."""
+    outlines = [Polygon(part.exterior) for part in shapely.get_parts(area) if isinstance(part, Polygon)]
+    return shapely.unary_union(outlines) if outlines else Polygon()
+
+
+def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None) -> FloatArray:
+    """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres.
+
+    Points whose scans are known by their times are aligned with one another first, and free space is found from the
+    places of the sensor (`wrf_mi.scene.plan.alignment`).
+
+    Raises:
+        InputError: no wall.
+    """
+    if isinstance(source, PlanPoints):
+        if source.time_s is None:
+            source = grid_from_points(source.xy_m, resolution_m)
+        else:
+            source = grid_from_scans(source.xy_m, source.time_s)
+    return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
+
+
+def plan_surfaces(
+    source: PlanGrid | PlanPoints | FloatArray,
+    *,
+    height_m: float,
+    floor_m: float = 0.0,
+    resolution_m: float | None = None,
+    name: str = "plan",
+) -> list[Surface]:
+    """Surfaces of a storey: walls extruded from floor to ceiling, and both of these.
+
+    Args:
+        source: the plan, as `wrf_mi.scene.plan.sources.read_plan` returns it.
+        height_m: height from floor to ceiling, above zero.
+        floor_m: z of the floor.
+        resolution_m: side of a cell to count points in.
+        name: name of the source, for errors.
+
+    Returns:
+        Floor, ceiling, and walls from the longest to the shortest; vertices in the frame of the source.
+
+    Raises:
+        InputError: bad height, no wall, or walls that enclose nothing.
+    """
+    if not (np.isfinite(height_m) and height_m > 0 and np.isfinite(floor_m)):
+        raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--height, metres)")
+    try:
+        walls_m = walls_of_plan(source, resolution_m)
+        flat, faces = triangulated(floor_of(walls_m))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    top_m = floor_m + height_m
+    parts: list[tuple[Kind, FloatArray, IntArray]] = [
+        ("floor", _at(flat, floor_m), faces),
+        ("ceiling", _at(flat, top_m), faces),
+    ]
+    for ends in walls_m:
+        vertices = np.concatenate([_at(ends, floor_m), _at(ends[::-1], top_m)])
+        parts.append(("wall", vertices, np.array([[0, 1, 2], [0, 2, 3]])))
+    names = number_names([kind for kind, _, _ in parts])
+    return [Surface(n, kind, v, f) for n, (kind, v, f) in zip(names, parts, strict=True)]
+
+
+def _at(xy_m: FloatArray, z_m: float) -> FloatArray:
+    """Points [n, 2] at a height, [n, 3]."""
+    return np.column_stack([xy_m, np.full(len(xy_m), z_m)])

@@ -1,0 +1,341 @@
+"""Planes of a building in a noisy point cloud: flat patches, split into layers, merged, and fitted to all their points.
+
+Patches are those of Open3D (Araujo and Oliveira 2020, Pattern Recognit. 107). Parallel layers of a plane that the noise
+blurs (boards on walls, recesses) are found by cells: two layers three standard deviations of the noise apart are one to
+single points, but the error of a cell's median falls with the root of the number of its points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.signal import find_peaks
+from skimage.filters import apply_hysteresis_threshold
+
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
+from .points import Thinned, lidar_package
+
+NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
+"""Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
+joins the walls of a sparse room around its corners, but finds narrow faces."""
+SEARCH_M = 0.10
+"""Half thickness of a patch in which parallel layers, such as both sides of a partition, are separated."""
+BAND = 3.0
+"""Points within this many standard deviations belong to a plane."""
+REPEAT = 5.0
+"""A later plane nearer than this to a parallel plane, in standard deviations, consists of its strays."""
+PLANAR_SHARE = 0.6
+"""A patch with fewer of its points in its layers is bent: a chair, a curtain."""
+NOISE_RANGE_M = (0.002, 0.04)
+"""Range of the noise: scanner on a tripod to phone."""
+LAYER_SHARE = 0.2
+"""Least density of a layer relative to the densest layer of its patch."""
+LAYER_CORE = (0.02, 0.98)
+"""Quantiles of a layer's points that bound it along each axis; the rest may be strays."""
+MERGE_GAP_M = 1.0
+"""Coplanar pieces nearer than this are one plane: wall on both sides of a door."""
+MERGE_ANGLE_RAD = float(np.radians(1.0))
+SHORTEST_EDGE_M = 0.2
+FEWEST_VOXELS = 60
+POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8
+"""Mean and least number of points of a cell."""
+CELL_RANGE_M = (0.1, 0.4)
+AROUND = 6.0
+"""Half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise."""
+LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
+"""Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
+GROWN_ERRORS = 2.0
+"""The same of cells beside."""
+LAYER_M2, LAYER_CELLS = 0.3, 8
+"""Least size of a layer."""
+FLATNESS = 2.0
+"""Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
+MEDIAN_ERROR = 1.25
+"""Standard error of a median, in that of a mean."""
+TUKEY = 4.685
+"""Constant of the biweight."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution in its median absolute deviations."""
+
+
+def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
+    """The planes of a thinned cloud and its noise.
+
+    Returns:
+        Planes, the one with the most points first, and the standard deviation of the points from them in metres.
+    """
+    planes: list[Plane] = []
+    free = np.ones(len(cloud.points_m), bool)
+    noise = 0.0
+    for spread_deg in NORMAL_SPREADS_DEG:
+        boxes = _patches(cloud, free, spread_deg)
+        noise = noise or _noise(cloud, boxes)
+        candidates = [plane for box in boxes for plane in _layers(cloud, free, box, noise)]
+        candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
+        if not candidates:
+            break
+        merged, planes = _merge(cloud, [*planes, *candidates], noise), []
+        for plane in merged:
+            if not any(_repeats(plane, other, 2 * noise) for other in planes):
+                planes.append(plane)
+        for plane in planes:
+            free &= ~near(plane, cloud.points_m, BAND * noise)
+    return planes, noise
+
+
+def fit(
+    points_m: FloatArray, weight: FloatArray, start: Plane, noise_m: float, *, normal: FloatArray | None = None
+) -> Plane:
+    """Least squares on the points [n, 3] within 2 standard deviations of a plane, in three iterations.
+
+    A given ``normal`` is kept; only the offset is fitted then. ``weight`` [n] are those of the points.
+    """
+    plane = start if normal is None else replace(start, normal=normal, offset_m=float(normal @ start.centre_m))
+    for _ in range(3):
+        inside = np.abs(plane.distance(points_m)) < 2 * noise_m
+        w = weight[inside].astype(float)
+        total = w.sum()
+        if np.count_nonzero(inside) < 10:
+            return plane
+        chosen = points_m[inside].astype(float)
+        centre = w @ chosen / total
+        values, vectors = np.linalg.eigh((chosen - centre).T * w @ (chosen - centre) / total)
+        n = vectors[:, 0] if normal is None else normal
+        # Standard error of a slope: noise over the spread of the points along the shorter axis.
+        error = noise_m / np.sqrt(values[1] * total)
+        offset = float(n @ centre)
+        plane = replace(plane, normal=n, offset_m=offset, centre_m=centre, angle_error_rad=float(error))
+    return with_axes(plane)
+
+
+def _fit_near(cloud: Thinned, chosen: Mask, start: Plane, noise_m: float) -> Plane:
+    return fit(cloud.points_m[chosen], cloud.count[chosen], start, noise_m)
+
+
+def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+    """Coplanar neighbours merged and fitted anew, the plane with the most points first."""
+    weight = [cloud.count[near(plane, cloud.points_m, 2 * noise_m)].sum() for plane in planes]
+    left = [planes[i] for i in np.argsort(weight)[::-1]]
+    merged: list[Plane] = []
+    while left:
+        plane = left.pop(0)
+        same = [other for other in left if _coplanar(plane, other, noise_m)]
+        if not same:
+            merged.append(plane)
+            continue
+        left = [other for other in left if not any(other is piece for piece in same)]
+        plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *(piece.patches_m for piece in same)]))
+        # The grown plane goes back to the front: it may meet further pieces.
+        left.insert(0, _fit_near(cloud, near(plane, cloud.points_m, BAND * noise_m), plane, noise_m))
+    return merged
+
+
+def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
+    # Within three standard errors of both directions, but a degree at least (registration) and five at most.
+    error = 3 * float(np.hypot(a.angle_error_rad, b.angle_error_rad))
+    angle = float(np.arccos(min(abs(float(a.normal @ b.normal)), 1.0)))
+    if angle > min(max(error, MERGE_ANGLE_RAD), 5 * MERGE_ANGLE_RAD):
+        return False
+    away = np.abs(a.distance(b.patches_m.mean(axis=1))).max()
+    if away > 1.5 * noise_m + 0.005:
+        return False
+    flat = shapely.union_all(shapely.convex_hull(shapely.multipoints(a.flat(b.patches_m))))
+    return bool(shapely.distance(flat, a.region(0)) < MERGE_GAP_M)
+
+
+def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
+    """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
+    if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
+        return False
+    if abs(other.distance(plane.centre_m)) > least_m:
+        return False
+    return bool(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)))
+
+
+def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:
+    """Boxes around the flat patches of a part of a cloud."""
+    if np.count_nonzero(free) < FEWEST_VOXELS:
+        return []
+    o3d = lidar_package("open3d")
+    part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m[free]))
+    part.normals = o3d.utility.Vector3dVector(cloud.normals[free])
+    boxes = part.detect_planar_patches(
+        normal_variance_threshold_deg=spread_deg,
+        coplanarity_deg=75,
+        outlier_ratio=0.75,
+        min_plane_edge_length=SHORTEST_EDGE_M,
+        min_num_points=FEWEST_VOXELS,
+        search_param=o3d.geometry.KDTreeSearchParamKNN(30),
+    )
+    return [box for box in boxes if min(box.extent) < THICKEST_M]
+
+
+def _box_plane(box: Any) -> tuple[Plane, float]:
+    """The middle plane of a patch's box, and its area."""
+    thin, *wide = np.argsort(box.extent)
+    rotation, centre = np.asarray(box.R), np.asarray(box.center)
+    half = [rotation[:, axis] * box.extent[axis] / 2 for axis in wide]
+    corners = np.stack([centre + a * half[0] + b * half[1] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    normal = rotation[:, thin] / np.linalg.norm(rotation[:, thin])
+    plane = Plane(normal, float(normal @ centre), corners[None], centre, np.inf)
+    return with_axes(plane), float(np.prod(box.extent[wide]))
+
+
+def _inner(plane: Plane, cloud: Thinned, free: Mask) -> tuple[FloatArray, FloatArray]:
+    """Offsets and counts of the points about a patch, without its rim, where neighbours begin."""
+    size = np.linalg.norm(np.diff(plane.patches_m[0, [0, 1, 2]], axis=0), axis=1).min()
+    inside = free & near(plane, cloud.points_m, SEARCH_M, -min(0.1 * size, 0.1))
+    return plane.distance(cloud.points_m[inside]), cloud.count[inside]
+
+
+def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
+    """Standard deviation of points from the planes, metres: over the ten largest patches, weighted by area."""
+    sized = sorted((_box_plane(box) for box in boxes), key=lambda pair: -pair[1])[:10]
+    widths, areas = [], []
+    everywhere = np.ones(len(cloud.points_m), bool)
+    for plane, area in sized:
+        around = near(plane, cloud.points_m, SEARCH_M, 0.0)
+        if np.count_nonzero(around) < FEWEST_VOXELS:
+            continue
+        offsets, count = _inner(_fit_near(cloud, around, plane, NOISE_RANGE_M[1] / 2), cloud, everywhere)
+        # 95 % of a normal distribution lies within 1.96 standard deviations. The tails count: noise along the ray is
+        # smaller across a surface seen at a grazing angle, so the sum over all angles has wide tails.
+        widths.append(np.quantile(np.abs(offsets), 0.95, weights=count, method="inverted_cdf") / 1.96)
+        areas.append(area)
+    if not widths:
+        return NOISE_RANGE_M[0]
+    return float(np.clip(np.quantile(widths, 0.5, weights=areas, method="inverted_cdf"), *NOISE_RANGE_M))
+
+
+def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
+    """The parallel planes within a patch, none where it is bent.
+
+    The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
+    all points about it may run across two real layers. The sharper of both is used.
+    """
+    middle, _ = _box_plane(box)
+    fitted = _fit_near(cloud, free & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
+    step = max(noise_m / 4, 0.002)
+    bins = np.arange(-SEARCH_M, SEARCH_M + step, step)
+    sharpest, best = 0.0, None
+    for plane in (middle, fitted):
+        offsets, count = _inner(plane, cloud, free)
+        if len(offsets) >= FEWEST_VOXELS / 2:
+            density = ndimage.gaussian_filter1d(np.histogram(offsets, bins, weights=count)[0], 0.7 * noise_m / step)
+            # 1 over the number of bins that a level distribution with this sum of squares would fill.
+            sharpness = float((density**2).sum() / density.sum() ** 2)
+            if sharpness > sharpest:
+                sharpest, best = sharpness, (plane, offsets, count, density)
+    if best is None:
+        return []
+    middle, offsets, count, density = best
+    density = np.pad(density, 1)
+    least = LAYER_SHARE * density.max()
+    peaks, _ = find_peaks(density, height=least, prominence=least / 2, distance=max(2.5 * noise_m / step, 1))
+    at = (bins[:-1] + step / 2)[peaks - 1]
+    inside = (np.abs(offsets[:, None] - at).min(axis=1, initial=np.inf)) < BAND * noise_m
+    if count[inside].sum() < PLANAR_SHARE * count.sum():
+        return []
+    planes = []
+    for offset in at:
+        layer = middle.shifted(offset)
+        inside = free & near(layer, cloud.points_m, BAND * noise_m, 0.0)
+        if np.count_nonzero(inside) >= FEWEST_VOXELS / 2:
+            if len(at) > 1:
+                bounds = np.quantile(layer.flat(cloud.points_m[inside]), LAYER_CORE, axis=0)
+                layer = replace(layer, patches_m=layer.rectangle(*bounds)[None])
+            planes.append(_fit_near(cloud, inside, layer, noise_m))
+    return planes
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A part of the points about a plane that lies in a parallel one.
+
+    Attributes:
+        plane: the parallel plane.
+        rows: numbers of its points.
+        before: whether it lies on the side of the plane where most points are: the plane goes on behind it.
+    """
+
+    plane: Plane
+    rows: IntArray
+    before: bool
+
+
+def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tuple[Plane, list[Layer]]:
+    """The plane of most cells, and the layers of others.
+
+    Args:
+        plane: a plane with its axes.
+        points_m: points of the scan [n, 3], metres.
+        free: points that belong to no other plane [n].
+        noise_m: standard deviation of points from planes.
+    """
+    reach = min(AROUND * noise_m, SEARCH_M)
+    rows = np.flatnonzero(free & near(plane, points_m, reach))
+    if len(rows) < LAYER_CELLS * POINTS_PER_CELL:
+        return plane, []
+    away, flat = plane.distance(points_m[rows]).astype(float), plane.flat(points_m[rows]).astype(float)
+    low = flat.min(axis=0)
+    # Density where there are points: the rectangle around them may be mostly empty.
+    density = len(rows) / max(
+        len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0)) * CELL_RANGE_M[0] ** 2, 1e-9
+    )
+    side = float(np.clip(np.sqrt(POINTS_PER_CELL / density), *CELL_RANGE_M))
+    cell = np.floor((flat - low) / side).astype(int)
+    shape = tuple(cell.max(axis=0) + 1)
+    number = np.ravel_multi_index(tuple(cell.T), shape)
+    count = np.bincount(number, minlength=int(np.prod(shape)))
+    median = np.full(len(count), np.nan)
+    counted = np.flatnonzero(count >= FEWEST_PER_CELL)
+    median[counted] = ndimage.median(away, number, counted)
+    error = MEDIAN_ERROR * noise_m / np.sqrt(np.maximum(count, 1))
+    level = _location(median[counted], error[counted])
+    step = median - level
+    parallels = list[tuple[Plane, IntArray, int]]()
+    for sign in (1, -1):
+        ratio = np.nan_to_num(sign * step / np.maximum(error, LEAST_STEP / LAYER_ERRORS * noise_m)).reshape(shape)
+        mask = apply_hysteresis_threshold(ratio, GROWN_ERRORS, LAYER_ERRORS)
+        parts, most = ndimage.label(ndimage.binary_opening(mask, np.ones((2, 2))))  # strips are rims of neighbours
+        for part in range(1, most + 1):
+            inside = np.flatnonzero((parts == part).ravel())
+            if len(inside) < LAYER_CELLS or len(inside) * side**2 < LAYER_M2:
+                continue
+            depth = float(np.median(step[inside]))
+            spread = NORMAL_MAD * float(np.median(np.abs(step[inside] - depth)))
+            # Medians of a layer differ by their own errors alone.
+            if spread > FLATNESS * float(np.median(error[inside])):
+                continue
+            chosen = np.isin(number, inside) & (np.abs(away - level - depth) < 2 * noise_m)
+            corners = np.stack(np.unravel_index(inside, shape), axis=1)
+            parallel = plane.shifted(level).shifted(depth)
+            patch = parallel.rectangle(low + side * corners.min(axis=0), low + side * (corners.max(axis=0) + 1))
+            parallel = replace(parallel, patches_m=patch[None], centre_m=patch.mean(axis=0))
+            parallels.append((parallel, rows[chosen], sign))
+    if not parallels:
+        return plane, []
+    room_side = np.sign(np.median(plane.distance(points_m)) - level)
+    return plane.shifted(level), [Layer(layer, which, bool(sign == room_side)) for layer, which, sign in parallels]
+
+
+def _location(values: NDArray[np.float64], error: FloatArray) -> float:
+    """Weighted location of values by Tukey's biweight, from their median."""
+    if not len(values):
+        return 0.0
+    at, weight = float(np.median(values)), np.ones(len(values))
+    for _ in range(10):
+        scale = np.maximum(error, NORMAL_MAD * np.median(np.abs(values - at)[weight > 0]))
+        weight = np.clip(1 - ((values - at) / (TUKEY * scale)) ** 2, 0, None) ** 2 / error**2
+        if weight.sum() <= 0:
+            break
+        at = float((weight * values).sum() / weight.sum())
+    return at
