@@ -36,7 +36,7 @@ GOOD_ENOUGH = 4.0
 """A start has converged when its residual is at most this many times that of the grey levels."""
 STEPS = 120
 """Steps of one start; starts that converge take 20 to 60."""
-TOGETHER = 128
+TOGETHER = 64
 """Spectra whose starts take their steps together."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e6
 """Damping of the first step, the smallest, and the one at which a descent ends, relative to the diagonal."""

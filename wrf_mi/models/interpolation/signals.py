@@ -223,6 +223,10 @@ class SignalProcess:
         """Inverse covariance of the rows for each component, [m, n, n]."""
         return np.stack([system.precision for system in self._systems])
 
+    def forget_precision(self) -> None:
+        """Free `precision`, as large as the factors, which `held_out` alone needs and computes anew."""
+        self.__dict__.pop("precision", None)
+
     def predict(self, tx_pos_m: ArrayLike) -> Posterior:
         """Posterior at positions [q, 3], metres."""
         cross = self.covariances.mixed(np.asarray(tx_pos_m, float), self.tx_pos_m, self.weight)

@@ -51,7 +51,7 @@ HELD_OUT = 80
 """Held-out training rows at most."""
 INTERVAL = 0.9
 """Share of errors that calibrated intervals cover."""
-UNSCALED_PER_CHUNK = 256
+UNSCALED_PER_CHUNK = 128
 """Spectra whose element signals are retrieved together."""
 CHUNK = 16
 """Transmitters predicted together, which bounds the memory of images with draws."""
@@ -316,6 +316,7 @@ def _fit_signals_and_nearby(
     nearby = fit_anisotropic(position_m, observed, receiver_m, wavelength, seed)
     kriged = KrigedSpectra(process, nearby, ExpectedSpectrum(array_m, frequency_hz, *observed.shape[1:]))
     _fit_weights(kriged, observed, wavelength, seed, part("weights"))
+    process.forget_precision()
     return kriged
 
 
