@@ -17,8 +17,8 @@ from wrf_mi.scene.coordinates import Y_UP
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.surfaces import Surface
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.devices import before_surfaces, check_devices, clear_m, winding_number
-from wrf_mi.tracing.surfaces import find_planes, scene_surfaces
+from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m, winding_number
+from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 
 

@@ -19,7 +19,7 @@ from ..scene.plan import plan_surfaces
 from ..scene.plan_sources import Mask, read_layout
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
 from ..scene.surfaces import Surface, bodies, box_of
-from ..tracing.devices import winding_number
+from ..tracing.search.devices import winding_number
 from .placements import placements
 from .repeats import named_rows
 from .units import Found

@@ -28,13 +28,13 @@ from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from ..tracing.corrected_scene import MovedSearch
-from ..tracing.instrument_parameters import instrument_parameters
-from ..tracing.material_parameters import PREFIX, QUANTITIES
-from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.solve import Prepared
-from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField
+from ..tracing.paths.corrected_scene import MovedSearch
+from ..tracing.paths.instrument_parameters import instrument_parameters
+from ..tracing.paths.material_parameters import PREFIX, QUANTITIES
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.solve import Prepared
+from ..tracing.paths.traced_carriers import traced_fields
+from ..tracing.paths.traced_field import TracedField
 from .frame import rigid_motions, scene_entries
 from .options import CorrectionOptions
 

@@ -11,11 +11,11 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
-from ..tracing.instrument_parameters import TX_PATTERN
-from ..tracing.material_parameters import EXPONENT, PREFIX, QUANTITIES
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
-from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.traced_field import TracedOptions
+from ..tracing.paths.instrument_parameters import TX_PATTERN
+from ..tracing.paths.material_parameters import EXPONENT, PREFIX, QUANTITIES
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import SQUARED_MAGNITUDE_EPS
-from ..tracing.field_calculator import Complex
-from ..tracing.traced_field import TracedPaths
+from ..tracing.paths.field_calculator import Complex
+from ..tracing.paths.traced_field import TracedPaths
 from .ports import ComplexMatrix, Ports, direction_weights, path_sum, steering, weighted
 
 How = Literal["coherent", "power"]

@@ -15,7 +15,7 @@ from ..gaussians import Gaussians
 from ..gaussians.footprint import Pose
 from ..gaussians.render import splat
 from ..gaussians.tiles import Plane
-from ..tracing.field_calculator import Complex
+from ..tracing.paths.field_calculator import Complex
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {

@@ -17,8 +17,8 @@ from scipy.constants import speed_of_light
 from ..backend.device import columns_on_device, on_device
 from ..core.angles import FloatArray, solid_angles
 from ..receivers.array import array_response
-from ..tracing.field_calculator import Complex
-from ..tracing.traced_field import Float64, TracedPaths
+from ..tracing.paths.field_calculator import Complex
+from ..tracing.paths.traced_field import Float64, TracedPaths
 
 
 @lru_cache(maxsize=16)

@@ -37,12 +37,12 @@ from ..receivers.spreads import PathStatistics
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
-from ..tracing.corrected_scene import check_materials, write_corrected_scene
 from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.options import without_effect
+from ..tracing.paths.corrected_scene import check_materials, write_corrected_scene
+from ..tracing.paths.result import join_traces
+from ..tracing.paths.solve import PAIRS_TOGETHER
 from ..tracing.polarization import warn_of_cross_polarization
-from ..tracing.result import join_traces
-from ..tracing.solve import PAIRS_TOGETHER
 from ..tracing.tracer import RayTracer
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
@@ -69,7 +69,7 @@ class TracingSettings(LoopOptions, TraceOptions):
     Attributes:
         calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
             receiver), ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and
-            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.surface_gaussians`); null: none.
+            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters
             (`wrf_mi.tracing.convergence`); null: none are chosen.

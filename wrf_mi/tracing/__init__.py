@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from .deepmimo import write_deepmimo
-from .materials import set_frequency
 from .options import TraceOptions
-from .result import TraceResult, load_trace, recompute, save_trace
-from .scenes import open_scene
-from .solve import trace_paths
+from .paths.result import TraceResult, load_trace, recompute, save_trace
+from .paths.solve import trace_paths
+from .sionna.materials import set_frequency
+from .sionna.scenes import open_scene
 from .tracer import RayTracer
 
 __all__ = [

@@ -22,8 +22,8 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..receivers import rssi_dbm
 from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
-from .result import TraceResult
-from .solve import FIRST_RAYS, Prepared, spread, trace_paths
+from .paths.result import TraceResult
+from .paths.solve import FIRST_RAYS, Prepared, spread, trace_paths
 
 logger = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from ..core.array_files import write_arrays
 from ..core.files import atomic_folder
 from ..core.types import IntArray
 from ..datasets.deepmimo import PARAMS, VERSION
-from .result import TraceResult
+from .paths.result import TraceResult
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from ..core import Antenna, Receiver
 from ..core.angles import FloatArray
 from ..receivers import received_power
 from .options import TraceOptions
-from .result import TraceResult, recompute
-from .solve import spread, trace_paths
+from .paths.result import TraceResult, recompute
+from .paths.solve import spread, trace_paths
 
 logger = logging.getLogger(__name__)
 

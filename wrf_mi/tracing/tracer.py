@@ -15,9 +15,9 @@ from ..core.carriers import by_carrier
 from ..core.types import IntArray
 from ..receivers.instruments import Instrument, SpectrumInstrument
 from .options import DEFAULTS, TraceOptions
-from .result import TraceResult, recompute
-from .scenes import open_scene
-from .solve import Prepared, trace_paths
+from .paths.result import TraceResult, recompute
+from .paths.solve import Prepared, trace_paths
+from .sionna.scenes import open_scene
 
 
 class RayTracer:

@@ -24,7 +24,7 @@ from ..gaussians.footprint import Pose
 from ..gaussians.tiles import Plane, perception_plane
 from ..graph.evaluations import Evaluation
 from ..graph.graph import Batch, Graph, Report
-from ..tracing.field_calculator import Complex
+from ..tracing.paths.field_calculator import Complex
 from .adam import NonFiniteReport, Params, guarded_step, rated_params
 
 Loss = Callable[..., Any]

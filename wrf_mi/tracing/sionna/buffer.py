@@ -6,22 +6,16 @@ the field calculator. This module alone sets attributes of ``PathsBuffer`` that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .options import TraceOptions
-from .surfaces import Surfaces
+from ...core.angles import FloatArray
+from ..options import TraceOptions
+from ..search.legs import SPECULAR, TRANSMISSION, Legs, join
+from ..search.surfaces import Surfaces
 
-SPECULAR, TRANSMISSION = 1, 4
-"""Values of Sionna RT's ``InteractionType``."""
-
-ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
-"""Fields of `Legs` with a value, or a row, for each path."""
 SLOTS_PER_CHUNK = 1 << 22
 """Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
 for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
@@ -29,58 +23,11 @@ WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 """Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
 
 
-@dataclass(frozen=True)
-class Legs:
-    """Interactions of p paths from source to target, the input of Sionna RT's stages.
-
-    Attributes:
-        source, target: indices of the points that each path joins, shape [p].
-        interactions: ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last.
-        face: index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last.
-        vertices_m: interaction points [p, depth, 3], metres, NaN beyond the last.
-        probability: probability of the interaction in a random search, shape [p, depth]; 1 in an exhaustive one.
-        wedge: edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction.
-    """
-
-    source: IntArray
-    target: IntArray
-    interactions: NDArray[np.uint8]
-    face: IntArray
-    vertices_m: FloatArray
-    probability: NDArray[np.float32]
-    wedge: dict[str, NDArray[Any]]
-
-    def __len__(self) -> int:
-        """Number of paths."""
-        return len(self.source)
-
-    def select(self, which: NDArray[Any] | slice) -> Legs:
-        """The paths of a mask or of indices."""
-        wedge = {name: array[which] for name, array in self.wedge.items()}
-        return Legs(**{name: getattr(self, name)[which] for name in ARRAYS}, wedge=wedge)
-
-    def reverse(self) -> Legs:
-        """The same paths from target to source; edges of diffraction keep the faces of the original direction."""
-        depth = self.interactions.shape[1]
-        last = np.count_nonzero(self.interactions, axis=1)[:, None] - 1
-        level = np.arange(depth)
-        turned = np.arange(len(self))[:, None], np.where(level <= last, last - level, level)
-        arrays = {name: getattr(self, name)[turned] for name in ("interactions", "face", "vertices_m", "probability")}
-        return replace(self, source=self.target, target=self.source, **arrays)
-
-
-def specular_legs(
-    source: IntArray, target: IntArray, interactions: NDArray[np.uint8], face: IntArray, vertices_m: FloatArray
-) -> Legs:
-    """Legs of an exhaustive search without diffraction."""
-    return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
-
-
 def point_array(points: FloatArray) -> Any:
     """Points [n, 3] as Mitsuba's ``Point3f``."""
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     return to_vectors(points, mi.Point3f)
 
@@ -91,7 +38,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     import mitsuba as mi
     from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
-    from ..backend.device import columns_on_device, on_device, to_vectors
+    from ...backend.device import columns_on_device, on_device, to_vectors
 
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
@@ -139,20 +86,6 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
     wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[kept] for name in WEDGE}
     source, target = (index.numpy()[kept].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
     return Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
-
-
-def join(parts: list[Legs], depth: int) -> Legs:
-    """Concatenate legs; an empty list gives no paths of that depth."""
-    if not parts:
-        none = np.zeros(0, np.int64)
-        return specular_legs(
-            none, none, np.zeros((0, depth), np.uint8), np.zeros((0, depth), np.int64), np.zeros((0, depth, 3))
-        )
-    wedge: dict[str, NDArray[Any]] = {}
-    for name, like in next((part.wedge for part in parts if part.wedge), {}).items():
-        zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
-        wedge[name] = np.concatenate([part.wedge.get(name, zero) for part, zero in zip(parts, zeros, strict=True)])
-    return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)
 
 
 def sampled_paths(

@@ -12,15 +12,15 @@ import trimesh
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
-from .. import backend
-from ..core import InputError
-from ..core.yaml_files import read_yaml
-from ..scene.coordinates import require_near, up_of, warn_of_up
-from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
-from ..scene.materials import FILE as MATERIALS_FILE
-from ..scene.materials import thicknesses
-from ..scene.surfaces import mesh_parts, sampled
-from ..scene.xml_file import read_scene_xml
+from ... import backend
+from ...core import InputError
+from ...core.yaml_files import read_yaml
+from ...scene.coordinates import require_near, up_of, warn_of_up
+from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
+from ...scene.materials import FILE as MATERIALS_FILE
+from ...scene.materials import thicknesses
+from ...scene.surfaces import mesh_parts, sampled
+from ...scene.xml_file import read_scene_xml
 from .materials import perfect_reflector, set_frequency
 from .scene_shapes import check_materials, load_checked, replace_shapes
 

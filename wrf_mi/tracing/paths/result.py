@@ -11,16 +11,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.paths import read_paths_file, save_paths
-from ..core.types import IntArray
-from .buffer import Legs
-from .fields import Devices, Ends, path_gains, scattering_materials
-from .materials import absorbs
-from .options import TraceOptions
-from .surfaces import Surfaces, scene_surfaces
+from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.paths import read_paths_file, save_paths
+from ...core.types import IntArray
+from ..options import TraceOptions
+from ..search.legs import Legs
+from ..search.surfaces import Surfaces, scene_surfaces
+from ..sionna.fields import Devices, Ends, path_gains, scattering_materials
+from ..sionna.materials import absorbs
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class TraceResult:
         tx_pos_m: transmitters [n_tx, 3], metres.
         receivers: the ``n_rx`` receivers.
         primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
-        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.buffer.Legs`.
-        wedge: edges of diffraction, see `wrf_mi.tracing.buffer.Legs`; empty without diffraction.
+        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.search.legs.Legs`.
+        wedge: edges of diffraction, see `wrf_mi.tracing.search.legs.Legs`; empty without diffraction.
         options: the options of the trace.
         rays: number of rays from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: whether the search went from receivers to transmitters.

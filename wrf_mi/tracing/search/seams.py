@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .buffer import SPECULAR, TRANSMISSION, Legs
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from .legs import SPECULAR, TRANSMISSION, Legs
 from .screens import ENLARGED
 from .surfaces import Surfaces
 
 NEAR = 1e-5
 """Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
-times that within which rays do not count them (`wrf_mi.tracing.visibility.WINDOW`)."""
+times that within which rays do not count them (`wrf_mi.tracing.search.visibility.WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
 """Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
 leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
@@ -69,7 +69,7 @@ class _Crossings(NamedTuple):
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
 
-    Of k paths with vertices and planes as of `wrf_mi.tracing.visibility.unobstructed`, and what rays met away from the
+    Of k paths with vertices and planes as of `visibility.unobstructed`, and what rays met away from the
     points of reflection, with `UNKNOWN_FACE`.
     """
     met, faces = _with_faces(surfaces, vertices_m, plane, met)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import Receiver
-from ..core.angles import FloatArray
-from ..core.carriers import rows_by_carrier
-from . import TraceResult, trace_paths
+from ...core import Receiver
+from ...core.angles import FloatArray
+from ...core.carriers import rows_by_carrier
 from .corrected_scene import MovedSearch
 from .instrument_parameters import moved_m
-from .solve import Prepared
+from .result import TraceResult
+from .solve import Prepared, trace_paths
 from .traced_field import TracedField, TracedOptions, needs_search
 
 

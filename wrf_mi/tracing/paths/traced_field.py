@@ -1,7 +1,7 @@
 """Traced paths with derivatives: gains, lengths and directions of Sionna RT's paths follow parameters.
 
 The search for the surfaces that a wave meets (`wrf_mi.tracing.trace_paths`) has no derivative; its result is kept. The
-image method and the field along each path are evaluated in each call (`wrf_mi.tracing.field_calculator`) with the
+image method and the field along each path are evaluated in each call (`wrf_mi.tracing.paths.field_calculator`) with the
 present parameters: materials, the scene's planes, the instrument's gain, antenna patterns and the receiver's pose.
 
 Everything is float64 over planes in float64, so that phases k d are exact to 1e-12 rad for the scene as stated (the
@@ -9,7 +9,7 @@ float32 corners of its files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
 further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
-searches again. Planes that move keep their paths (see `wrf_mi.tracing.plane_parameters`).
+searches again. Planes that move keep their paths (see `wrf_mi.tracing.paths.plane_parameters`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..backend.device import columns_on_device, on_device
-from ..core import Antenna, InputError, Receiver
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from ..gaussians.recurrence import times
-from ..receivers.spreads import PathStatistics
-from . import TraceOptions, TraceResult, trace_paths
-from .buffer import SPECULAR, TRANSMISSION
+from ...backend.device import columns_on_device, on_device
+from ...core import Antenna, InputError, Receiver
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.types import IntArray
+from ...gaussians.recurrence import times
+from ...receivers.spreads import PathStatistics
+from ..options import FACTOR, TraceOptions
+from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.surfaces import Surfaces
 from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
 from .instrument_parameters import (
     TX_PATTERN,
@@ -47,12 +48,10 @@ from .instrument_parameters import (
     spread_pose,
 )
 from .material_parameters import TRAINED, MaterialGrouping
-from .options import FACTOR
 from .plane_parameters import SceneTables, renumbered
-from .result import without_faint
-from .solve import Prepared
+from .result import TraceResult, without_faint
+from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
-from .surfaces import Surfaces
 
 SINGLE = 16
 """Numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all."""
@@ -65,14 +64,14 @@ class TracedOptions:
     Attributes:
         trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
         pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
-            `wrf_mi.tracing.instrument_parameters`).
+            `wrf_mi.tracing.paths.instrument_parameters`).
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
-        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
+        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
-        constants: constants of materials that are parameters, of `wrf_mi.tracing.material_parameters.QUANTITIES`.
+        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.material_parameters.QUANTITIES`.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -125,7 +124,7 @@ class TracedField:
         tx_heading_rad: yaw of each transmitter's frame about +z, rad, shape [n]; None: 0.
         traced: known paths from these transmitters to this receiver; None: paths are searched.
         prepared: shared state of the scene for several fields in it: rays of a receiver are then shot once, and the
-            caller checks the antennas (`wrf_mi.tracing.solve.Prepared.check`).
+            caller checks the antennas (`wrf_mi.tracing.paths.solve.Prepared.check`).
         frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
         present: Dr.Jit tensors by the names of `parameters` by which faint paths are told; None: as stated.
@@ -197,15 +196,15 @@ class TracedField:
 
     @property
     def gain_name(self) -> str:
-        """See `wrf_mi.tracing.instrument_parameters.gain_name`."""
+        """See `wrf_mi.tracing.paths.instrument_parameters.gain_name`."""
         return gain_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
-        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.material_parameters`), or of n
-        surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m and
-        ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.plane_parameters`);
+        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.paths.material_parameters`), or
+        of n surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m
+        and ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.paths.plane_parameters`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """

@@ -21,11 +21,11 @@ import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.files import one_line
-from ..scene.surfaces import mesh_parts
-from ..scene.xml_file import FILES, named_shapes
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.files import one_line
+from ...scene.surfaces import mesh_parts
+from ...scene.xml_file import FILES, named_shapes
 from .materials import CONSTANTS
 
 logger = logging.getLogger(__name__)

@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
-from ..backend.device import columns_on_device
-from ..core import Antenna
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from ..gaussians.footprint import Pose, cross, dot, tangent_basis
-from .buffer import SPECULAR, TRANSMISSION
-from .surfaces import Surfaces
+from ...backend.device import columns_on_device
+from ...core import Antenna
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.types import IntArray
+from ...gaussians.footprint import Pose, cross, dot, tangent_basis
+from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.surfaces import Surfaces
 
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from trimesh.triangles import closest_point
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
 from .surfaces import Solid, Surfaces
 
 logger = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ BEHIND_M = 0.01
 BEFORE_M = 1e-4
 """Least distance before a surface from which an antenna on it is traced."""
 CLEAR = 2.5e-5
-"""The same as a share of `Surfaces.scale_m`: twice as far as `wrf_mi.tracing.images.displaced` moves an antenna."""
+"""The same as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
 ON_SHARE = 0.1
@@ -115,7 +115,7 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
-    """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.surfaces.Surfaces`."""
+    """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.search.surfaces.Surfaces`."""
     thing = np.full(len(positions_m), -1)
     for solid, rows in _near_solids(surfaces, positions_m, 0.0):
         inside = winding_number(solid.corners, positions_m[rows]) > 0.5

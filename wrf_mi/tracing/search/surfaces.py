@@ -13,10 +13,10 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.digest import content_digest
-from ..core.types import IntArray
-from ..scene.surfaces import bodies
+from ...core.angles import FloatArray
+from ...core.digest import content_digest
+from ...core.types import IntArray
+from ...scene.surfaces import bodies
 from .screens import ENLARGED, scale_m, screens
 
 COPLANAR_M = 2e-5
@@ -95,7 +95,7 @@ class Surfaces:
     @cached_property
     def faces_on_device(self) -> tuple[Any, Any]:
         """`first_by_shape`, and plane of each face: Dr.Jit arrays, ``mi.UInt32``."""
-        from ..backend.device import to_uint
+        from ...backend.device import to_uint
 
         return to_uint(self.first_by_shape), to_uint(self.plane)
 
@@ -107,12 +107,12 @@ class Surfaces:
 
     @cached_property
     def scale_m(self) -> float:
-        """Length by which distances that single precision does not resolve grow, see `wrf_mi.tracing.screens`."""
+        """Length by which distances that single precision does not resolve grow, see `screens`."""
         return scale_m(self.triangles, self.centre_m)
 
     @cached_property
     def screens(self) -> Any:
-        """Mitsuba scene of the faces about `centre_m`, closed at their seams, see `wrf_mi.tracing.screens.screens`."""
+        """Mitsuba scene of the faces about `centre_m`, closed at their seams."""
         return screens(self.triangles - self.centre_m, self.scale_m)
 
     @cached_property
@@ -151,7 +151,7 @@ class Surfaces:
     def moved_planes(
         self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.plane_parameters`.
+        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.plane_parameters`.
 
         Args:
             shift_m: shifts along the normals [k].
@@ -167,7 +167,7 @@ class Surfaces:
         """``normal``, ``offset``, both ``axes``, ``low`` and ``high`` of the planes: Dr.Jit vectors [q]."""
         import mitsuba as mi
 
-        from ..backend.device import columns_on_device
+        from ...backend.device import columns_on_device
 
         columns = (self.normal, self.offset[:, None], self.axes[:, 0], self.axes[:, 1], self.low, self.high)
         x = columns_on_device(np.hstack(columns).T, mi.Float)

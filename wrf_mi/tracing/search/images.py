@@ -1,6 +1,6 @@
 """Specular paths from sources to many targets: possible chains, tested by rays, made exact in float64.
 
-Planes are n . x = d with unit normals n. `wrf_mi.tracing.field_calculator` has the differentiable image method in
+Planes are n . x = d with unit normals n. `wrf_mi.tracing.paths.field_calculator` has the differentiable image method in
 Dr.Jit. Source: Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
 """
 
@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .buffer import SPECULAR, Legs, join, specular_legs
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import TraceOptions
+from .chains import ReflectionChains, possible
 from .devices import before_surfaces, clear_m
-from .options import TraceOptions
+from .legs import SPECULAR, Legs, join, specular_legs
 from .seams import reflect_on_faces
-from .search import ReflectionChains, possible
 from .surfaces import Surfaces
 from .visibility import unobstructed
 
@@ -93,7 +93,7 @@ def specular_paths(
 
     Args:
         surfaces: surfaces of the scene.
-        chains: chains from these sources, see `wrf_mi.tracing.search.shoot`.
+        chains: chains from these sources, see `wrf_mi.tracing.search.chains.shoot`.
         sources_m: positions [s, 3], metres.
         targets_m: positions [n, 3], metres.
         options: kinds of interaction and depth.

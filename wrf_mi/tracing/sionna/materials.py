@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M, THICKNESS_M
 
-from ..core import InputError
-from ..scene.materials import EXPONENT
+from ...core import InputError
+from ...scene.materials import EXPONENT
 
 logger = logging.getLogger(__name__)
 

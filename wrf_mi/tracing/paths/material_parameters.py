@@ -20,11 +20,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import columns_on_device
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .materials import conductivity_exponent
-from .surfaces import Surfaces
+from ...backend.device import columns_on_device
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..search.surfaces import Surfaces
+from ..sionna.materials import conductivity_exponent
 
 LEAST_SUSCEPTIBILITY = 1e-3
 """Start of permittivity - 1 for materials of permittivity 1 (metal, air), whose logarithm has no derivative."""

@@ -23,9 +23,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Receiver
-from ..core.angles import FloatArray
-from ..gaussians.footprint import Pose, principal_axes
+from ...core import Receiver
+from ...core.angles import FloatArray
+from ...gaussians.footprint import Pose, principal_axes
 
 TX_PATTERN = "pattern.transmitter"
 """Name of the parameter [2, c] of the transmitters' pattern."""

@@ -1,8 +1,8 @@
 """Scenes with planes and materials as training has changed them: as a folder, and for the search of paths.
 
-Planes that move take paths with them (`wrf_mi.tracing.plane_parameters`), but edges that move uncover some paths and
-hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated one,
-so that paths found there are paths of the stated scene with these parameters.
+Planes that move take paths with them (`wrf_mi.tracing.paths.plane_parameters`), but edges that move uncover some paths
+and hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated
+one, so that paths found there are paths of the stated scene with these parameters.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
-from ..backend.device import on_device, to_tensor
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from ..scene.folder import plain_name, write_scene
-from ..scene.materials import CARRIER, THICKNESS_M, Materials
-from ..scene.materials import EXPONENT as LAW
-from ..scene.surfaces import SAME_CORNER_M, Kind, Surface
+from ...backend.device import on_device, to_tensor
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ...scene.folder import plain_name, write_scene
+from ...scene.materials import CARRIER, THICKNESS_M, Materials
+from ...scene.materials import EXPONENT as LAW
+from ...scene.surfaces import SAME_CORNER_M, Kind, Surface
+from ..search.surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
+from ..sionna.materials import absorbs, in_itu_range
 from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
-from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .solve import Prepared
-from .surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
 
 FLAT = 0.2
 """Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
@@ -148,7 +148,7 @@ def write_corrected_scene(
         folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
-            `wrf_mi.tracing.material_parameters`); others are ignored.
+            `wrf_mi.tracing.paths.material_parameters`); others are ignored.
         grouping: grouping of the parameters of materials.
         kinds: kinds of objects by name; by default ``other``.
         absent: slabs, in the order of their parameters, whose surfaces are left out.
@@ -264,7 +264,7 @@ def moved_search(
         copy: ``sionna.rt.Scene`` with the objects of the stated one, which may have been moved before; nothing else
             may use it.
         stated: surfaces of the scene as stated.
-        parameters: parameters of `wrf_mi.tracing.traced_field.TracedField` by name, those of planes among them.
+        parameters: parameters of `wrf_mi.tracing.paths.traced_field.TracedField` by name, those of planes among them.
         absent: slabs of surfaces, in the order of their parameters, that no ray shall meet.
 
     Raises:

@@ -13,18 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from ..core import Antenna, InputError, Paths, Receiver
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from .buffer import Legs, join, sampled_paths
-from .devices import before_surfaces, check_devices, from_behind
-from .fields import AT_ANTENNA_M, path_gains, scattering_materials
-from .images import image_sources, specular_paths
-from .options import DEFAULTS, MAX_RAYS, TraceOptions
+from ...core import Antenna, InputError, Paths, Receiver
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.types import IntArray
+from ..options import DEFAULTS, MAX_RAYS, TraceOptions
+from ..search.chains import ReflectionChains, check_search, shoot
+from ..search.devices import before_surfaces, check_devices, from_behind
+from ..search.images import image_sources, specular_paths
+from ..search.legs import Legs, join
+from ..search.surfaces import Surfaces, scene_surfaces
+from ..sionna.buffer import sampled_paths
+from ..sionna.fields import AT_ANTENNA_M, path_gains, scattering_materials
 from .result import TraceResult, device_ends
-from .search import ReflectionChains, check_search, shoot
-from .surfaces import Surfaces, scene_surfaces
 
 if TYPE_CHECKING:
     from .material_parameters import MaterialGrouping
@@ -63,7 +64,7 @@ class Prepared:
         """Refuse antennas inside solids and warn of those near surfaces, each position once, as stated.
 
         Raises:
-            InputError: see `wrf_mi.tracing.devices.check_devices`.
+            InputError: see `wrf_mi.tracing.search.devices.check_devices`.
         """
         names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
         names += [f"receiver {receiver.name}" for receiver in receivers]
@@ -78,7 +79,7 @@ class Prepared:
             self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
-        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.from_behind`."""
+        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.search.devices.from_behind`."""
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         # Those on a surface stay: their paths are searched for before it, and have the lengths from the surface.
         positions, others = np.split(from_behind(self.surfaces, stated), [len(tx_pos_m)])
@@ -86,7 +87,7 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .plane_parameters import SceneTables
+        from .plane_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
@@ -134,13 +135,13 @@ def trace_paths(
     """Trace the paths from every transmitter position to every receiver.
 
     Sequences of reflecting planes that the rays of one source find are tried for every position of the other side, so
-    that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.visibility`), and
-    Sionna RT's field calculator gives their gains. The paths of a pair are the same alone and among others, as long as
-    the number of rays is not ``"auto"``.
+    that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.search.visibility`),
+    and Sionna RT's field calculator gives their gains. The paths of a pair are the same alone and among others, as long
+    as the number of rays is not ``"auto"``.
 
     Memory grows with the paths found, about 1 kB for each at six interactions (measured), and not with the positions
-    tried: chunks are bounded by `wrf_mi.tracing.images.CANDIDATES_PER_CHUNK` and
-    `wrf_mi.tracing.search.PAIRS_PER_CHUNK`.
+    tried: chunks are bounded by `wrf_mi.tracing.search.images.CANDIDATES_PER_CHUNK` and
+    `wrf_mi.tracing.search.chains.PAIRS_PER_CHUNK`.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`, at the carrier frequency.

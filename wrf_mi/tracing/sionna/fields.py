@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.antenna import MountedAntenna
-from .buffer import SPECULAR, TRANSMISSION, Legs, point_array, to_buffer
-from .images import image_sources
-from .options import TraceOptions
-from .surfaces import Surfaces
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.antenna import MountedAntenna
+from ..options import TraceOptions
+from ..search.images import image_sources
+from ..search.legs import SPECULAR, TRANSMISSION, Legs
+from ..search.surfaces import Surfaces
+from .buffer import point_array, to_buffer
 
 PATHS_PER_CHUNK = 1 << 19
 """Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
@@ -76,7 +77,7 @@ def field_of(
 
     Args:
         scene: ``sionna.rt.Scene``.
-        buffer: p paths from source to target, from `wrf_mi.tracing.buffer.to_buffer`; may be used again.
+        buffer: p paths from source to target, from `wrf_mi.tracing.sionna.buffer.to_buffer`; may be used again.
         ends: sources and targets.
         rays: number of rays shot per source, for diffuse reflections.
         loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
@@ -112,7 +113,7 @@ def _pattern(devices: Devices, index: Any) -> Any:
     import mitsuba as mi
     from sionna.rt.antenna_pattern import antenna_pattern_registry
 
-    from ..backend.device import to_uint
+    from ...backend.device import to_uint
 
     antennas = [mounted.antenna for mounted in devices.antennas]
     distinct = list(dict.fromkeys(antennas))

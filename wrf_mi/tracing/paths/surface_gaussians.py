@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..backend.device import on_device
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ...backend.device import on_device
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import DISC, FACTOR
 from .field_calculator import Complex
-from .options import DISC, FACTOR
 
 NEAREST = 6
 """Gaussians that change one interaction."""

@@ -6,21 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .buffer import SPECULAR, TRANSMISSION
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from .legs import SPECULAR, TRANSMISSION
 from .seams import UNKNOWN_FACE, Met, with_crossings
 from .surfaces import Surfaces
 
 STEP = 5e-7
-"""Length that a ray skips behind each face that it meets, as a share of `wrf_mi.tracing.screens.scale_m`: eight times
+"""Length that a ray skips behind each face that it meets, as a share of `screens.scale_m`: eight times
 the rounding of a coordinate in single precision, as distances of rays are no more exact."""
 CLUSTER = 1e-6
 """Largest distance of consecutive points of reflection, as a share of the same, that rays cannot tell apart: the leg to
 the first then ends at whichever plane its ray meets."""
 WINDOW = 2 * CLUSTER
 """Distance from a point of reflection within which rays cannot tell sides, as a share of the same:
-`wrf_mi.tracing.seams` finds what is crossed there."""
+`wrf_mi.tracing.search.seams` finds what is crossed there."""
 MOST_CLUSTERED = 3
 """Reflections in a cluster: three planes meet in a corner."""
 NO_PLANE = 0xFFFFFFFF
@@ -33,9 +33,9 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     """Candidates that are paths.
 
     A ray follows each leg to the next vertex. The plane that reflects there has to be met at the end of the leg;
-    surfaces before are passed, or obstruct the path. Faces are closed (`wrf_mi.tracing.screens`): a ray that meets an
+    surfaces before are passed, or obstruct the path. Faces are closed (`screens`): a ray that meets an
     edge is obstructed by what ends there. So is a reflection at the foot of a wall that stands between both legs
-    (`wrf_mi.tracing.seams`).
+    (`wrf_mi.tracing.search.seams`).
 
     Mitsuba's surface interaction takes a call of each shape, which to trace and compile takes longer than the rays:
     points are computed from distances here.
@@ -51,7 +51,7 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_uint, to_vectors
+    from ...backend.device import to_uint, to_vectors
 
     size, legs = len(plane), plane.shape[1] + 1
     if not size or not len(surfaces.triangles):

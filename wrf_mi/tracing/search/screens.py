@@ -1,7 +1,7 @@
 """Faces of a scene as closed screens: enlarged a little at free and sharp edges, so that no ray passes at a seam.
 
 Rays in single precision miss triangles that they meet on an edge, and sheets that were modelled one by one may leave a
-gap of rounding at their seam. A wave that meets an edge counts as meeting its surface (`wrf_mi.tracing.visibility`).
+gap of rounding at their seam. A wave that meets an edge counts as meeting its surface (`visibility`).
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from ..core.angles import FloatArray
-from ..scene.surfaces import shared_edges
+from ...core.angles import FloatArray
+from ...scene.surfaces import shared_edges
 
 ENLARGED = 4e-5
 """Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are
-displaced (`wrf_mi.tracing.images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
+displaced (`images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
 OVERLAP = 5e-7
 """The same at edges at which a face goes on in another: eight times the rounding of a coordinate in single precision,
 by which edges of enlarged faces do not match."""
@@ -43,7 +43,7 @@ def screens(triangles: FloatArray, scale_m: float) -> Any:
     """A Mitsuba scene of one mesh for rays, whose primitives are the triangles [f, 3, 3] in their order, enlarged."""
     import mitsuba as mi
 
-    from ..backend.device import on_device
+    from ...backend.device import on_device
 
     mesh: Any = mi.Mesh("screens", 3 * len(triangles), len(triangles))
     parameters = mi.traverse(mesh)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .options import TraceOptions
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import TraceOptions
 from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ MARGIN_M = 1e-3
 """Slack of the bounds of planes."""
 BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
-displaced by `wrf_mi.tracing.images`."""
+displaced by `wrf_mi.tracing.search.images`."""
 MOST_KEPT = 1 << 27
 """Bytes of chains that a process keeps."""
 SECONDS_PER_HIT = 1.2e-7
@@ -75,7 +75,7 @@ class ReflectionChains:
         """Numbers of reflections; planes, and images of the source, of each reflection: Dr.Jit arrays [c]."""
         import mitsuba as mi
 
-        from ..backend.device import columns_on_device, to_uint, to_vectors
+        from ...backend.device import columns_on_device, to_uint, to_vectors
 
         planes = columns_on_device(np.maximum(self.plane, 0).T, mi.UInt32)
         return to_uint(self.length), planes, [to_vectors(image, mi.Point3f) for image in self.image.swapaxes(0, 1)]
@@ -175,7 +175,7 @@ def _shoot(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     ray = mi.Ray3f(to_vectors(source_m[None], mi.Point3f), to_vectors(directions.T, mi.Vector3f))
     first, plane = surfaces.faces_on_device
@@ -223,7 +223,7 @@ def possible(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
     (reflections, planes, images), tables = chains.on_device, surfaces.planes_on_device
