@@ -200,7 +200,7 @@ def test_paths_of_a_seed_do_not_depend_on_chunks(divided: Any, monkeypatch: pyte
     monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
     monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
     monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
-    monkeypatch.setattr("wrf_mi.tracing.sionna.fields.PATHS_PER_CHUNK", 50)
+    monkeypatch.setattr("wrf_mi.tracing.sionna.path_solver.PATHS_PER_CHUNK", 50)
     parts = trace_paths(divided, tx, rx, options).paths
     np.testing.assert_allclose(parts.gain, whole.gain, rtol=1e-5)  # other widths of vector instructions
     equal(replace(parts, gain=whole.gain), whole)

@@ -23,8 +23,8 @@ from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.synthetic import laboratory_record, load_record, stored
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
-from wrf_mi.tracing.sionna.fields import sionna_orientation
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
+from wrf_mi.tracing.sionna.path_solver import sionna_orientation
 
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
 ARRAY_M = planar_array(4, 4, SPACING_M)

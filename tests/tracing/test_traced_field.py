@@ -30,8 +30,7 @@ from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
 from wrf_mi.tracing.paths.material_parameters import QUANTITIES
 from wrf_mi.tracing.search.surfaces import scene_surfaces
-from wrf_mi.tracing.sionna.buffer import to_buffer
-from wrf_mi.tracing.sionna.fields import field_of
+from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)

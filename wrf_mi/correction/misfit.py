@@ -33,8 +33,7 @@ from ..tracing.paths.instrument_parameters import instrument_parameters
 from ..tracing.paths.material_parameters import PREFIX, QUANTITIES
 from ..tracing.paths.plane_parameters import SHIFT, TILT
 from ..tracing.paths.solve import Prepared
-from ..tracing.paths.traced_carriers import traced_fields
-from ..tracing.paths.traced_field import TracedField
+from ..tracing.paths.traced_field import TracedField, traced_fields
 from .frame import rigid_motions, scene_entries
 from .options import CorrectionOptions
 

@@ -4,7 +4,7 @@ paths.npz         in the run folder: every path, to be used again for other mate
 corrected/        where planes or materials were calibrated: the corrected scene, a folder that plain Sionna RT opens
 convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all tried settings
 
-For signal strengths an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows. With
+For signal strengths an offset per receiver (`wrf_mi.tracing.tracer`) is fitted to the training rows. With
 ``calibration``, parameters of the scene are trained for every task, by the graph of `wrf_mi.graph.graph` without
 Gaussians.
 """
@@ -37,13 +37,12 @@ from ..receivers.spreads import PathStatistics
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
-from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.options import without_effect
 from ..tracing.paths.corrected_scene import check_materials, write_corrected_scene
 from ..tracing.paths.result import join_traces
 from ..tracing.paths.solve import PAIRS_TOGETHER
 from ..tracing.polarization import warn_of_cross_polarization
-from ..tracing.tracer import RayTracer
+from ..tracing.tracer import Offsets, RayTracer, fit_offsets
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField

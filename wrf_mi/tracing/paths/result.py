@@ -19,8 +19,8 @@ from ...core.types import IntArray
 from ..options import TraceOptions
 from ..search.legs import Legs
 from ..search.surfaces import Surfaces, scene_surfaces
-from ..sionna.fields import Devices, Ends, path_gains, scattering_materials
 from ..sionna.materials import absorbs
+from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from ..search.devices import before_surfaces, check_devices, from_behind
 from ..search.images import image_sources, specular_paths
 from ..search.legs import Legs, join
 from ..search.surfaces import Surfaces, scene_surfaces
-from ..sionna.buffer import sampled_paths
-from ..sionna.fields import AT_ANTENNA_M, path_gains, scattering_materials
+from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scattering_materials
 from .result import TraceResult, device_ends
 
 if TYPE_CHECKING:

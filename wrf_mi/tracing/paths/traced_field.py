@@ -29,12 +29,14 @@ from ...backend.device import columns_on_device, on_device
 from ...core import Antenna, InputError, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
+from ...core.carriers import rows_by_carrier
 from ...core.types import IntArray
 from ...gaussians.recurrence import times
 from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions
 from ..search.legs import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
+from .corrected_scene import MovedSearch
 from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
 from .instrument_parameters import (
     TX_PATTERN,
@@ -371,3 +373,44 @@ class TracedField:
 def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
     """Whether a receiver is further than a quarter of a wavelength from where paths were searched, both [3], metres."""
     return bool(np.linalg.norm(here_m - searched_at_m) > speed_of_light / frequency_hz / 4)
+
+
+def traced_fields(
+    scene: Any,
+    tx_pos_m: ArrayLike,
+    receiver: Receiver,
+    options: TracedOptions,
+    prepared: Prepared,
+    tx_heading_rad: ArrayLike | None = None,
+    carriers_hz: FloatArray | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    searched: MovedSearch | None = None,
+) -> list[TracedField]:
+    """Traced fields of the transmitters of each carrier at a receiver, in ascending order of the carriers.
+
+    Paths are searched once for all carriers, and once at positions that repeat; wavelength and materials of a field are
+    those of its carrier. Arguments and errors are those of `TracedField`, and ``carriers_hz``: carrier of each
+    transmitter [n], Hz (None: that of the scene); ``parameters``: Dr.Jit tensors by the names of
+    `TracedField.parameters`, where they move the receiver further than `TracedField.refresh` allows at a carrier, paths
+    are searched from there (None: the stated pose); ``searched``: where paths are searched (None: in the stated scene).
+    """
+    positions = np.atleast_2d(np.asarray(tx_pos_m, float))
+    heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
+    distinct, number = np.unique(positions, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    stated_m, here_m = receiver.position_m, moved_m(receiver, parameters or {})
+    found, fields = dict[bool, TraceResult](), list[TracedField]()
+    for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
+        moved = needs_search(here_m, stated_m, carrier_hz or float(scene.frequency[0]))
+        from_m = here_m if moved else stated_m
+        if moved not in found:
+            there = replace(receiver, position_m=from_m)
+            where = searched.prepared if searched else prepared
+            how: dict[str, Any] = {"prepared": where, "tx_antenna": options.tx_antenna}
+            how |= {"check": False, "gains": False}
+            found[moved] = trace_paths(where.scene, distinct, there, options.trace, **how)
+        given = positions[rows], receiver, options, None if heading is None else heading[rows]
+        traced = found[moved].of_transmitters(number[rows])
+        present = searched.parameters if searched else None
+        fields.append(TracedField(scene, *given, traced, prepared, carrier_hz, from_m, present))
+    return fields

@@ -2,6 +2,5 @@
 
 - `scenes`: opens a scene from a name, a folder, a Mitsuba XML or a mesh; `scene_shapes`: shapes that Sionna RT lacks;
 - `materials`: radio materials at a carrier, also below the range of its table;
-- `buffer`: paths to and from its ``PathsBuffer``; diffraction and scattering by its random search;
-- `fields`: gains of paths by its field calculator.
+- `path_solver`: diffraction and scattering by its random search, gains of paths by its field calculator.
 """
