@@ -40,7 +40,7 @@ from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.paths.traced_field import TracedField, TracedOptions, TracedPaths, traced_fields
-from ..tracing.polarization import check_polarization
+from ..tracing.tracer import check_polarization
 from .evaluations import EVALUATIONS, Evaluation
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig

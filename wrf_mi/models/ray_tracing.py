@@ -41,8 +41,7 @@ from ..tracing.options import without_effect
 from ..tracing.paths.corrected_scene import check_materials, write_corrected_scene
 from ..tracing.paths.result import join_traces
 from ..tracing.paths.solve import PAIRS_TOGETHER
-from ..tracing.polarization import warn_of_cross_polarization
-from ..tracing.tracer import Offsets, RayTracer, fit_offsets
+from ..tracing.tracer import Offsets, RayTracer, fit_offsets, warn_of_cross_polarization
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField

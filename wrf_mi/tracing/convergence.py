@@ -127,8 +127,8 @@ class _Sampled:
     def _reports(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
         if (options, few) not in self._known:
-            here = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
-            paths = self._trace(tx_pos_m=here, options=options).paths
+            sample = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
+            paths = self._trace(tx_pos_m=sample, options=options).paths
             spectra = None if self._spectra is None else np.asarray(self._spectra(paths))
             self._known[options, few] = rssi_dbm(paths), spectra
         return self._known[options, few]

@@ -201,11 +201,10 @@ def write_corrected_scene(
                 if owner not in fitted_names:
                     fitted_names[owner] = plain_name(f"fitted_{owner}", ODD_IN_MATERIALS, constants)
                 material = fitted_names[owner]
-                law = {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
-                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True)) | law
+                constants[material] = _constants(fitted[slab]) | {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
             elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):
                 material = f"{itu}_{carrier_hz / 1e6:.0f}mhz"
-                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
+                constants[material] = _constants(fitted[slab])
             else:
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
@@ -236,6 +235,10 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
     smooth &= known[pairs].all(axis=1)
     facets[slab_of_face[pairs[smooth]]] = True
     return facets
+
+
+def _constants(slab: FloatArray) -> dict[str, float]:
+    return dict(zip(PERFECT_CONSTANTS, map(_rounded, slab), strict=True))
 
 
 def _rounded(value: float) -> float:

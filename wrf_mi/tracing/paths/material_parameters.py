@@ -138,13 +138,13 @@ class SlabMaterials:
                 return LEAST[quantity] + dr.exp(x) if quantity in LEAST else x
 
             if self.grouping == "surface":
-                whole = parameters.get(name_of(SURFACE, quantity))
-                return constant if whole is None else value(whole)
+                of_all = parameters.get(name_of(SURFACE, quantity))
+                return constant if of_all is None else value(of_all)
             each = [parameters.get(name_of(name, quantity)) for name in self.names]
             if all(parameter is None for parameter in each):
                 return constant
             pairs = zip(getattr(self, attribute), each, strict=True)
-            return dr.concat([float_type(float(one)) if p is None else value(p) for one, p in pairs])
+            return dr.concat([float_type(float(x)) if p is None else value(p) for x, p in pairs])
 
         conductivity = column("conductivity")
         if frequency_ratio != 1:

@@ -58,8 +58,8 @@ class TraceResult:
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
         wedge = {name: values[which] for name, values in self.wedge.items()}
-        kept = self.primitives[which], self.probability[which]
-        return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
+        paths, primitives, probability = self.paths.select(which), self.primitives[which], self.probability[which]
+        return replace(self, paths=paths, primitives=primitives, probability=probability, wedge=wedge)
 
     def unabsorbed(self, scene: Any) -> TraceResult:
         """The paths that meet no absorber of the ``sionna.rt.Scene``; others have no gain."""
@@ -72,15 +72,15 @@ class TraceResult:
     def of_transmitters(self, which: IntArray) -> TraceResult:
         """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""
         paths = self.paths
-        pair = paths.n_tx * paths.rx + paths.tx  # ascending
+        pair = paths.n_tx * paths.rx + paths.tx  # ascending, so that the paths of a pair are a range
         wanted = (paths.n_tx * np.arange(paths.n_rx)[:, None] + which).ravel()
         first, end = (np.searchsorted(pair, wanted, side) for side in ("left", "right"))
         count = end - first
         row = np.repeat(np.arange(len(wanted)), count)
-        found = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
+        selected = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
         carriers = None if self.carriers_hz is None else self.carriers_hz[which]
-        paths = replace(found.paths, tx=row % len(which), n_tx=len(which))
-        return replace(found, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
+        paths = replace(selected.paths, tx=row % len(which), n_tx=len(which))
+        return replace(selected, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
 
     def of_receivers(self, which: IntArray) -> TraceResult:
         """The trace of the receivers of ascending indices ``which`` [n]."""
@@ -218,7 +218,7 @@ def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[
     order = np.lexsort((amplitude, tx))
     ordered, upto = tx[order], np.cumsum(amplitude[order])
     first = np.searchsorted(ordered, ordered)
-    upto -= (upto - amplitude[order])[first]
-    kept = np.empty(len(tx), bool)
-    kept[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
-    return kept
+    upto -= (upto - amplitude[order])[first]  # sum of a transmitter's weaker paths and the path itself
+    strong = np.empty(len(tx), bool)
+    strong[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
+    return strong

@@ -39,15 +39,12 @@ from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
 from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
 from .instrument_parameters import (
-    TX_PATTERN,
-    component,
     gain_name,
     instrument_parameters,
     moved_m,
-    pattern_factor,
-    pattern_name,
     receiver_pose,
     spread_pose,
+    with_antennas,
 )
 from .material_parameters import TRAINED, MaterialGrouping
 from .plane_parameters import SceneTables, renumbered
@@ -170,12 +167,12 @@ class TracedField:
         self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
         self.searches = 0
         self.surfaces: Surfaces = self._shared.surfaces
-        here = receiver.position_m if searched_at_m is None else searched_at_m
+        position_m = receiver.position_m if searched_at_m is None else searched_at_m
         self._set_tables(self._shared.tables(options.materials))
         if traced is None:
-            self.search(here)
+            self.search(position_m)
         else:
-            self._take(traced, here)
+            self._set_paths(traced, position_m)
 
     def __len__(self) -> int:
         """Number of transmitters."""
@@ -218,10 +215,10 @@ class TracedField:
 
     def refresh(self, parameters: Mapping[str, Any]) -> bool:
         """Search for paths again if the receiver is too far from the position of the last search; whether it was."""
-        here = moved_m(self.receiver, parameters)
-        if not needs_search(here, self.searched_at_m, self.frequency_hz):
+        position_m = moved_m(self.receiver, parameters)
+        if not _needs_search(position_m, self.searched_at_m, self.frequency_hz):
             return False
-        self.search(here)
+        self.search(position_m)
         return True
 
     def __call__(
@@ -249,13 +246,7 @@ class TracedField:
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
         dr.eval(paths)
         gain, length_m, departure, arrival = paths
-        if self.gain_name in parameters:
-            amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
-            sine, cosine = dr.sincos(phase)
-            gain = times(gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
-        for name, direction in ((pattern_name(self.receiver), arrival), (TX_PATTERN, departure)):
-            if name in parameters:
-                gain = times(gain, pattern_factor(parameters[name], direction))
+        gain = with_antennas(gain, self.receiver, parameters, arrival, departure)
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
         return TracedPaths(gain, length_m, arrival, batch, each)
@@ -298,35 +289,32 @@ class TracedField:
         count = len(self) * self._each
         self._weights = PathWeights.of(gaussians, self.interactions, self._path_of_met, count)
 
-    def search(self, here_m: FloatArray) -> None:
+    def search(self, position_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
-        how: dict[str, Any] = {"prepared": self._shared, "tx_antenna": self.options.tx_antenna}
-        receiver = replace(self.receiver, position_m=here_m)
-        found = trace_paths(
-            self.scene, self.tx_pos_m, receiver, self.options.trace, check=self._checks, gains=False, **how
-        )
-        self._take(found, here_m)
+        receiver = replace(self.receiver, position_m=position_m)
+        traced = _search(self.scene, self.tx_pos_m, receiver, self.options, self._shared, self._checks)
+        self._set_paths(traced, position_m)
         self.searches += 1
 
-    def _take(self, traced: TraceResult, here_m: FloatArray) -> None:
+    def _set_paths(self, traced: TraceResult, position_m: FloatArray) -> None:
         """Lay out paths on the device, with as many entries for each transmitter as the largest number of paths."""
         surfaces, types, tx = self.surfaces, traced.paths.interactions, traced.paths.tx
         legs = traced.legs(surfaces)
         face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
-        found = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
-        share, kept = self.options.faint, np.arange(len(tx))
+        chains = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
+        share, strong = self.options.faint, np.arange(len(tx))
         if share:
-            kept = np.flatnonzero(without_faint(tx, self._amplitudes(found), share))
-        tx, types, face, vertices_m = tx[kept], types[kept], face[kept], traced.paths.vertices_m[kept]
+            strong = np.flatnonzero(without_faint(tx, self._amplitudes(chains), share))
+        tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         if len(self) == 1:
             each = -(-each // SINGLE) * SINGLE
-        entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
+        entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)  # paths are sorted by transmitter
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
-        place[entry], present[entry] = kept, True
-        self._each, self.searched_at_m = each, np.array(here_m, float)
+        place[entry], present[entry] = strong, True
+        self._each, self.searched_at_m = each, np.array(position_m, float)
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
         self.interactions = Interactions(vertices_m[met], normal)
@@ -336,10 +324,10 @@ class TracedField:
         # Place holders have a transmitter, too: lengths of zero have no direction.
         sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
         self.chains = Chains(sources[:3], tuple(sources[3:]), dr.zeros(Float64, len(place)), [])
-        if len(kept):
+        if len(strong):
             index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)
-            self.chains.exists = dr.gather(Float64, found.exists, index, mask)
-            self.chains.levels = [dr.gather(Level, level, index, mask) for level in found.levels]
+            self.chains.exists = dr.gather(Float64, chains.exists, index, mask)
+            self.chains.levels = [dr.gather(Level, level, index, mask) for level in chains.levels]
         dr.eval(self.chains)
 
     def _source_columns(self, tx: IntArray) -> list[FloatArray]:
@@ -370,9 +358,17 @@ class TracedField:
         return number
 
 
-def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
+def _search(
+    scene: Any, tx_pos_m: FloatArray, receiver: Receiver, options: TracedOptions, prepared: Prepared, check: bool
+) -> TraceResult:
+    """Paths without gains, which follow from the parameters."""
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna, "check": check, "gains": False}
+    return trace_paths(scene, tx_pos_m, receiver, options.trace, **how)
+
+
+def _needs_search(position_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
     """Whether a receiver is further than a quarter of a wavelength from where paths were searched, both [3], metres."""
-    return bool(np.linalg.norm(here_m - searched_at_m) > speed_of_light / frequency_hz / 4)
+    return bool(np.linalg.norm(position_m - searched_at_m) > speed_of_light / frequency_hz / 4)
 
 
 def traced_fields(
@@ -398,19 +394,20 @@ def traced_fields(
     heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
     distinct, number = np.unique(positions, axis=0, return_inverse=True)
     number = number.reshape(-1)
-    stated_m, here_m = receiver.position_m, moved_m(receiver, parameters or {})
-    found, fields = dict[bool, TraceResult](), list[TracedField]()
+    stated_m, moved_to_m = receiver.position_m, moved_m(receiver, parameters or {})
+    place, present = (searched.prepared, searched.parameters) if searched else (prepared, None)
+    traces, fields = dict[bool, TraceResult](), list[TracedField]()
     for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
-        moved = needs_search(here_m, stated_m, carrier_hz or float(scene.frequency[0]))
-        from_m = here_m if moved else stated_m
-        if moved not in found:
-            there = replace(receiver, position_m=from_m)
-            where = searched.prepared if searched else prepared
-            how: dict[str, Any] = {"prepared": where, "tx_antenna": options.tx_antenna}
-            how |= {"check": False, "gains": False}
-            found[moved] = trace_paths(where.scene, distinct, there, options.trace, **how)
-        given = positions[rows], receiver, options, None if heading is None else heading[rows]
-        traced = found[moved].of_transmitters(number[rows])
-        present = searched.parameters if searched else None
-        fields.append(TracedField(scene, *given, traced, prepared, carrier_hz, from_m, present))
+        # The stated position serves the carriers for which the receiver has not moved by a quarter of a wavelength.
+        moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(scene.frequency[0]))
+        position_m = moved_to_m if moved else stated_m
+        if moved not in traces:
+            traces[moved] = _search(
+                place.scene, distinct, replace(receiver, position_m=position_m), options, place, False
+            )
+        traced, yaw = traces[moved].of_transmitters(number[rows]), None if heading is None else heading[rows]
+        field = TracedField(
+            scene, positions[rows], receiver, options, yaw, traced, prepared, carrier_hz, position_m, present
+        )
+        fields.append(field)
     return fields

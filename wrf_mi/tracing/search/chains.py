@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -54,12 +54,6 @@ class ReflectionChains:
     plane: IntArray
     image: FloatArray
     source: IntArray
-
-    @classmethod
-    def joined(cls, chains: Sequence[ReflectionChains]) -> ReflectionChains:
-        """Chains from one source each, which are numbered in order."""
-        source = np.repeat(np.arange(len(chains)), [len(part) for part in chains])
-        return cls(np.concatenate([part.plane for part in chains]), np.concatenate([p.image for p in chains]), source)
 
     def __len__(self) -> int:
         """Number of chains."""
@@ -127,9 +121,9 @@ def _chains(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, turn: FloatArray, depth: int, choices: Choices
 ) -> IntArray:
     reflections = len(choices[0])
-    found = [np.zeros((0, reflections), np.int64)]
+    chains = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
-        return found[0]
+        return chains[0]
     for reflecting in choices:
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
@@ -137,8 +131,8 @@ def _chains(
             hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
             for column, level in enumerate(reflecting):
                 sequence[:, column] = hits[level]
-            found.append(unique_chains(sequence))
-    return unique_chains(np.concatenate(found))
+            chains.append(unique_chains(sequence))  # chunk by chunk: most rays find the same few chains
+    return unique_chains(np.concatenate(chains))
 
 
 def patterns(depth: int, reflections: int, passing: bool) -> Choices:
@@ -243,15 +237,17 @@ def possible(
             plane = dr.gather(mi.UInt32, planes[level], row, active)
             image = dr.gather(mi.Point3f, images[level], row, active)
             n, d, u, v, low, high = (dr.gather(type(table), table, plane, active) for table in tables)
-            here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
-            met: Any = point + (image - point) * (here / (here - there))
+            # Backwards from the target: the line to the image meets the plane where the wave is reflected, if both
+            # are on opposite sides of it.
+            height, image_height = dr.dot(n, point) - d, dr.dot(n, image) - d
+            met: Any = point + (image - point) * (height / (height - image_height))
             along = mi.Point2f(dr.dot(u, met), dr.dot(v, met))
             within: Any = dr.all(along >= low - MARGIN_M) & dr.all(along <= high + MARGIN_M)
-            opposite = dr.select(there > 0, here < beside, here > -beside)
+            opposite = dr.select(image_height > 0, height < beside, height > -beside)
             valid &= ~active | (opposite & within)
             point = dr.select(active, met, point)
-        found = np.asarray(dr.compress(valid), np.int64)
-        chain, target = found // len(targets_m) + start, found % len(targets_m)
+        pairs = np.asarray(dr.compress(valid), np.int64)
+        chain, target = pairs // len(targets_m) + start, pairs % len(targets_m)
         order = np.argsort(length[chain], kind="stable")
         yield chain[order], target[order]
 
@@ -262,8 +258,10 @@ def hits(options: TraceOptions, rays: int) -> int:
     Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
     (`shoot`), of which there are up to two to the power of the depth.
     """
+    if not options.reflections:
+        return 0
     met = options.max_depth if options.transmission else options.reflections
-    return len(patterns(met, options.reflections, options.transmission)) * rays * met if options.reflections else 0
+    return len(patterns(met, options.reflections, options.transmission)) * rays * met
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
@@ -275,8 +273,8 @@ def check_search(options: TraceOptions, rays: int, sources: int) -> None:
     duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
     if duration_s < WARN_S:
         return
-    what = f"search for paths with up to {options.reflections} reflections"
+    search = f"search for paths with up to {options.reflections} reflections"
     remedy = f"a smaller --depth (max_depth, {options.max_depth}) or --reflections (max_reflections)"
     if duration_s > MOST_S:
-        raise InputError(f"{what}: about {duration_s / 3600:.1f} hours; give {remedy}")
-    logger.warning("%s: about %.0f s; faster with %s", what, duration_s, remedy)
+        raise InputError(f"{search}: about {duration_s / 3600:.1f} hours; give {remedy}")
+    logger.warning("%s: about %.0f s; faster with %s", search, duration_s, remedy)

@@ -36,16 +36,16 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     Raises:
         InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
     """
-    thing = solid_around(surfaces, positions_m)
-    if (thing >= 0).any():
-        first = int(np.argmax(thing >= 0))
+    enclosing = solid_around(surfaces, positions_m)
+    if (enclosing >= 0).any():
+        first = int(np.argmax(enclosing >= 0))
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
-        what = surfaces.called(int(thing[first]))
-        raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
+        solid = surfaces.called(int(enclosing[first]))
+        raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
-    low, high = surfaces.bounds_m
-    beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
+    corners = surfaces.triangles.reshape(-1, 3)
+    beyond = np.maximum(corners.min(axis=0) - positions_m, positions_m - corners.max(axis=0)).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
         text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres"
@@ -68,11 +68,13 @@ def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     for point, plane in _pairs_near(surfaces, moved):
         for index in np.unique(plane):
             normal, offset = surfaces.normal[index], surfaces.offset[index]
-            scene = surfaces.triangles @ normal - offset
-            side, near = 1.0 if scene.max() > -scene.min() else -1.0, point[plane == index]
+            corner_heights, near = surfaces.triangles @ normal - offset, point[plane == index]
+            inner_side = 1.0 if corner_heights.max() > -corner_heights.min() else -1.0
+            inwards = inner_side * corner_heights
             height = moved[near] @ normal - offset
-            outer = (side * scene).min() >= -BEHIND_M and (side * scene).max() >= BEHIND_M
-            sides = np.full(len(near), side) if outer else np.where(height < -ON_M, -1.0, 1.0)
+            # An outer wall has the whole scene before it; any other sheet may carry antennas on both sides.
+            outer = inwards.min() >= -BEHIND_M and inwards.max() >= BEHIND_M
+            sides = np.full(len(near), inner_side) if outer else np.where(height < -ON_M, -1.0, 1.0)
             low = sides * height < clear
             moved[near[low]] += (sides * clear - height)[low, None] * normal
     return moved
@@ -87,12 +89,11 @@ def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -> Iterator[tuple[Solid, IntArray]]:
     """Solids with the positions [n, 3] that lie within their bounds and a margin."""
-    low, high = surfaces.solid_bounds_m
-    near = np.ones((len(positions_m), len(low)), bool)
-    for axis, here in enumerate(positions_m.T):
-        near &= (here[:, None] >= low[:, axis] - margin_m) & (here[:, None] <= high[:, axis] + margin_m)
-    for number in np.flatnonzero(near.any(axis=0)):
-        yield surfaces.solids[number], np.flatnonzero(near[:, number])
+    for solid in surfaces.solids:
+        low, high = solid.corners.min(axis=(0, 1)) - margin_m, solid.corners.max(axis=(0, 1)) + margin_m
+        rows = np.flatnonzero(((positions_m >= low) & (positions_m <= high)).all(axis=1))
+        if len(rows):
+            yield solid, rows
 
 
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
@@ -116,11 +117,11 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.search.surfaces.Surfaces`."""
-    thing = np.full(len(positions_m), -1)
+    enclosing = np.full(len(positions_m), -1)
     for solid, rows in _near_solids(surfaces, positions_m, 0.0):
         inside = winding_number(solid.corners, positions_m[rows]) > 0.5
-        thing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
-    return thing
+        enclosing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
+    return enclosing
 
 
 def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:

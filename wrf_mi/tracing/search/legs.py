@@ -64,13 +64,8 @@ def specular_legs(
     return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
 
 
-def join(parts: list[Legs], depth: int) -> Legs:
-    """Concatenate legs; an empty list gives no paths of that depth."""
-    if not parts:
-        none = np.zeros(0, np.int64)
-        return specular_legs(
-            none, none, np.zeros((0, depth), np.uint8), np.zeros((0, depth), np.int64), np.zeros((0, depth, 3))
-        )
+def join(parts: list[Legs]) -> Legs:
+    """Concatenate legs of the same depth."""
     wedge: dict[str, NDArray[Any]] = {}
     for name, like in next((part.wedge for part in parts if part.wedge), {}).items():
         zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]

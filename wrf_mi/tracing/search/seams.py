@@ -50,6 +50,12 @@ class Met(NamedTuple):
         """The paths of a mask or of indices."""
         return Met(*(array[which] for array in self))
 
+    @property
+    def leg(self) -> IntArray:
+        """Leg on which, or at whose end, each interaction is: the number of reflections before it [k, depth]."""
+        reflects = self.interactions == SPECULAR
+        return np.cumsum(reflects, axis=1) - reflects
+
 
 class _Crossings(NamedTuple):
     """Crossings [n]: paths, legs, faces, shares of the legs before them, and points [n, 3]."""
@@ -61,9 +67,7 @@ class _Crossings(NamedTuple):
     points_m: FloatArray
 
     def select(self, which: NDArray[Any]) -> _Crossings:
-        """The crossings of a mask or of indices."""
-        path, leg, face, share, points_m = self
-        return _Crossings(path[which], leg[which], face[which], share[which], points_m[which])
+        return _Crossings(*(array[which] for array in self))
 
 
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
@@ -78,24 +82,23 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     if not len(crossings.path):
         return met
     # Few paths have any: the others stay as they are.
-    few, path = np.unique(crossings.path, return_inverse=True)
-    part = met.select(few)
+    crossing, path = np.unique(crossings.path, return_inverse=True)
+    part = met.select(crossing)
     new = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
     if transmission:
-        part, valid = _inserted(part, new, vertices_m[few])
+        part, valid = _inserted(part, new, vertices_m[crossing])
     else:
-        valid = ~np.isin(np.arange(len(few)), new.path)
-    met.interactions[few], met.face[few], met.points_m[few] = part.interactions, part.face, part.points_m
-    kept = np.ones(len(plane), bool)
-    kept[few[~valid]] = False
-    return met if valid.all() else met.select(kept)
+        valid = ~np.isin(np.arange(len(crossing)), new.path)
+    met.interactions[crossing], met.face[crossing], met.points_m[crossing] = part[1:]
+    unobstructed = np.ones(len(plane), bool)
+    unobstructed[crossing[~valid]] = False
+    return met if valid.all() else met.select(unobstructed)
 
 
 def _inserted(met: Met, new: _Crossings, vertices_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
     """Paths [k] with further transmissions, and the mask of those that are not too deep."""
     path, slot = np.nonzero(met.interactions)
-    mirrors = met.interactions[path, slot] == SPECULAR
-    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot] - mirrors
+    mirrors, leg = met.interactions[path, slot] == SPECULAR, met.leg[path, slot]
     start, end = vertices_m[path, leg], vertices_m[path, leg + 1]
     away = np.linalg.norm(met.points_m[path, slot] - start, axis=1) / np.linalg.norm(end - start, axis=1)
     # By their place on the leg, and the reflections of a cluster, which end it together, in their order.
@@ -117,16 +120,16 @@ def _inserted(met: Met, new: _Crossings, vertices_m: FloatArray) -> tuple[Met, N
 def _with_faces(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met) -> tuple[Met, NDArray[np.bool_]]:
     """Paths with a face for each `UNKNOWN_FACE`, and the mask of those that have one at each point."""
     path, slot = np.nonzero(met.face == UNKNOWN_FACE)
-    every = np.ones(len(plane), bool)
+    has_faces = np.ones(len(plane), bool)
     if not len(path):
-        return met, every
-    level = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot] - 1
+        return met, has_faces
+    level = met.leg[path, slot]
     points = vertices_m[path, level + 1]
     nearest, away_m = nearest_faces(surfaces, plane[path, level], points)
     face, points_m = met.face.copy(), met.points_m.copy()
     face[path, slot], points_m[path, slot] = nearest, points
-    every[path[away_m > ENLARGED * surfaces.scale_m]] = False
-    return met._replace(face=face, points_m=points_m).select(every), every
+    has_faces[path[away_m > ENLARGED * surfaces.scale_m]] = False
+    return met._replace(face=face, points_m=points_m).select(has_faces), has_faces
 
 
 def reflect_on_faces(surfaces: Surfaces, legs: Legs) -> NDArray[np.bool_]:
@@ -151,8 +154,8 @@ def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> 
     for index, rows in _by_value(plane):
         faces = ordered[first[index] : first[index + 1]]
         for part in np.array_split(rows, -(-len(rows) * len(faces) // PAIRS_TOGETHER)):
-            row, own = np.repeat(part, len(faces)), np.tile(faces, len(part))
-            away = np.linalg.norm(closest_point(surfaces.triangles[own], points_m[row]) - points_m[row], axis=1)
+            row, candidate = np.repeat(part, len(faces)), np.tile(faces, len(part))
+            away = np.linalg.norm(closest_point(surfaces.triangles[candidate], points_m[row]) - points_m[row], axis=1)
             away = away.reshape(len(part), len(faces))
             face[part], away_m[part] = faces[away.argmin(axis=1)], away.min(axis=1)
     return face, away_m
@@ -162,12 +165,11 @@ def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met:
     """All crossings of faces within `NEAR` of a point where a path meets another surface, each leg and plane once."""
     path, level = np.nonzero(plane >= 0)
     row, slot = np.nonzero(met.interactions == TRANSMISSION)
-    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[row, slot]
     mirrored = _near_planes(surfaces, plane[path, level], vertices_m[path, level + 1])
     passed = _near_planes(surfaces, surfaces.plane[met.face[row, slot]], met.points_m[row, slot])
     # At a reflection, both of its legs; at a transmission, which rays do not tell from another one at the same point,
     # the leg that it is on.
-    places = ((path, level, mirrored), (path, level + 1, mirrored), (row, leg, passed))
+    places = ((path, level, mirrored), (path, level + 1, mirrored), (row, met.leg[row, slot], passed))
     parts = [_crossed(surfaces, vertices_m, plane, *place) for place in places]
     crossings = _Crossings(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     key = np.stack([crossings.path, crossings.leg, surfaces.plane[crossings.face]])
@@ -238,8 +240,8 @@ def _by_value(values: IntArray) -> Iterator[tuple[int, IntArray]]:
 def _unrecorded(surfaces: Surfaces, legs: int, met: Met, crossings: _Crossings) -> _Crossings:
     """Crossings that rays have not met on the same of a path's legs."""
     path, slot = np.nonzero(met.interactions == TRANSMISSION)
-    leg = np.cumsum(met.interactions == SPECULAR, axis=1)[path, slot]
-    columns = [(path, leg, surfaces.plane[met.face[path, slot]])]
+    columns = [(path, met.leg[path, slot], surfaces.plane[met.face[path, slot]])]
     columns += [(crossings.path, crossings.leg, surfaces.plane[crossings.face])]
-    known, new = ((row * legs + at) * len(surfaces.normal) + crossed for row, at, crossed in columns)
-    return crossings.select(~np.isin(new, known))
+    # One number for each path, leg and plane: a straight leg crosses a plane once.
+    met_by_rays, crossed = ((row * legs + at) * len(surfaces.normal) + plane for row, at, plane in columns)
+    return crossings.select(~np.isin(crossed, met_by_rays))

@@ -184,21 +184,9 @@ class Surfaces:
                 solids.append(Solid(face, corners, np.sign(volume) * trimesh.triangles.normals(corners)[0]))
         return solids
 
-    @cached_property
-    def solid_bounds_m(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates of the solids [s, 3], metres."""
-        empty = [np.zeros((0, 3))]
-        low, high = ([getattr(one.corners, side)((0, 1))[None] for one in self.solids] for side in ("min", "max"))
-        return np.concatenate(empty + low), np.concatenate(empty + high)
-
-    @cached_property
-    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates of the faces [3], metres."""
-        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
-
-    def called(self, thing: int) -> str:
+    def called(self, index: int) -> str:
         """Name of an object in error messages, with its mesh file if that has another name."""
-        name, file = self.names[thing], self.files[thing] if self.files else ""
+        name, file = self.names[index], self.files[index] if self.files else ""
         return repr(name) if Path(file).stem in ("", name) else f"{name!r} ({file})"
 
     def object_of(self, face: IntArray) -> IntArray:
@@ -218,8 +206,8 @@ def scene_surfaces(scene: Any) -> Surfaces:
         corners = np.asarray(parameters["vertex_positions"], float).reshape(-1, 3)
         triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
         ids.append(shape_id(mesh))
-        found = MESH_FILE.search(str(mesh))
-        files.append(found[1] if found else "")
+        stated_file = MESH_FILE.search(str(mesh))
+        files.append(stated_file[1] if stated_file else "")
     first = np.cumsum([len(part) for part in triangles])
     surfaces = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
     return replace(surfaces, files=tuple(files))
@@ -242,13 +230,15 @@ def find_planes(
     The second step joins a wall with its slivers, whose normals are inexact.
     """
     centre, cross = triangles.mean(axis=1), trimesh.triangles.cross(triangles)
-    area = np.linalg.norm(cross, axis=1)[:, None] / 2
-    normal = np.divide(cross, 2 * area, out=np.tile([0.0, 0.0, 1.0], (len(cross), 1)), where=area > 0)
-    area = area[:, 0]
+    area = np.linalg.norm(cross, axis=1) / 2
+    # Faces without area get any normal: no ray meets them.
+    normal = np.tile([0.0, 0.0, 1.0], (len(cross), 1))
+    np.divide(cross, 2 * area[:, None], out=normal, where=area[:, None] > 0)
     largest = np.abs(normal).argmax(axis=1)[:, None]
     normal *= np.sign(np.take_along_axis(normal, largest, axis=1))  # both sides of a sheet have one normal
     offset = (normal * centre).sum(axis=1)
 
+    # First equal rounded normals and offsets, in one pass; a face on the border of two cells is taken in below.
     rounded = np.round(np.column_stack([normal, offset]) / COPLANAR_M).astype(np.int64)
     _, plane = np.unique(rounded, axis=0, return_inverse=True)
     plane = plane.reshape(-1)
@@ -263,14 +253,14 @@ def find_planes(
         candidates = np.flatnonzero(free & (np.abs(centre @ normal[face] - offset[face]) < COPLANAR_M))
         near = np.abs(triangles[candidates] @ normal[face] - offset[face]).max(axis=1) < COPLANAR_M
         near &= np.abs(normal[candidates] @ normal[face]) > COPLANAR_COS
-        near |= candidates == face
+        near |= candidates == face  # its own corners may be off by more: the normal of a sliver is inexact
         plane[candidates[near]] = seed
         free[candidates[near]] = False
     labels, plane = np.unique(plane, return_inverse=True)
     plane = plane.reshape(-1)
     # The plane is that of the face which took in the others: theirs may be tilted within the tolerance.
-    kept = plane[biggest[labels]] == np.arange(len(labels))
-    face = np.where(kept, biggest[labels], largest_face(plane, area))
+    is_own_plane = plane[biggest[labels]] == np.arange(len(labels))
+    face = np.where(is_own_plane, biggest[labels], largest_face(plane, area))
     normal, offset = normal[face], offset[face]
     edge = triangles[face][:, 1] - triangles[face][:, 0]
     edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)

@@ -81,36 +81,37 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
         cluster = dr.gather(mi.UInt32, together, lane * legs + leg, active)  # reflections at the end of the leg
         origin = start + direction * way
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
-        there = active & hit.is_valid()
+        hits = active & hit.is_valid()
         met: Any = origin + direction * hit.t
         at = way + hit.t
-        here = dr.gather(mi.UInt32, plane_of, hit.prim_index, there)
+        plane_met = dr.gather(mi.UInt32, plane_of, hit.prim_index, hits)
 
         arriving: Any = expected[0] == NO_PLANE
         place = mi.UInt32(MOST_CLUSTERED)  # of the plane in the cluster, whose other faces are found afterwards
         for k in reversed(range(MOST_CLUSTERED)):
-            place = dr.select(there & (here == expected[k]) & (k < cluster), mi.UInt32(k), place)
+            place = dr.select(hits & (plane_met == expected[k]) & (k < cluster), mi.UInt32(k), place)
         mirrors: Any = place < MOST_CLUSTERED
         # Rays do not tell a plane that ends at the point of reflection from the one that reflects: either is the end.
-        at_end: Any = there & ~arriving & (at > length - window) & (at < length + window)
+        at_end: Any = hits & ~arriving & (at > length - window) & (at < length + window)
         reflects: Any = (mirrors | at_end) & (count + cluster <= slots)
         # A plane beyond the end is not met: the target is reached, or the plane that reflects has no face there.
-        ends = active & ~reflects & (~there | (at >= length + dr.select(arriving, -skip, window)))
-        again: Any = (here == last[0]) | (here == last[1]) | (here == last[2])  # a straight line meets a plane once
+        ends = active & ~reflects & (~hits | (at >= length + dr.select(arriving, -skip, window)))
+        # A straight line meets a plane once: a second hit is a seam of its faces, or rounding.
+        again: Any = (plane_met == last[0]) | (plane_met == last[1]) | (plane_met == last[2])
         beside: Any = at < dr.select(leg == 0, 0, window)
-        crosses = there & ~reflects & ~ends & ~again & ~beside
+        crosses = hits & ~reflects & ~ends & ~again & ~beside
         passes = crosses & through & (count < slots)
-        told = (reflects & mirrors) | passes
+        has_face = (reflects & mirrors) | passes
         slot = lane * slots + count + dr.select(reflects, place, mi.UInt32(0))
         code = hit.prim_index + dr.select(reflects, mi.UInt32(REFLECTS), mi.UInt32(0))
-        dr.scatter(codes, code, slot, told)
-        dr.scatter(points, met, slot, told)
+        dr.scatter(codes, code, slot, has_face)
+        dr.scatter(points, met, slot, has_face)
         none, zero = mi.UInt32(NO_PLANE), mi.UInt32(0)
         # The next leg begins on the planes of the cluster.
         turned = [dr.select(k < cluster, expected[k], none) for k in range(MOST_CLUSTERED)]
-        straight = [here, last[0], last[1]]
+        straight = [plane_met, last[0], last[1]]
         return (
-            there & ~ends & (reflects | passes | again | beside) & (step < most),
+            hits & ~ends & (reflects | passes | again | beside) & (step < most),
             reached | (ends & arriving),
             leg + dr.select(reflects, cluster, zero),
             step + 1,
@@ -124,18 +125,18 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     state = (*begin, [dr.full(mi.UInt32, NO_PLANE, size) for _ in range(MOST_CLUSTERED)])
     reached, count = dr.while_loop(state, lambda active, *_: active, body)[1:5:3]
     dr.eval(reached, count, codes, points)
-    kept = np.flatnonzero(reached.numpy())
-    code = codes.numpy().reshape(size, depth)[kept].astype(np.int64)
-    found = np.arange(depth) < count.numpy()[kept, None]
+    is_path = np.flatnonzero(reached.numpy())
+    code = codes.numpy().reshape(size, depth)[is_path].astype(np.int64)
+    used = np.arange(depth) < count.numpy()[is_path, None]
     kinds = np.where(code >= REFLECTS, SPECULAR, TRANSMISSION)
-    points_m = np.moveaxis(points.numpy().reshape(3, size, depth), 0, -1)[kept].astype(float)
+    points_m = np.moveaxis(points.numpy().reshape(3, size, depth), 0, -1)[is_path].astype(float)
     met = Met(
-        kept,
-        np.where(found, kinds, 0).astype(np.uint8),
-        np.where(found, code % REFLECTS, -1),
-        np.where(found[..., None], points_m + surfaces.centre_m, np.nan),
+        is_path,
+        np.where(used, kinds, 0).astype(np.uint8),
+        np.where(used, code % REFLECTS, -1),
+        np.where(used[..., None], points_m + surfaces.centre_m, np.nan),
     )
-    return with_crossings(surfaces, vertices_m[kept], plane[kept], met, transmission)
+    return with_crossings(surfaces, vertices_m[is_path], plane[is_path], met, transmission)
 
 
 def clusters(vertices_m: FloatArray, plane: IntArray, apart_m: float) -> IntArray:

@@ -74,15 +74,6 @@ def sionna_orientation(to_world: ArrayLike) -> FloatArray:
         return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
 
 
-def point_array(points: FloatArray) -> Any:
-    """Points [n, 3] as Mitsuba's ``Point3f``."""
-    import mitsuba as mi
-
-    from ...backend.device import to_vectors
-
-    return to_vectors(points, mi.Point3f)
-
-
 def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     """A ``PathsBuffer`` of these paths."""
     import drjit as dr
@@ -125,18 +116,18 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
 
     buffer.schedule()
     dr.eval()
-    kept = np.flatnonzero(buffer.valid.numpy())
-    types = buffer.interaction_types.numpy()[kept].astype(np.uint8)
+    valid = np.flatnonzero(buffer.valid.numpy())
+    types = buffer.interaction_types.numpy()[valid].astype(np.uint8)
     used = types != 0
-    shape, primitive = (tensor.numpy()[kept].astype(np.int64) for tensor in (buffer.shapes, buffer.primitives))
+    shape, primitive = (tensor.numpy()[valid].astype(np.int64) for tensor in (buffer.shapes, buffer.primitives))
     face = np.full(shape.shape, -1, np.int64)
     face[used] = surfaces.first_by_shape[shape[used]] + primitive[used]
-    vertices = np.stack([getattr(buffer, f"vertices_{axis}").numpy()[kept] for axis in "xyz"], axis=-1).astype(float)
+    vertices = np.stack([getattr(buffer, f"vertices_{axis}").numpy()[valid] for axis in "xyz"], axis=-1).astype(float)
     vertices[~used] = np.nan
     wedges = buffer.diffracting_wedges
-    wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[kept] for name in WEDGE}
-    source, target = (index.numpy()[kept].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
-    return Legs(source, target, types, face, vertices, buffer.probs.numpy()[kept], wedge)
+    wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[valid] for name in WEDGE}
+    source, target = (index.numpy()[valid].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
+    return Legs(source, target, types, face, vertices, buffer.probs.numpy()[valid], wedge)
 
 
 def sampled_paths(
@@ -147,14 +138,17 @@ def sampled_paths(
     Source 0, target 0..n-1; vertices are in single precision.
     """
     import drjit as dr
+    import mitsuba as mi
     from sionna.rt.path_solvers.image_method import ImageMethod
     from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+    from ...backend.device import to_vectors
 
     step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
     parts = []
     for start in range(0, len(targets_m), step):
         batch = targets_m[start : start + step]
-        ends = point_array(source_m[None]), point_array(batch)
+        ends = to_vectors(source_m[None], mi.Point3f), to_vectors(batch, mi.Point3f)
         dr.make_opaque(*ends)
         buffer = SBDeterministicCandidateGenerator()(
             mi_scene=scene.mi_scene,
@@ -182,11 +176,12 @@ def sampled_paths(
             src_positions=ends[0],
             tgt_positions=ends[1],
         )
-        found = from_buffer(buffer, surfaces)
-        types = found.interactions
-        found = found.select(((types != 0) & (types != SPECULAR) & (types != TRANSMISSION)).any(axis=1))
-        parts.append(replace(found, target=found.target + start))
-    return join(parts, options.max_depth)
+        legs = from_buffer(buffer, surfaces)
+        # Specular paths are those of `images`: Sionna RT's search finds them by chance, in single precision.
+        specular = np.isin(legs.interactions, (0, SPECULAR, TRANSMISSION)).all(axis=1)
+        legs = legs.select(np.flatnonzero(~specular))
+        parts.append(replace(legs, target=legs.target + start))
+    return join(parts)
 
 
 def field_of(
@@ -209,24 +204,29 @@ def field_of(
     import mitsuba as mi
     from sionna.rt.path_solvers.field_calculator import FieldCalculator
 
+    from ...backend.device import to_vectors
+
     if buffer.buffer_size == 0:
         return mi.Float(), mi.Float()
     calculator = FieldCalculator()
     calculator.loop_mode = loop_mode
+    # The calculator marks paths of gain zero as invalid; all are evaluated again in the next call.
     buffer.valid = dr.full(mi.Bool, True, buffer.buffer_size)
-    done = calculator(
+    points = (values for end in ends for values in (end.position_m, end.angles))
+    source_m, source_angles, target_m, target_angles = (to_vectors(rows, mi.Point3f) for rows in points)
+    evaluated = calculator(
         wavelength=scene.wavelength,
         paths=buffer,
         samples_per_src=rays,
         diffraction=buffer.diffracting_wedges is not None,
-        src_positions=point_array(ends[0].position_m),
-        tgt_positions=point_array(ends[1].position_m),
-        src_orientations=point_array(ends[0].angles),
-        tgt_orientations=point_array(ends[1].angles),
+        src_positions=source_m,
+        tgt_positions=target_m,
+        src_orientations=source_angles,
+        tgt_orientations=target_angles,
         src_antenna_patterns=[_pattern(ends[0], buffer.source_indices)],
         tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices)],
     )
-    gain = done.a[0][0]
+    gain = evaluated.a[0][0]
     return gain.real, gain.imag
 
 
@@ -318,11 +318,11 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
 def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
     """Set the scattering coefficient of all materials while the block lasts, if scattering is on."""
     able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
-    before = [material.scattering_coefficient for material in able]
+    stated = [material.scattering_coefficient for material in able]
     for material in able:
         material.scattering_coefficient = options.scattering_coefficient
     try:
         yield
     finally:
-        for material, coefficient in zip(able, before, strict=True):
+        for material, coefficient in zip(able, stated, strict=True):
             material.scattering_coefficient = coefficient
