@@ -81,6 +81,11 @@ class TraceOptions:
         return most if self.reflection else 0
 
     @property
+    def surfaces_met(self) -> int:
+        """Largest number of surfaces that a ray of the search for specular paths meets."""
+        return self.max_depth if self.transmission else self.reflections
+
+    @property
     def sampled(self) -> bool:
         """Whether paths are drawn at random (scattering) or along edges, by Sionna RT's search."""
         return (self.diffraction or self.scattering) and self.max_depth > 0

@@ -251,7 +251,7 @@ class MovedSearch:
 
     Attributes:
         prepared: shared state of traces in the moved scene.
-        parameters: parameters of the traced fields, Dr.Jit tensors by name, by which faint paths are told.
+        parameters: parameters of the traced fields, Dr.Jit tensors by name, used to prune weak paths.
     """
 
     prepared: Prepared

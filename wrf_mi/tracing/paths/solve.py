@@ -108,9 +108,8 @@ class Prepared:
 
     def new_chains(self, sources_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
         """Chains from points [s, 3] by rays of any seed, not kept here."""
-        surfaces, met = self.surfaces, options.max_depth if options.transmission else options.reflections
-        how = rays, met, options.reflections, seed, options.transmission
-        planes = [shoot(self.scene, surfaces, source_m, *how) for source_m in sources_m]
+        surfaces = self.surfaces
+        planes = [shoot(self.scene, surfaces, source_m, options, rays, seed) for source_m in sources_m]
         source = np.repeat(np.arange(len(planes)), [len(plane) for plane in planes])
         plane = np.concatenate(planes)
         image = image_sources(surfaces.normal, surfaces.offset, plane, sources_m[source])[:, 1:]

@@ -126,7 +126,7 @@ class TracedField:
             caller checks the antennas (`wrf_mi.tracing.paths.solve.Prepared.check`).
         frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
-        present: Dr.Jit tensors by the names of `parameters` by which faint paths are told; None: as stated.
+        present: parameter values used to prune weak paths, Dr.Jit tensors by name; None: as stated.
 
     Attributes:
         frequency_hz: carrier of the paths.

@@ -76,41 +76,32 @@ class ReflectionChains:
 
 
 def shoot(
-    scene: Any,
-    surfaces: Surfaces,
-    source_m: FloatArray,
-    rays: int,
-    depth: int,
-    reflections: int,
-    seed: int,
-    passing: bool = True,
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
     """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
     Rays leave on a randomly rotated Fibonacci lattice. Where waves pass surfaces, the rays are shot once for each
-    choice of the hits that reflect: up to two to the power of the depth. What they found is kept in the
-    process for `MOST_KEPT` bytes of the last calls: models, folds and carriers trace the same rooms from the same
-    receivers.
+    choice of the hits that reflect: up to two to the power of the depth. The process keeps `MOST_KEPT` bytes of the
+    last results: models, folds and carriers trace the same rooms from the same receivers.
 
     Args:
         scene: ``sionna.rt.Scene``.
         surfaces: surfaces of the scene.
         source_m: position [3], metres.
+        options: numbers of surfaces met and of reflections, and whether rays pass surfaces.
         rays: number of rays.
-        depth: largest number of surfaces met.
-        reflections: largest number of reflections.
         seed: seed of the lattice's random rotation.
-        passing: whether rays pass surfaces, or are reflected at each.
 
     Returns:
         Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
     """
-    key = surfaces.digest, source_m.tobytes(), rays, depth, reflections, seed, passing
+    reach = options.surfaces_met, options.reflections, options.transmission
+    key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
     else:
         turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, depth, patterns(depth, reflections, passing))
+        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, options.surfaces_met, patterns(*reach))
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -173,7 +164,7 @@ def _shoot(
 
     ray = mi.Ray3f(to_vectors(source_m[None], mi.Point3f), to_vectors(directions.T, mi.Vector3f))
     first, plane = surfaces.faces_on_device
-    # As data, not as code: the same kernel serves every pattern.
+    # Runtime argument, so that Dr.Jit reuses the kernel for every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
     planes: list[Any] = []
@@ -222,7 +213,7 @@ def possible(
     length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
     (reflections, planes, images), tables = chains.on_device, surfaces.planes_on_device
     step = max(1, PAIRS_PER_CHUNK // len(targets_m))
-    # As data, not as code: the same kernel serves all numbers of targets.
+    # Runtime arguments, so that Dr.Jit reuses the kernel for all numbers of targets.
     count, beside = dr.opaque(mi.UInt32, len(targets_m)), dr.opaque(mi.Float, BESIDE * surfaces.scale_m)
     for start in range(0, len(chains), step):
         part = min(step, len(chains) - start)
@@ -260,7 +251,7 @@ def hits(options: TraceOptions, rays: int) -> int:
     """
     if not options.reflections:
         return 0
-    met = options.max_depth if options.transmission else options.reflections
+    met = options.surfaces_met
     return len(patterns(met, options.reflections, options.transmission)) * rays * met
 
 

@@ -20,7 +20,7 @@ BEHIND_M = 0.01
 BEFORE_M = 1e-4
 """Least distance before a surface from which an antenna on it is traced."""
 CLEAR = 2.5e-5
-"""The same as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
+"""That distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
 ON_SHARE = 0.1
@@ -44,8 +44,8 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
-    corners = surfaces.triangles.reshape(-1, 3)
-    beyond = np.maximum(corners.min(axis=0) - positions_m, positions_m - corners.max(axis=0)).max(axis=1)
+    low, high = surfaces.bounds_m
+    beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
         text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres"
@@ -89,11 +89,13 @@ def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -> Iterator[tuple[Solid, IntArray]]:
     """Solids with the positions [n, 3] that lie within their bounds and a margin."""
-    for solid in surfaces.solids:
-        low, high = solid.corners.min(axis=(0, 1)) - margin_m, solid.corners.max(axis=(0, 1)) + margin_m
-        rows = np.flatnonzero(((positions_m >= low) & (positions_m <= high)).all(axis=1))
-        if len(rows):
-            yield solid, rows
+    low, high = surfaces.solid_bounds_m
+    near = np.ones((len(positions_m), len(low)), bool)
+    # Axis by axis: furnished scenes have hundreds of solids, and predictions few positions.
+    for axis, coordinate in enumerate(positions_m.T):
+        near &= (coordinate[:, None] >= low[:, axis] - margin_m) & (coordinate[:, None] <= high[:, axis] + margin_m)
+    for number in np.flatnonzero(near.any(axis=0)):
+        yield surfaces.solids[number], np.flatnonzero(near[:, number])
 
 
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
@@ -103,7 +105,7 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     for (_, corners, normal), rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
         if len(normal) < len(corners):
             continue
-        # Most positions are far from all planes of the faces, which is told faster than distances from faces.
+        # Distances from planes are computed faster than those from faces, and rule out most positions.
         height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
         inside = winding_number(corners, moved[rows]) > 0.5
         for row, limit in zip(rows, np.where(inside, BEHIND_M, clear), strict=True):

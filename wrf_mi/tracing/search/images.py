@@ -117,7 +117,7 @@ def specular_paths(
     for start in range(0, max(1, len(candidates[0])), CANDIDATES_PER_CHUNK):
         chain, source, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         plane = np.where(chain[:, None] >= 0, chains.plane[chain], -1) if len(chains) else chain[:, None][:, :0]
-        # Whether a path exists is told near its ends, not at them; its points are exact.
+        # Existence of a path is judged for displaced antennas (`displaced`); its points are exact for the stated ones.
         near = displaced(surfaces.scale_m, clear_sources[source], clear_targets[target])
         vertices, meets = _vertices(surfaces, plane, *(ends + surfaces.centre_m for ends in near))
         meets &= ~_mounted(surfaces, plane, sources_m[source], targets_m[target])

@@ -28,7 +28,7 @@ leave which were modelled one by one, `wrf_mi.scene.surfaces.SAME_CORNER_M`."""
 PAIRS_TOGETHER = 1 << 20
 """Pairs of points and planes, or faces, in a chunk."""
 UNKNOWN_FACE = (1 << 31) - 1
-"""Face of a reflection that no ray told from another one at the same point."""
+"""Face of a reflection that rays cannot distinguish from another one at the same point."""
 
 
 class Met(NamedTuple):

@@ -184,6 +184,18 @@ class Surfaces:
                 solids.append(Solid(face, corners, np.sign(volume) * trimesh.triangles.normals(corners)[0]))
         return solids
 
+    @cached_property
+    def solid_bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates of the solids [s, 3], metres."""
+        bounds = [np.stack([solid.corners.min((0, 1)), solid.corners.max((0, 1))]) for solid in self.solids]
+        low, high = np.reshape(bounds, (-1, 2, 3)).swapaxes(0, 1)
+        return low, high
+
+    @cached_property
+    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates of the faces [3], metres."""
+        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+
     def called(self, index: int) -> str:
         """Name of an object in error messages, with its mesh file if that has another name."""
         name, file = self.names[index], self.files[index] if self.files else ""

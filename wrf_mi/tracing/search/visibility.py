@@ -65,7 +65,7 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     ends_at = np.pad(plane, ((0, 0), (0, MOST_CLUSTERED)), constant_values=-1)
     planes = to_uint(np.where(ends_at < 0, NO_PLANE, ends_at))
     together = to_uint(clusters(vertices_m, plane, CLUSTER * surfaces.scale_m))
-    # As data, not as code: the same kernel serves all depths.
+    # Runtime arguments, so that Dr.Jit reuses the kernel for all depths.
     slots, most = dr.opaque(mi.UInt32, depth), dr.opaque(mi.UInt32, 4 * (depth + legs))
     through = dr.opaque(mi.Bool, transmission)
     skip, window = (dr.opaque(mi.Float, share * surfaces.scale_m) for share in (STEP, WINDOW))

@@ -195,7 +195,7 @@ def field_of(
 
     Args:
         scene: ``sionna.rt.Scene``.
-        buffer: p paths from source to target, from `wrf_mi.tracing.sionna.buffer.to_buffer`; may be used again.
+        buffer: p paths from source to target, from `to_buffer`; may be used again.
         ends: sources and targets.
         rays: number of rays shot per source, for diffuse reflections.
         loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
@@ -297,7 +297,8 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     direction = points[row, 1:] - image
     size = np.linalg.norm(direction, axis=2, keepdims=True)
     direction /= np.maximum(size, 1e-30)
-    for leg in reversed(range(direction.shape[1] - 1)):  # an antenna within a sheet that its path passes
+    # An antenna within a sheet that its path passes is at its first point: that leg takes the next one's direction.
+    for leg in reversed(range(direction.shape[1] - 1)):
         at_image = size[:, leg] < AT_ANTENNA_M
         direction[:, leg] = np.where(at_image, direction[:, leg + 1], direction[:, leg])
     moved = np.zeros_like(points[row])
