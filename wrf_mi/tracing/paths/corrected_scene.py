@@ -122,8 +122,8 @@ def check_materials(scene: Any) -> None:
         InputError: a material that is neither a slab nor an absorber.
     """
     slabs = read_materials(scene).names
-    for name, thing in scene.objects.items():
-        if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
+    for name, scene_object in scene.objects.items():
+        if (material := scene_object.radio_material.name) not in slabs and not absorbs(scene_object.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
 
 
@@ -229,9 +229,9 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
     corners = np.round(surfaces.triangles.reshape(-1, 3) / SAME_CORNER_M)
     vertices, same = np.unique(corners, axis=0, return_inverse=True)
     pairs = trimesh.Trimesh(vertices, same.reshape(-1, 3), process=False).face_adjacency
-    plane, thing = surfaces.plane[pairs], surfaces.object_of(pairs)
+    plane, object_index = surfaces.plane[pairs], surfaces.object_of(pairs)
     bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
-    smooth = (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS)
+    smooth = (plane[:, 0] != plane[:, 1]) & (object_index[:, 0] == object_index[:, 1]) & (bend > CREASE_COS)
     smooth &= known[pairs].all(axis=1)
     facets[slab_of_face[pairs[smooth]]] = True
     return facets

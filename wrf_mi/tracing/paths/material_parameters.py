@@ -174,12 +174,12 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]
     number = np.array([named.names.index(kind) if kind in named.names else -1 for kind in kinds], np.int64)
-    thing = surfaces.object_of(np.arange(len(surfaces.plane)))
-    slab_of_face = number[thing] if len(thing) else np.zeros(0, np.int64)
+    object_index = surfaces.object_of(np.arange(len(surfaces.plane)))
+    slab_of_face = number[object_index] if len(object_index) else np.zeros(0, np.int64)
     if grouping == "named":
         return named, slab_of_face
     is_slab = slab_of_face >= 0
-    pairs, surface = np.unique(np.stack([thing, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
+    pairs, surface = np.unique(np.stack([object_index, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
     slab_of_face[is_slab] = surface.reshape(-1)
     names = tuple(f"{surfaces.names[index]}/{plane}" for index, plane in pairs)
     return replace(named.select(number[pairs[:, 0]]), names=names, grouping=grouping), slab_of_face

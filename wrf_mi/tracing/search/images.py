@@ -17,9 +17,8 @@ from ..options import TraceOptions
 from .chains import ReflectionChains, possible
 from .devices import before_surfaces, clear_m
 from .legs import SPECULAR, Legs, join, specular_legs
-from .seams import reflect_on_faces
 from .surfaces import Surfaces
-from .visibility import unobstructed
+from .visibility import reflect_on_faces, unobstructed
 
 CANDIDATES_PER_CHUNK = 1 << 20
 """Candidates in a chunk, which take some 100 bytes for each interaction."""

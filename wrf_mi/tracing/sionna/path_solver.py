@@ -86,10 +86,10 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
     face = np.where(used, legs.face, 0)
-    thing = surfaces.object_of(face)
+    object_index = surfaces.object_of(face)
     shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
-    shape[used] = surfaces.shape_ids[thing[used]]
-    primitive[used] = (face - surfaces.first_face[thing])[used]
+    shape[used] = surfaces.shape_ids[object_index[used]]
+    primitive[used] = (face - surfaces.first_face[object_index])[used]
     buffer._valid = dr.opaque(mi.Bool, True, count)
     buffer._src_indices, buffer._tgt_indices = columns_on_device((legs.source, legs.target), mi.UInt32)
     integers: Any = mi.TensorXu
