@@ -221,6 +221,7 @@ def _depth(sample: _Sampled, options: TraceOptions, share: float) -> tuple[Trace
         deeper = replace(now, max_depth=now.max_depth + 1)
         changes.append(sample.change("depth", deeper.max_depth, now, deeper))
         now = deeper
+        # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
         if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:
             break
     return now, remainder(changes)
@@ -234,5 +235,5 @@ def _rays(sample: _Sampled, options: TraceOptions, share: float, most: int = MAX
         rays *= 2
         change = sample.change("rays", rays, now, replace(now, rays=rays))
         now = replace(now, rays=rays)
-        calm = calm + 1 if change <= share else 0
+        calm = calm + 1 if change <= share else 0  # once may be chance: each number has other rays
     return now, change

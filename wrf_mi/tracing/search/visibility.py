@@ -212,8 +212,8 @@ class _Crossings(NamedTuple):
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
 
-    Of k paths with vertices and planes as of `unobstructed`, and what rays met away from the
-    points of reflection, with `UNKNOWN_FACE`.
+    Of k paths with vertices and planes as of `unobstructed`, and what rays met away from the points of reflection, with
+    `UNKNOWN_FACE`.
     """
     met, faces = _with_faces(surfaces, vertices_m, plane, met)
     vertices_m, plane = vertices_m[faces], plane[faces]
@@ -223,30 +223,30 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     # Few paths have any: the others stay as they are.
     crossing, path = np.unique(crossings.path, return_inverse=True)
     part = met.select(crossing)
-    new = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
+    further = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
     if transmission:
-        part, valid = _inserted(part, new, vertices_m[crossing])
+        part, valid = _inserted(part, further, vertices_m[crossing])
     else:
-        valid = ~np.isin(np.arange(len(crossing)), new.path)
+        valid = ~np.isin(np.arange(len(crossing)), further.path)
     met.interactions[crossing], met.face[crossing], met.points_m[crossing] = part[1:]
-    unobstructed = np.ones(len(plane), bool)
-    unobstructed[crossing[~valid]] = False
-    return met if valid.all() else met.select(unobstructed)
+    is_clear = np.ones(len(plane), bool)
+    is_clear[crossing[~valid]] = False
+    return met if valid.all() else met.select(is_clear)
 
 
-def _inserted(met: Met, new: _Crossings, vertices_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
+def _inserted(met: Met, further: _Crossings, vertices_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
     """Paths [k] with further transmissions, and the mask of those that are not too deep."""
     path, slot = np.nonzero(met.interactions)
     mirrors, leg = met.interactions[path, slot] == SPECULAR, met.leg[path, slot]
     start, end = vertices_m[path, leg], vertices_m[path, leg + 1]
     away = np.linalg.norm(met.points_m[path, slot] - start, axis=1) / np.linalg.norm(end - start, axis=1)
-    # By their place on the leg, and the reflections of a cluster, which end it together, in their order.
-    place = np.concatenate([np.where(mirrors, 2.0, away), new.share])
-    paths, legs = np.concatenate([path, new.path]), np.concatenate([leg, new.leg])
+    # Transmissions by their share of the leg; reflections end it, hence a share beyond 1, those of a cluster in order.
+    place = np.concatenate([np.where(mirrors, 2.0, away), further.share])
+    paths, legs = np.concatenate([path, further.path]), np.concatenate([leg, further.leg])
     order = np.lexsort((place, legs, paths))
-    kinds = np.concatenate([met.interactions[path, slot], np.full(len(new.path), TRANSMISSION, np.uint8)])[order]
-    faces = np.concatenate([met.face[path, slot], new.face])[order]
-    points = np.concatenate([met.points_m[path, slot], new.points_m])[order]
+    kinds = np.concatenate([met.interactions[path, slot], np.full(len(further.path), TRANSMISSION, np.uint8)])[order]
+    faces = np.concatenate([met.face[path, slot], further.face])[order]
+    points = np.concatenate([met.points_m[path, slot], further.points_m])[order]
     paths = paths[order]
     slots = np.arange(len(paths)) - np.searchsorted(paths, paths)
     within = slots < met.face.shape[1]
@@ -293,6 +293,7 @@ def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> 
     for index, rows in _by_value(plane):
         faces = ordered[first[index] : first[index + 1]]
         for part in np.array_split(rows, -(-len(rows) * len(faces) // PAIRS_TOGETHER)):
+            # All pairs: planes have few faces, but for those of finely divided meshes, which chunks bound.
             row, candidate = np.repeat(part, len(faces)), np.tile(faces, len(part))
             away = np.linalg.norm(closest_point(surfaces.triangles[candidate], points_m[row]) - points_m[row], axis=1)
             away = away.reshape(len(part), len(faces))

@@ -243,6 +243,7 @@ def _pattern(devices: Devices, index: Any) -> Any:
     functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
     if len(distinct) == 1:
         return functions[0]
+    # The field calculator takes one pattern for all paths: this one evaluates each and selects by the path's antenna.
     kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in antennas])), index)
 
     def mixed(theta: Any, phi: Any) -> tuple[Any, Any]:
