@@ -16,7 +16,7 @@ from ...core.types import IntArray
 from ..options import TraceOptions
 from .chains import ReflectionChains, possible
 from .devices import before_surfaces, clear_m
-from .legs import SPECULAR, Legs, join, specular_legs
+from .legs import SPECULAR, Legs, join
 from .surfaces import Surfaces
 from .visibility import reflect_on_faces, unobstructed
 
@@ -123,7 +123,8 @@ def specular_paths(
         row = np.flatnonzero(meets)
         met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission)
         is_path = row[met.candidate]
-        single = specular_legs(source[is_path], target[is_path], met.interactions, met.face, met.points_m)
+        exhaustive = np.ones(met.face.shape, np.float32)
+        single = Legs(source[is_path], target[is_path], met.interactions, met.face, met.points_m, exhaustive, {})
         exact = _exact(surfaces, chains, chain[is_path], single, sources_m, targets_m)
         valid = reflect_on_faces(surfaces, exact)
         parts.append(exact if valid.all() else exact.select(valid))

@@ -57,13 +57,6 @@ class Legs:
         return replace(self, source=self.target, target=self.source, **arrays)
 
 
-def specular_legs(
-    source: IntArray, target: IntArray, interactions: NDArray[np.uint8], face: IntArray, vertices_m: FloatArray
-) -> Legs:
-    """Legs of an exhaustive search without diffraction."""
-    return Legs(source, target, interactions, face, vertices_m, np.ones(face.shape, np.float32), {})
-
-
 def join(parts: list[Legs]) -> Legs:
     """Concatenate legs of the same depth."""
     wedge: dict[str, NDArray[Any]] = {}
