@@ -402,12 +402,9 @@ def traced_fields(
         moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(scene.frequency[0]))
         position_m = moved_to_m if moved else stated_m
         if moved not in traces:
-            traces[moved] = _search(
-                place.scene, distinct, replace(receiver, position_m=position_m), options, place, False
-            )
+            at = replace(receiver, position_m=position_m)
+            traces[moved] = _search(place.scene, distinct, at, options, place, check=False)
         traced, yaw = traces[moved].of_transmitters(number[rows]), None if heading is None else heading[rows]
-        field = TracedField(
-            scene, positions[rows], receiver, options, yaw, traced, prepared, carrier_hz, position_m, present
-        )
-        fields.append(field)
+        of_carrier = positions[rows], receiver, options, yaw, traced
+        fields.append(TracedField(scene, *of_carrier, prepared, carrier_hz, position_m, present))
     return fields
