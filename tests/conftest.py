@@ -55,7 +55,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Numbers of targets, transmitters where rays leave the receivers, of each search for paths in a test."""
-    from wrf_mi.tracing import solve
+    from wrf_mi.tracing.paths import solve
 
     counts, search = list[int](), solve._search
 

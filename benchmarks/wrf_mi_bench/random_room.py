@@ -26,7 +26,7 @@ from wrf_mi.scene.scan import simulate_scan
 from wrf_mi.synthetic.floor_channels import with_noise
 from wrf_mi.synthetic.searches import free_positions
 from wrf_mi.tracing.options import TraceOptions
-from wrf_mi.tracing.scenes import open_scene
+from wrf_mi.tracing.sionna.scenes import open_scene
 from wrf_mi.tracing.tracer import RayTracer
 
 CARRIER_HZ = 2.44e9

@@ -21,7 +21,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.scan.points import lidar_package
 from wrf_mi.scene.scan.simulated import OUTLIERS, RANGE_NOISE_M, RAYS_PER_POSE, simulate_scan
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 from .comparison import line, room_file
 from .trace import ROOMS, assign

@@ -31,8 +31,8 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.instrument_parameters import pattern_name, receiver_pose
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.instrument_parameters import pattern_name, receiver_pose
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
 from .stress_oracle import ComplexArray, OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
 from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst

@@ -1,8 +1,8 @@
 """Traced side of the joint graph and reports of receivers in NumPy, complex128.
 
-The reference of `wrf_mi.tracing.field_calculator` shares the chains of planes and constants with the graph, but no
-device code. The direction of a leg is that from an image of the transmitter to an image of the receiver; slabs are Airy
-sums, patterns SciPy's spherical harmonics.
+The reference of `wrf_mi.tracing.paths.field_calculator` shares the chains of planes and constants with the graph, but
+no device code. The direction of a leg is that from an image of the transmitter to an image of the receiver; slabs are
+Airy sums, patterns SciPy's spherical harmonics.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from wrf_mi.core.angles import FloatArray, solid_angles
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
 from wrf_mi.receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS
-from wrf_mi.tracing.instrument_parameters import TX_PATTERN, pattern_name
-from wrf_mi.tracing.material_parameters import SURFACE, name_of
-from wrf_mi.tracing.traced_field import TracedField
+from wrf_mi.tracing.paths.instrument_parameters import TX_PATTERN, pattern_name
+from wrf_mi.tracing.paths.material_parameters import SURFACE, name_of
+from wrf_mi.tracing.paths.traced_field import TracedField
 
 from .stress_rows import relative
 
@@ -219,7 +219,7 @@ def slab(
 
 
 def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
-    """Factor [p] of an antenna pattern in directions [p, 3], see `wrf_mi.tracing.instrument_parameters`."""
+    """Factor [p] of an antenna pattern in directions [p, 3], see `wrf_mi.tracing.paths.instrument_parameters`."""
     polar, azimuth = np.arccos(np.clip(direction[:, 2], -1, 1)), np.arctan2(direction[:, 1], direction[:, 0])
     series, weights = np.zeros(len(direction), complex), coefficients[0] + 1j * coefficients[1]
     index = 0

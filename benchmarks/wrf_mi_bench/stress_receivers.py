@@ -25,7 +25,7 @@ from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, Powe
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers import antenna_csi, csi
-from wrf_mi.tracing.traced_field import TracedPaths
+from wrf_mi.tracing.paths.traced_field import TracedPaths
 
 from .stress_fields import (
     HARD,

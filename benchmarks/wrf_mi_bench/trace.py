@@ -23,7 +23,7 @@ from wrf_mi.datasets.newrf import KEYS, read_arrays
 from wrf_mi.receivers import csi
 from wrf_mi.tasks.scores import summary
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 from .comparison import line, room_file
 

@@ -12,7 +12,7 @@ from wrf_mi_bench.trace import confirm_paths, image_method_agreement, match_path
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.tracing import TraceOptions, trace_paths
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 DATA = Path(os.environ.get("WRF_MI_DATA", "")) / "newrf"
 SHARE = 0.99

@@ -25,9 +25,8 @@ from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import CARRIER, TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace
-from wrf_mi.tracing.polarization import cross_polarized
-from wrf_mi.tracing.result import join_traces, recompute
-from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.tracing.paths.result import join_traces, recompute
+from wrf_mi.tracing.tracer import RayTracer, cross_polarized
 
 LOW, HIGH = 1.1e9, 5.1e9
 FLOAT32_DB = 1e-4

@@ -17,8 +17,8 @@ from wrf_mi.correction.fit import LEAST_PATHS
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.datasets import make_splits, read_spectrum_folder, write_spectrum_folder
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.plane_parameters import SHIFT
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.plane_parameters import SHIFT
+from wrf_mi.tracing.paths.solve import Prepared
 
 SECONDS, MEBIBYTES = 60, 2048
 """Most processor time and memory of a command with 15 rows, on a machine that does nothing else."""

@@ -34,8 +34,8 @@ from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.plane_parameters import SHIFT, TILT
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 ROOM = correction_rooms.surfaces

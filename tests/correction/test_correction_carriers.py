@@ -17,8 +17,8 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.material_parameters import EXPONENT, SURFACE, name_of
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.material_parameters import EXPONENT, SURFACE, name_of
+from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)

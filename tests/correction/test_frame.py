@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from wrf_mi.correction.frame import rigid_motion, rigid_motions
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.surfaces import Surfaces, scene_surfaces
+from wrf_mi.tracing.search.surfaces import Surfaces, scene_surfaces
 
 SECOND_ORDER = 5e-5
 """Metres and rad: a rotation of 1.4 mrad times a displacement of 37 mm, or its square times 5 m."""

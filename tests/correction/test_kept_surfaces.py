@@ -13,7 +13,7 @@ from wrf_mi.correction.choices import ABSENT, ABSENT_VALUES, material_places
 from wrf_mi.correction.fit import Fit, State
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.solve import Prepared
 
 
 def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.material_parameters import SURFACE, name_of
-from wrf_mi.tracing.plane_parameters import SHIFT, TILT
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.material_parameters import SURFACE, name_of
+from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.solve import Prepared
 
 ROUNDING = 1e-5
 """Single precision of the tracer's residuals and parameters, k d of 1e3 rad."""

@@ -12,7 +12,7 @@ from scipy.constants import speed_of_light
 from wrf_mi.backend.device import on_device
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.tracing.traced_field import TracedPaths
+from wrf_mi.tracing.paths.traced_field import TracedPaths
 
 # isort: split
 import drjit as dr

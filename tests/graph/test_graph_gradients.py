@@ -11,10 +11,10 @@ import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 
 from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.tracing.instrument_parameters import receiver_pose
 from wrf_mi.tracing.options import FACTOR
-from wrf_mi.tracing.surface_gaussians import SurfaceGaussians
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
+from wrf_mi.tracing.paths.surface_gaussians import SurfaceGaussians
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
 # isort: split
 import drjit as dr

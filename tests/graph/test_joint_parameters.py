@@ -19,8 +19,8 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.graph.combine import PowerReceiver
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, trace_paths
-from wrf_mi.tracing.materials import BELOW_1_GHZ
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig, calibration_config, default_config
 from wrf_mi.training.state import FitState

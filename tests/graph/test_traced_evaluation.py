@@ -33,8 +33,8 @@ from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compressed import compress_run
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tracing.field_calculator import slab
-from wrf_mi.tracing.instrument_parameters import pose_names, receiver_pose
+from wrf_mi.tracing.paths.field_calculator import slab
+from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
 from wrf_mi.training.compress import Compression
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.predictor import Predictor

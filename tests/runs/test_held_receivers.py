@@ -21,7 +21,7 @@ from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
-from wrf_mi.tracing.offsets import fit_offsets
+from wrf_mi.tracing.tracer import fit_offsets
 
 LAW_DBM, EXPONENT = -40.0, 2.5
 ROUNDING_DB = 1e-4

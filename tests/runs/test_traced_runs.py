@@ -25,11 +25,11 @@ from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import open_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import instrument_of
-from wrf_mi.tracing import TraceOptions, load_trace, open_scene, solve
-from wrf_mi.tracing.offsets import fit_offsets
+from wrf_mi.tracing import TraceOptions, load_trace, open_scene
 from wrf_mi.tracing.options import stated_kinds
-from wrf_mi.tracing.surfaces import scene_surfaces
-from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.tracing.paths import solve
+from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.tracer import RayTracer, fit_offsets
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
 CALIBRATED = TracingSettings(reflection=False, max_depth=0, calibration="gain,patterns", steps=60)

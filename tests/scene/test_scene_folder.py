@@ -20,7 +20,7 @@ from wrf_mi.scene.materials import Materials, read_materials
 from wrf_mi.scene.mesh.surfaces import Surface, number_names
 from wrf_mi.scene.scan import simulate_scan
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.materials import perfect_reflector
+from wrf_mi.tracing.sionna.materials import perfect_reflector
 
 FREQUENCY_HZ = 2.4e9
 

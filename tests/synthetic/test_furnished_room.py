@@ -17,8 +17,8 @@ from wrf_mi.receivers.channel import array_channels
 from wrf_mi.synthetic.furnished_room import MEASURED, TracedRoom, traced_room, transmitters
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.devices import solid_around
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.devices import solid_around
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 SMALL = TracedRoom(train=6, test=2, rays=1 << 10, scattered_rays=1 << 8, depth=2, reflections=1)
 

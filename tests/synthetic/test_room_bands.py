@@ -23,7 +23,7 @@ from wrf_mi.synthetic.room_bands import DEFAULT, RECEIVERS, RoomBands, channels_
 from wrf_mi.synthetic.searches import searched_paths, set_scattering, trace_channels
 from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.result import recompute
+from wrf_mi.tracing.paths.result import recompute
 
 SMALL = RoomBands(
     train=4,

@@ -10,7 +10,9 @@ import pytest
 from traced_rooms import inside, receiver, room
 
 from wrf_mi.core import InputError
-from wrf_mi.tracing import TraceOptions, search, solve
+from wrf_mi.tracing import TraceOptions
+from wrf_mi.tracing.paths import solve
+from wrf_mi.tracing.search import chains as search
 
 IMMEDIATE_S = 5.0
 """More than a refusal takes on a busy machine, and less than the shortest search that is refused."""

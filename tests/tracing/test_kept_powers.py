@@ -14,7 +14,7 @@ from wrf_mi.core import Antenna
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers import rssi_dbm
 from wrf_mi.tracing import TraceOptions, power_map, trace_paths
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.solve import Prepared
 
 OPTIONS = TraceOptions(transmission=True, max_depth=1)
 POSITIONS, CENTRE = inside(5), (3.0, 2.0, 1.5)

@@ -9,9 +9,9 @@ import numpy as np
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.corrected_scene import moved_triangles
-from wrf_mi.tracing.plane_parameters import SHIFT
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.paths.corrected_scene import moved_triangles
+from wrf_mi.tracing.paths.plane_parameters import SHIFT
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 SHIFT_M = 0.03
 ROUNDED_M = 1e-5

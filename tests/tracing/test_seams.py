@@ -16,10 +16,10 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.backend.device import to_vectors
 from wrf_mi.core import Paths
 from wrf_mi.tracing import TraceOptions, trace_paths
-from wrf_mi.tracing.buffer import TRANSMISSION
-from wrf_mi.tracing.images import displaced
-from wrf_mi.tracing.screens import ENLARGED, OVERLAP, enlarged, scale_m, screens
-from wrf_mi.tracing.solve import Prepared
+from wrf_mi.tracing.paths.solve import Prepared
+from wrf_mi.tracing.search.images import displaced
+from wrf_mi.tracing.search.legs import TRANSMISSION
+from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, scale_m, screens
 
 LONG, WIDE, HIGH, WALL = 8.0, 4.0, 2.5, 4.0
 """Two rooms side by side, metres, and where the wall between them stands."""

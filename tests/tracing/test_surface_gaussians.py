@@ -17,8 +17,8 @@ from wrf_mi.receivers.instruments import ChannelInstrument
 from wrf_mi.tasks import task_of
 from wrf_mi.tracing import RayTracer, TraceOptions
 from wrf_mi.tracing.options import DISC, FACTOR
-from wrf_mi.tracing.surface_gaussians import NEAREST, SIZE, Interactions, SurfaceGaussians
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.surface_gaussians import NEAREST, SIZE, Interactions, SurfaceGaussians
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
 # isort: split
 import drjit as dr

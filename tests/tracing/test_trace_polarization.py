@@ -21,7 +21,7 @@ from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
-from wrf_mi.tracing.polarization import GAIN_DB, cross_polarized
+from wrf_mi.tracing.tracer import GAIN_DB, cross_polarized
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.trainer import Trainer
 

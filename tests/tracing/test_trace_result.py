@@ -10,9 +10,8 @@ from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, roo
 
 from wrf_mi.core import Antenna, InputError, Paths, load_paths, save_paths
 from wrf_mi.tracing import TraceOptions, TraceResult, load_trace, open_scene, recompute, save_trace, trace_paths
-from wrf_mi.tracing.buffer import to_buffer
-from wrf_mi.tracing.fields import field_of
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
 SINGLE = 1e-5
 """Relative to the largest; other widths of vector instructions."""

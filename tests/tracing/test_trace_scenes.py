@@ -17,8 +17,8 @@ from wrf_mi.scene.coordinates import Y_UP
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.devices import before_surfaces, check_devices, clear_m, winding_number
-from wrf_mi.tracing.surfaces import find_planes, scene_surfaces
+from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m, winding_number
+from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 
 
@@ -140,7 +140,7 @@ def test_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog
     np.testing.assert_allclose(np.sort(behind), np.sort(on), atol=2e-4)
     assert not far
     assert "1 of 1 antennas lie up to 1 cm behind a surface (first: receiver rx)" in caplog.text
-    assert "1 of 1 receivers have no path (first: rx at (-0.02, 2.50, 1.30) m)" in caplog.text
+    assert "1 of 1 receivers have no path (first: receiver rx at (-0.02, 2.50, 1.30) m)" in caplog.text
     # Sheets inside a room have no right side, but an antenna on one has a side; beyond a wall's edges nothing is moved.
     places = np.array([[2.5, 2.5, 0.695], [2.5, 2.5, 0.705], [2.5, 2.5, 0.7], [0.0, 2.5, 1.3], [-2e-3, 9.0, 1.3]])
     clear = clear_m(surfaces)

@@ -28,11 +28,11 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi import backend
 from wrf_mi.core import InputError, Paths
 from wrf_mi.tracing import TraceOptions, recompute, trace_paths
-from wrf_mi.tracing import images as images_module
-from wrf_mi.tracing import search as search_module
-from wrf_mi.tracing import solve as solve_module
-from wrf_mi.tracing.images import image_sources, meeting_point
-from wrf_mi.tracing.materials import perfect_reflector
+from wrf_mi.tracing.paths import solve as solve_module
+from wrf_mi.tracing.search import chains as search_module
+from wrf_mi.tracing.search import images as images_module
+from wrf_mi.tracing.search.images import image_sources, meeting_point
+from wrf_mi.tracing.sionna.materials import perfect_reflector
 
 SINGLE = 2e-4
 """Relative; Sionna RT's gains are single precision."""
@@ -200,7 +200,7 @@ def test_paths_of_a_seed_do_not_depend_on_chunks(divided: Any, monkeypatch: pyte
     monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
     monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
     monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
-    monkeypatch.setattr("wrf_mi.tracing.fields.PATHS_PER_CHUNK", 50)
+    monkeypatch.setattr("wrf_mi.tracing.sionna.path_solver.PATHS_PER_CHUNK", 50)
     parts = trace_paths(divided, tx, rx, options).paths
     np.testing.assert_allclose(parts.gain, whole.gain, rtol=1e-5)  # other widths of vector instructions
     equal(replace(parts, gain=whole.gain), whole)

@@ -23,8 +23,8 @@ from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.synthetic import laboratory_record, load_record, stored
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
-from wrf_mi.tracing.fields import sionna_orientation
-from wrf_mi.tracing.materials import BELOW_1_GHZ
+from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
+from wrf_mi.tracing.sionna.path_solver import sionna_orientation
 
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
 ARRAY_M = planar_array(4, 4, SPACING_M)
@@ -181,7 +181,7 @@ def test_materials_below_their_range_have_constants(tmp_path: Path, caplog: pyte
         "b": ("itu_wood", sheet(2, 1.0, (0.0, 1.0), (0.0, 1.0))),
     }
     xml = write_xml(tmp_path, parts)
-    with caplog.at_level(logging.INFO, "wrf_mi.tracing.materials"):
+    with caplog.at_level(logging.INFO, "wrf_mi.tracing.sionna.materials"):
         scene = open_scene(xml, 915e6, {"itu_brick": 0.2})
     assert caplog.messages == ["915 MHz is below the range of ITU-R P.2040 for brick: constant values of 1 GHz used"]
     brick, wood = scene.radio_materials["itu_brick"], scene.radio_materials["itu_wood"]
@@ -192,7 +192,7 @@ def test_materials_below_their_range_have_constants(tmp_path: Path, caplog: pyte
     with pytest.raises(InputError, match=r"itu_brick: not known at 0\.1 GHz"):
         set_frequency(scene, 100e6)
     caplog.clear()
-    with caplog.at_level(logging.INFO, "wrf_mi.tracing.materials"):
+    with caplog.at_level(logging.INFO, "wrf_mi.tracing.sionna.materials"):
         at_2_4 = open_scene(xml, 2.4e9)
     assert caplog.messages == []
     assert float(at_2_4.radio_materials["itu_brick"].conductivity[0]) == pytest.approx(0.0238 * 2.4**0.16, rel=1e-5)

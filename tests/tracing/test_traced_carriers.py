@@ -11,10 +11,9 @@ from box_room import CEILING, PARTITION, THICKNESS_M, WALLS, receiver, transmitt
 from traced_rooms import write_xml
 
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing import search as search_module
-from wrf_mi.tracing.solve import Prepared
-from wrf_mi.tracing.traced_carriers import traced_fields
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.solve import Prepared
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
+from wrf_mi.tracing.search import chains as search_module
 
 # isort: split
 import drjit as dr

@@ -17,7 +17,7 @@ from traced_rooms import write_xml
 
 from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Antenna, InputError, Receiver
-from wrf_mi.tracing.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
 # isort: split
 import drjit as dr
@@ -25,13 +25,12 @@ import mitsuba as mi
 from sionna.rt.utils import itu_coefficients_single_layer_slab
 
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
-from wrf_mi.tracing import traced_field as traced_field_module
-from wrf_mi.tracing.buffer import to_buffer
-from wrf_mi.tracing.field_calculator import slab
-from wrf_mi.tracing.fields import field_of
-from wrf_mi.tracing.instrument_parameters import pattern_factor, receiver_pose
-from wrf_mi.tracing.material_parameters import QUANTITIES
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.paths import traced_field as traced_field_module
+from wrf_mi.tracing.paths.field_calculator import slab
+from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
+from wrf_mi.tracing.paths.material_parameters import QUANTITIES
+from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)

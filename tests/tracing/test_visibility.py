@@ -11,10 +11,10 @@ from traced_rooms import LENGTH, PARTITION, SHOEBOX, Parts, inside, receiver, ro
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.tracing import TraceOptions, trace_paths
-from wrf_mi.tracing.buffer import SPECULAR, TRANSMISSION
-from wrf_mi.tracing.solve import Prepared
-from wrf_mi.tracing.surfaces import Surfaces
-from wrf_mi.tracing.visibility import unobstructed
+from wrf_mi.tracing.paths.solve import Prepared
+from wrf_mi.tracing.search.legs import SPECULAR, TRANSMISSION
+from wrf_mi.tracing.search.surfaces import Surfaces
+from wrf_mi.tracing.search.visibility import unobstructed
 
 SHORT_M = 0.01
 """Sionna RT's least distance of interactions."""

@@ -20,7 +20,7 @@ from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import open_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import load_trace, open_scene
-from wrf_mi.tracing.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.viewer.content import ViewOptions
 from wrf_mi.viewer.map_layer import read_map, thinned
 from wrf_mi.viewer.run_layers import path_layer, power_db, representative

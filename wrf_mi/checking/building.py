@@ -20,7 +20,7 @@ from ..scene.mesh.surfaces import Surface, bodies, box_of
 from ..scene.plan.sources import Mask, read_layout
 from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
-from ..tracing.devices import winding_number
+from ..tracing.search.devices import winding_number
 from .plans import placements
 from .repeats import named_rows
 from .units import Found

@@ -15,9 +15,9 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SURFACE, name_of
-from ..tracing.materials import itu_constants, itu_exponent
-from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.paths.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SURFACE, name_of
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.sionna.materials import itu_constants, itu_exponent
 from .misfit import Misfit
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")

@@ -30,9 +30,9 @@ from ..scene.mesh.surfaces import KINDS, Kind
 from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tracing import open_scene
-from ..tracing.corrected_scene import check_materials, moved_search
-from ..tracing.instrument_parameters import gain_name
-from ..tracing.solve import Prepared
+from ..tracing.paths.corrected_scene import check_materials, moved_search
+from ..tracing.paths.instrument_parameters import gain_name
+from ..tracing.paths.solve import Prepared
 from ..training.reach import hold_out_groups, improves
 from .fit import LEAST_PATHS, Fit, State
 from .misfit import Misfit

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.material_parameters import EXPONENT, PREFIX
-from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.paths.material_parameters import EXPONENT, PREFIX
+from ..tracing.paths.plane_parameters import SHIFT, TILT
 from .choices import ABSENT, ABSENT_VALUES, Choice, material_places
 from .frame import rigid_motions, scene_entries
 from .least_squares import Noise, Prior, left_out_residuals, minimised, posterior_covariance

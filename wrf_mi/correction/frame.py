@@ -6,7 +6,7 @@ import numpy as np
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.surfaces import Surfaces
+from ..tracing.search.surfaces import Surfaces
 
 
 def rigid_motions(surfaces: Surfaces) -> FloatArray:

@@ -28,13 +28,12 @@ from ..graph.receivers import RECEIVERS, Form, ReceiverModel
 from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
-from ..tracing.corrected_scene import MovedSearch
-from ..tracing.instrument_parameters import instrument_parameters
-from ..tracing.material_parameters import PREFIX, QUANTITIES
-from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.solve import Prepared
-from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField
+from ..tracing.paths.corrected_scene import MovedSearch
+from ..tracing.paths.instrument_parameters import instrument_parameters
+from ..tracing.paths.material_parameters import PREFIX, QUANTITIES
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.solve import Prepared
+from ..tracing.paths.traced_field import TracedField, traced_fields
 from .frame import rigid_motions, scene_entries
 from .options import CorrectionOptions
 
@@ -48,7 +47,7 @@ class PathTable(NamedTuple):
     """The n paths of a misfit.
 
     Attributes:
-        entry: place of each path among the entries of its side's `wrf_mi.tracing.traced_field.TracedPaths` [n].
+        entry: place of each path among the entries of its side's `wrf_mi.tracing.paths.traced_field.TracedPaths` [n].
         side: number of its side [n], ascending.
         row: its row of `Misfit.residual` [n], ascending in a side.
         plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.

@@ -17,7 +17,7 @@ from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
 from ..parallel.threads import on_threads
-from ..tracing.plane_parameters import SHIFT
+from ..tracing.paths.plane_parameters import SHIFT
 from .choices import ABSENT, Choice, joint_choices, material_choices, shift_choices
 from .fit import Fit, State
 from .least_squares import Noise

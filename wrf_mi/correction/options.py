@@ -11,11 +11,11 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
-from ..tracing.instrument_parameters import TX_PATTERN
-from ..tracing.material_parameters import EXPONENT, PREFIX, QUANTITIES
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
-from ..tracing.plane_parameters import SHIFT, TILT
-from ..tracing.traced_field import TracedOptions
+from ..tracing.paths.instrument_parameters import TX_PATTERN
+from ..tracing.paths.material_parameters import EXPONENT, PREFIX, QUANTITIES
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
@@ -92,7 +92,7 @@ class CorrectionOptions(CheckedSettings):
         return TracedOptions(trace, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES)
 
     def changes(self, name: str) -> bool:
-        """Whether a parameter of `wrf_mi.tracing.traced_field.TracedField` is changed."""
+        """Whether a parameter of `wrf_mi.tracing.paths.traced_field.TracedField` is changed."""
         if name.startswith(PREFIX):
             return MATERIALS in self.parts
         if name in (SHIFT, TILT):

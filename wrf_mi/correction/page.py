@@ -28,9 +28,9 @@ from ..core.files import atomic_folder, write_atomically, write_figure
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
-from ..tracing.corrected_scene import moved_triangles, write_corrected_scene
-from ..tracing.material_parameters import QUANTITIES, SURFACE, name_of
-from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
+from ..tracing.paths.material_parameters import QUANTITIES, SURFACE, name_of
+from ..tracing.paths.plane_parameters import SHIFT, TILT
 from .correct import Correction
 from .fit import LEAST_PATHS
 from .frame import rigid_motion, scene_entries

@@ -26,9 +26,9 @@ from ..core.types import IntArray
 from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..parallel.threads import on_threads
 from ..tasks import task_of
-from ..tracing.images import mirrored
-from ..tracing.material_parameters import PREFIX
-from ..tracing.plane_parameters import SHIFT, TILT
+from ..tracing.paths.material_parameters import PREFIX
+from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.search.images import mirrored
 from .signal_reports import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from ..runs.scene_view import surfaces_of
 from ..scene.coordinates import Y_UP
 from ..scene.folder import plain_name
 from ..scene.mesh.surfaces import Surface
-from ..tracing.corrected_scene import ODD_IN_FILES, check_materials
-from ..tracing.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
-from ..tracing.scenes import load_scene
+from ..tracing.paths.corrected_scene import ODD_IN_FILES, check_materials
+from ..tracing.sionna.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
+from ..tracing.sionna.scenes import load_scene
 from .format import ExportOptions
 from .source import Source
 

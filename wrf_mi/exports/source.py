@@ -16,8 +16,8 @@ from ..models.ray_tracing import CORRECTED, PATHS
 from ..runs.folder import CONFIG
 from ..runs.run import Run, open_run
 from ..scene.folder import FACTS_FILE
-from ..tracing.result import TraceResult, load_trace
-from ..tracing.scenes import MESHES
+from ..tracing.paths.result import TraceResult, load_trace
+from ..tracing.sionna.scenes import MESHES
 from .format import DATASET, RUN, SCENE, ExportOptions
 
 

@@ -32,7 +32,7 @@ from ..backend.vectors import Complex
 from ..core.angles import FloatArray, pixel_directions
 from ..receivers.array import steering_matrix
 from ..receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS, arrives, scaled, strength_db
-from ..tracing.traced_field import TracedPaths
+from ..tracing.paths.traced_field import TracedPaths
 from .ports import ComplexMatrix, Ports, direction_weights, path_sum, weighted
 
 How = Literal["coherent", "power"]

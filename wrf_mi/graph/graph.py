@@ -9,8 +9,8 @@ parameters; other data have one.
 
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
 logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
-``receiver.*``, ``pattern.*`` (`wrf_mi.tracing.traced_field.TracedField`) and ``surface.*``
-(`wrf_mi.tracing.surface_gaussians`). Without a scene Sionna RT is not imported.
+``receiver.*``, ``pattern.*`` (`wrf_mi.tracing.paths.traced_field.TracedField`) and ``surface.*``
+(`wrf_mi.tracing.paths.surface_gaussians`). Without a scene Sionna RT is not imported.
 """
 
 from __future__ import annotations
@@ -34,13 +34,12 @@ from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
-from ..tracing.instrument_parameters import receiver_pose
 from ..tracing.options import FACTOR
-from ..tracing.polarization import check_polarization
-from ..tracing.solve import Prepared
-from ..tracing.surface_gaussians import Interactions, SurfaceGaussians
-from ..tracing.traced_carriers import traced_fields
-from ..tracing.traced_field import TracedField, TracedOptions, TracedPaths
+from ..tracing.paths.instrument_parameters import receiver_pose
+from ..tracing.paths.solve import Prepared
+from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
+from ..tracing.paths.traced_field import TracedField, TracedOptions, TracedPaths, traced_fields
+from ..tracing.tracer import check_polarization
 from .evaluations import EVALUATIONS, Evaluation
 from .phase_errors import draws_of, for_draws, mean_of_draws, with_phase_errors
 from .receivers import RECEIVERS, Form

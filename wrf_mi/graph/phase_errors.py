@@ -9,10 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..backend.device import on_device
-from ..backend.vectors import times
+from ..backend.vectors import Complex, times
 from ..receivers.instruments import DRAWS, phase_draws
-from ..tracing.field_calculator import Complex
-from ..tracing.traced_field import Float64, TracedPaths
+from ..tracing.paths.traced_field import Float64, TracedPaths
 
 
 @lru_cache(maxsize=64)
@@ -25,7 +24,7 @@ def with_phase_errors(paths: TracedPaths, bounces: Any, rows: Any | None, phase_
     """`DRAWS` copies of each transmitter's paths, one after the other, with phases that are drawn.
 
     Args:
-        paths: paths of the transmitters ``rows`` of a `wrf_mi.tracing.traced_field.TracedField`.
+        paths: paths of the transmitters ``rows`` of a `wrf_mi.tracing.paths.traced_field.TracedField`.
         bounces: its square roots of numbers of reflections [n * each].
         rows: unsigned integers [batch]; None: all of its transmitters.
         phase_error: standard deviation of the phase that each reflection adds, rad, independently.

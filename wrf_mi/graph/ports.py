@@ -17,7 +17,7 @@ from scipy.constants import speed_of_light
 from ..backend.device import columns_on_device, on_device
 from ..backend.vectors import Complex, times
 from ..core.angles import FloatArray, solid_angles
-from ..tracing.traced_field import Float64, TracedPaths
+from ..tracing.paths.traced_field import Float64, TracedPaths
 
 
 @lru_cache(maxsize=16)

@@ -15,7 +15,7 @@ EvaluationName = Literal["splatted", "traced"]
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.", "surface.")
-"""Prefixes of the traced side's parameters (`wrf_mi.tracing.traced_field.TracedField.parameters`)."""
+"""Prefixes of the traced side's parameters (`wrf_mi.tracing.paths.traced_field.TracedField.parameters`)."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class TracedConfig:
     surface_spacing: Positive = 0.5
 
     def rate(self, name: str) -> float:
-        """Learning rate of a parameter of `wrf_mi.tracing.traced_field.TracedField.parameters`."""
+        """Learning rate of a parameter of `wrf_mi.tracing.paths.traced_field.TracedField.parameters`."""
         if name == DISC:
             return 0.0
         first, last = name.partition(".")[0], name.rpartition(".")[2]

@@ -169,8 +169,8 @@ def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
 
 def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
     """Mask of positions [n, 3], metres, that are not in a solid object of a ``sionna.rt.Scene``."""
-    from ..tracing.devices import solid_around  # the tracer is imported where there is a scene
-    from ..tracing.surfaces import scene_surfaces
+    from ..tracing.search.devices import solid_around  # the tracer is imported where there is a scene
+    from ..tracing.search.surfaces import scene_surfaces
 
     return solid_around(scene_surfaces(scene), positions_m) < 0
 
@@ -215,7 +215,7 @@ def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
     import mitsuba as mi
 
     up = 1 if above else -1
-    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.devices.before_walls`).
+    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.search.devices.before_surfaces`).
     start = np.stack(positions_m) - np.array([0.0, 0.0, up * MOUNTED_M])
     ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
     return bool(np.all(np.array(scene.mi_scene.ray_test(ray), bool)))

@@ -134,7 +134,7 @@ def _inputs(positions_m: FloatArray, conditions: Conditions) -> Inputs:
 @contextmanager
 def _each_warning_once() -> Iterator[None]:
     """Chunks would repeat the tracer's warnings of antennas near surfaces and outside the scene."""
-    logger, seen = logging.getLogger("wrf_mi.tracing.devices"), set[str]()
+    logger, seen = logging.getLogger("wrf_mi.tracing.search.devices"), set[str]()
 
     def new(record: logging.LogRecord) -> bool:
         known = record.msg in seen

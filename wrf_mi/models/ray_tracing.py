@@ -4,7 +4,7 @@ paths.npz         in the run folder: every path, to be used again for other mate
 corrected/        where planes or materials were calibrated: the corrected scene, a folder that plain Sionna RT opens
 convergence.json  where settings were chosen by convergence: target and estimated error, dB, and all tried settings
 
-For signal strengths an offset per receiver (`wrf_mi.tracing.offsets`) is fitted to the training rows. With
+For signal strengths an offset per receiver (`wrf_mi.tracing.tracer`) is fitted to the training rows. With
 ``calibration``, parameters of the scene are trained for every task, by the graph of `wrf_mi.graph.graph` without
 Gaussians.
 """
@@ -37,13 +37,11 @@ from ..receivers.spreads import PathStatistics
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
-from ..tracing.corrected_scene import check_materials, write_corrected_scene
-from ..tracing.offsets import Offsets, fit_offsets
 from ..tracing.options import without_effect
-from ..tracing.polarization import warn_of_cross_polarization
-from ..tracing.result import join_traces
-from ..tracing.solve import PAIRS_TOGETHER
-from ..tracing.tracer import RayTracer
+from ..tracing.paths.corrected_scene import check_materials, write_corrected_scene
+from ..tracing.paths.result import join_traces
+from ..tracing.paths.solve import PAIRS_TOGETHER
+from ..tracing.tracer import Offsets, RayTracer, fit_offsets, warn_of_cross_polarization
 from ..training.config import calibration_config
 from ..training.loop_config import LoopOptions
 from .gaussian.model import FittedField
@@ -69,7 +67,7 @@ class TracingSettings(LoopOptions, TraceOptions):
     Attributes:
         calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
             receiver), ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and
-            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.surface_gaussians`); null: none.
+            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none.
         target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
             further kinds of path are chosen by convergence on a sample of the transmitters
             (`wrf_mi.tracing.convergence`); null: none are chosen.

@@ -15,7 +15,7 @@ from ..models.ray_tracing import PATHS
 from ..scene.mesh.surfaces import KINDS, Kind, Surface
 from ..scene.preview import GaussianCloud, draw_scene
 from ..tracing import load_trace
-from ..tracing.surfaces import scene_surfaces
+from ..tracing.search.surfaces import scene_surfaces
 from .api import open_run
 
 SHOWN_GAUSSIANS = 40

@@ -26,7 +26,7 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import make_splits, read_nerf2_csi, write_nerf2_csi
-from ..tracing.scenes import open_scene
+from ..tracing.sionna.scenes import open_scene
 from .searches import Searches, trace_channels
 from .stored import Files, scene_files, stored
 

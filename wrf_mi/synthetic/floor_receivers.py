@@ -28,10 +28,10 @@ from ..datasets.deepmimo import CHANNEL_PARAMS
 from ..datasets.folder_files import write_extra, write_official
 from ..receivers.channel import rssi_dbm
 from ..tracing.deepmimo import write_deepmimo
-from ..tracing.devices import winding_number
-from ..tracing.result import TraceResult
-from ..tracing.scenes import open_scene
-from ..tracing.solve import trace_paths
+from ..tracing.paths.result import TraceResult
+from ..tracing.paths.solve import trace_paths
+from ..tracing.search.devices import winding_number
+from ..tracing.sionna.scenes import open_scene
 from .floor_channels import made_on_floor
 from .searches import SCATTERING, Searches, free_positions, set_scattering
 from .stored import Files, scan_file

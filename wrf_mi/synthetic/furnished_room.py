@@ -24,7 +24,7 @@ from ..core.arrays import planar_array
 from ..datasets import read_spectrum_folder, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum
 from ..receivers.reports import minmax_scale
-from ..tracing.scenes import open_scene
+from ..tracing.sionna.scenes import open_scene
 from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, SCANNER_M, SPACING_M
 from .searches import Searches, free_positions, trace_channels
 from .stored import Files, scan_file, scene_files, stored

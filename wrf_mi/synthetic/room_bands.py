@@ -25,8 +25,8 @@ from ..receivers.array import bartlett_spectrum
 from ..receivers.channel import array_channels
 from ..receivers.reports import minmax_scale
 from ..tracing.options import TraceOptions
-from ..tracing.result import recompute
-from ..tracing.scenes import open_scene
+from ..tracing.paths.result import recompute
+from ..tracing.sionna.scenes import open_scene
 from .furnished_room import TracedRoom, made_in_room, opaque_parts, transmitters
 from .searches import searched_paths, set_scattering
 

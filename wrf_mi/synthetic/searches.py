@@ -17,11 +17,11 @@ from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..receivers.channel import array_channels
-from ..tracing.devices import solid_around
 from ..tracing.options import TraceOptions
-from ..tracing.result import TraceResult
-from ..tracing.solve import trace_paths
-from ..tracing.surfaces import scene_surfaces
+from ..tracing.paths.result import TraceResult
+from ..tracing.paths.solve import trace_paths
+from ..tracing.search.devices import solid_around
+from ..tracing.search.surfaces import scene_surfaces
 
 SCATTERING, DIFFRACTION = 2, 8
 """Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""

@@ -1,13 +1,22 @@
-"""Ray tracing by Sionna RT: scenes, paths, spectra, and paths with derivatives."""
+"""Ray tracing with Sionna RT: scenes, paths, spectra, and paths with derivatives.
+
+Imports run upwards in this list:
+
+- top level: `tracer` (observations of traced paths), `convergence` (choice of depth and rays), `power_map`, `deepmimo`;
+- `paths`: traced paths, and their gains with derivatives in materials, planes, poses and patterns;
+- `sionna`: adapter to Sionna RT, which opens scenes, computes gains, and searches for diffraction and scattering;
+- `search`: chains of surfaces that can connect two antennas, the image method, and what obstructs a path;
+- `options`: kinds of path, depth and rays of a trace.
+"""
 
 from __future__ import annotations
 
 from .deepmimo import write_deepmimo
-from .materials import set_frequency
 from .options import TraceOptions
-from .result import TraceResult, load_trace, recompute, save_trace
-from .scenes import open_scene
-from .solve import trace_paths
+from .paths.result import TraceResult, load_trace, recompute, save_trace
+from .paths.solve import trace_paths
+from .sionna.materials import set_frequency
+from .sionna.scenes import open_scene
 from .tracer import RayTracer
 
 __all__ = [

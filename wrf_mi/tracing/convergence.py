@@ -22,8 +22,8 @@ from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..receivers import rssi_dbm
 from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
-from .result import TraceResult
-from .solve import FIRST_RAYS, Prepared, spread, trace_paths
+from .paths.result import TraceResult
+from .paths.solve import FIRST_RAYS, Prepared, spread, trace_paths
 
 logger = logging.getLogger(__name__)
 
@@ -127,8 +127,8 @@ class _Sampled:
     def _reports(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
         if (options, few) not in self._known:
-            here = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
-            paths = self._trace(tx_pos_m=here, options=options).paths
+            sample = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
+            paths = self._trace(tx_pos_m=sample, options=options).paths
             spectra = None if self._spectra is None else np.asarray(self._spectra(paths))
             self._known[options, few] = rssi_dbm(paths), spectra
         return self._known[options, few]
@@ -221,6 +221,7 @@ def _depth(sample: _Sampled, options: TraceOptions, share: float) -> tuple[Trace
         deeper = replace(now, max_depth=now.max_depth + 1)
         changes.append(sample.change("depth", deeper.max_depth, now, deeper))
         now = deeper
+        # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
         if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:
             break
     return now, remainder(changes)
@@ -234,5 +235,5 @@ def _rays(sample: _Sampled, options: TraceOptions, share: float, most: int = MAX
         rays *= 2
         change = sample.change("rays", rays, now, replace(now, rays=rays))
         now = replace(now, rays=rays)
-        calm = calm + 1 if change <= share else 0
+        calm = calm + 1 if change <= share else 0  # once may be chance: each number has other rays
     return now, change

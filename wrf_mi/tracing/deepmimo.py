@@ -25,7 +25,7 @@ from ..core.files import atomic_folder
 from ..core.types import IntArray
 from ..datasets.deepmimo import PARAMS, VERSION
 from ..version import __version__
-from .result import TraceResult
+from .paths.result import TraceResult
 
 logger = logging.getLogger(__name__)
 
@@ -181,25 +181,23 @@ def _params(traced: TraceResult, paths: Paths, carrier_hz: float) -> dict[str, A
         "raw_params": {"written_by": f"wrf-mi {__version__}", "phase": "with the carrier's exp(-j 2 pi f delay)"},
     }
     scene = {"num_scenes": 1, "n_objects": 0, "n_vertices": 0, "n_faces": 0, "n_triangular_faces": 0}
+    sets = (STATIONS, "base_stations", paths.n_rx, paths.rx), (USERS, "users", paths.n_tx, paths.tx)
     return {
         "version": VERSION,
         "rt_params": rt_params,
-        "txrx_sets": {
-            f"txrx_set_{STATIONS}": _set(STATIONS, "base_stations", True, paths.n_rx, paths.rx),
-            f"txrx_set_{USERS}": _set(USERS, "users", False, paths.n_tx, paths.tx),
-        },
+        "txrx_sets": {f"txrx_set_{key}": _set(key, name, count, reached) for key, name, count, reached in sets},
         "materials": {},
         "scene": {**scene, "representation": "hull"},
     }
 
 
-def _set(number: int, name: str, is_station: bool, count: int, reached: IntArray) -> dict[str, Any]:
+def _set(number: int, name: str, count: int, reached: IntArray) -> dict[str, Any]:
     return {
         "name": name,
         "id_orig": number,
         "id": number,
-        "is_tx": is_station,
-        "is_rx": not is_station,
+        "is_tx": number == STATIONS,
+        "is_rx": number == USERS,
         "num_points": count,
         "num_active_points": len(np.unique(reached)),
         "num_ant": 1,

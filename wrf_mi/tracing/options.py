@@ -14,8 +14,8 @@ MAX_RAYS = 1 << 24
 MAX_DEGREE = 8
 """Largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`."""
 FACTOR, DISC = "surface.factor", "surface.disc"
-"""Parameters of Gaussians on surfaces (`wrf_mi.tracing.surface_gaussians`): trained [2, g], logarithmic amplitudes and
-phases in rad, and constant [6, g], centres in metres and unit normals."""
+"""Parameters of Gaussians on surfaces (`wrf_mi.tracing.paths.surface_gaussians`): trained [2, g], logarithmic
+amplitudes and phases in rad, and constant [6, g], centres in metres and unit normals."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TraceOptions:
         max_reflections: largest number of reflections among them, except in paths with scattering or diffraction;
             None: ``max_depth``.
         rays: number of rays from each source (best a power of two), or ``"auto"``: doubled until the paths of a sample
-            of positions converge, see `wrf_mi.tracing.solve.converged_rays`.
+            of positions converge, see `wrf_mi.tracing.paths.solve.converged_rays`.
         seed: seed of the rays' directions.
         scattering_coefficient: share of the reflected amplitude that is scattered, 0..1, if ``scattering`` is on.
         phase_error: standard deviation of the phase that each reflection adds, rad, for errors of a mesh and of its
@@ -79,6 +79,11 @@ class TraceOptions:
         """Largest number of reflections of a specular path."""
         most = self.max_depth if self.max_reflections is None else min(self.max_reflections, self.max_depth)
         return most if self.reflection else 0
+
+    @property
+    def surfaces_met(self) -> int:
+        """Largest number of surfaces that a ray of the search for specular paths meets."""
+        return self.max_depth if self.transmission else self.reflections
 
     @property
     def sampled(self) -> bool:

@@ -28,10 +28,10 @@ from ..core.digest import content_digest
 from ..core.types import IntArray
 from ..datasets import user_cache
 from ..receivers import rssi_dbm
-from .devices import solid_around
-from .material_parameters import slabs_of_faces
 from .options import TraceOptions
-from .solve import Prepared, trace_paths
+from .paths.material_parameters import slabs_of_faces
+from .paths.solve import Prepared, trace_paths
+from .search.devices import solid_around
 
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
@@ -149,8 +149,8 @@ def trace_map(
 ) -> PowerMap:
     """Trace a scene on a grid over its extent and all of a record's positions.
 
-    Points of the grid inside closed solids (`wrf_mi.tracing.devices.solids`) are not traced: local means exclude them,
-    and they take the mean of the points outside, or the value of the nearest of these.
+    Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: local means
+    exclude them, and they take the mean of the points outside, or the value of the nearest of these.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`.
@@ -214,8 +214,9 @@ def traced_powers(
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
     if (slab_of_face >= 0).all():  # other materials have no digest
-        here = Path(__file__).parent
-        code = {one.name: one for folder in (here, here.parent / "receivers") for one in folder.glob("*.py")}
+        package = Path(__file__).parents[1]
+        folders = package / "tracing", package / "receivers"
+        code = {str(file.relative_to(package)): file for folder in folders for file in folder.rglob("*.py")}
         versions = [importlib.metadata.version(name) for name in PACKAGES]
         faces = prepared.surfaces.triangles, slab_of_face, slabs, float(scene.frequency[0])
         asked = tx_pos_m, receiver_arrays(receivers), asdict(options), tx_antenna

@@ -1,8 +1,10 @@
-"""Ray tracing as a model of a data set: observations at transmitter positions."""
+"""Ray tracing as a model of a data set: observations at positions, offsets of receivers, cross-polarised links."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
+from ..receivers import received_power
 from ..receivers.instruments import Instrument, SpectrumInstrument
 from .options import DEFAULTS, TraceOptions
-from .result import TraceResult, recompute
-from .scenes import open_scene
-from .solve import Prepared, trace_paths
+from .paths.result import TraceResult, recompute
+from .paths.solve import Prepared, spread, trace_paths
+from .sionna.scenes import open_scene
+
+logger = logging.getLogger(__name__)
+
+GAIN_DB = 10.0
+"""Gain in median power by the other polarisation above which a link counts as cross-polarised. Reflections turn the
+polarisation of some paths, but a co-polarised link keeps most of its power."""
+SAMPLE = 256
+"""Transmitters on which the gain is judged."""
+TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections=1, rays=1 << 12)
+"""Transmitters and options of the trace for models that do not trace all transmitters at once."""
 
 
 class RayTracer:
@@ -101,3 +115,98 @@ class RayTracer:
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
         """Observations of all receivers [n_rx, n, ...] for transmitter positions [n, 3] (metres)."""
         return self.observe(self.trace(tx_pos_m))
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets of traced signal strengths.
+
+    Attributes:
+        offset_db: offset of each receiver, shape [n_rx].
+        floor_dbm: weakest measured signal of each receiver, shape [n_rx], the report where no path arrives.
+    """
+
+    offset_db: FloatArray
+    floor_dbm: FloatArray
+
+    def __call__(self, traced_dbm: ArrayLike) -> FloatArray:
+        """Traced signal strengths [n_rx, n] (dBm for 0 dBm sent, NaN without a path) on the receivers' scales."""
+        moved = np.asarray(traced_dbm, float) + self.offset_db[:, None]
+        return np.where(np.isnan(moved), self.floor_dbm[:, None], moved)
+
+
+def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
+    """Fit an offset to each receiver: the median of measured minus traced, which minimises the absolute error.
+
+    A receiver that received nothing takes the mean offset of the others, and their weakest signal.
+
+    Args:
+        traced_dbm: shape [n_rx, n], NaN where no path arrives.
+        measured_dbm: measured training rows [n_rx, n], NaN where nothing was received.
+
+    Raises:
+        InputError: a receiver that received rows, but none that was traced.
+    """
+    traced, measured = np.asarray(traced_dbm, float), np.asarray(measured_dbm, float)
+    difference = measured - traced
+    heard = ~np.isnan(measured).all(axis=1)
+    for receiver, known in enumerate(~np.isnan(difference)):
+        if heard[receiver] and not known.any():
+            raise InputError(
+                f"receiver {receiver}: no training row is both received and reached by a path; trace more kinds of path"
+            )
+    offset_db, floor_dbm = np.empty((2, len(measured)))
+    offset_db[heard], floor_dbm[heard] = np.nanmedian(difference[heard], axis=1), np.nanmin(measured[heard], axis=1)
+    offset_db[~heard], floor_dbm[~heard] = offset_db[heard].mean(), floor_dbm[heard].min()
+    return Offsets(offset_db, floor_dbm)
+
+
+def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
+    """Gains in dB, `GAIN_DB` or more, by the names of receivers whose polarisation is turned by 90 degrees.
+
+    Of the paths of `SAMPLE` transmitters, evenly spaced, in the scene in which they were traced.
+    """
+    sample = traced.select(np.isin(traced.paths.tx, spread(len(traced.tx_pos_m), SAMPLE)))
+    if sample.carriers_hz is not None:  # both at the scene's carrier
+        sample = recompute(sample, scene)
+    stated = _median_power(sample)
+    receivers = tuple(replace(rx, antenna=rx.antenna.turned) for rx in traced.receivers)
+    turned = _median_power(recompute(replace(sample, receivers=receivers), scene))
+    tiny = np.finfo(np.float32).tiny
+    gain_db = 10 * np.log10(np.maximum(turned, tiny) / np.maximum(stated, tiny))
+    return {rx.name: float(g) for rx, g in zip(traced.receivers, gain_db, strict=True) if g >= GAIN_DB}
+
+
+def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
+    """Warn of receivers that `cross_polarized` finds, naming the option that turns their polarisation."""
+    gains_db = cross_polarized(traced, scene)
+    if not gains_db:
+        return
+    first, count = next(iter(gains_db)), len(traced.receivers)
+    now = next(rx.antenna for rx in traced.receivers if rx.name == first)
+    who = f"receiver {first}" if count == 1 else f"{len(gains_db)} of {count} receivers (first: {first})"
+    options = f"--rx-polarization {now.turned.polarization}" + (" or --rx-frame world" if now.frame == "array" else "")
+    logger.warning(
+        "%s: turning the receive polarisation by 90 degrees raises the median traced power by %.0f dB; "
+        "state the antenna in the data, or try %s (now: %s, frame %s)",
+        who,
+        gains_db[first],
+        options,
+        now.polarization,
+        now.frame,
+    )
+
+
+def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
+    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised receivers."""
+    few = tx_pos_m[spread(len(tx_pos_m), TRACED)]
+    traced = trace_paths(scene, few, receivers, ROUGH, tx_antenna=tx_antenna, check=False)
+    warn_of_cross_polarization(traced, scene)
+
+
+def _median_power(traced: TraceResult) -> FloatArray:
+    """Median over the transmitters with a path of the power at each receiver [n_rx]; 0 without any path."""
+    power = received_power(traced.paths)
+    reached = np.zeros(power.shape, bool)
+    reached[traced.paths.rx, traced.paths.tx] = True
+    return np.array([np.median(row[has]) if has.any() else 0.0 for row, has in zip(power, reached, strict=True)])

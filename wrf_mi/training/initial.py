@@ -22,8 +22,8 @@ from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_
 from ..scene.coordinates import require_near
 from ..scene.scan.points import read_points
 from ..tracing import open_scene, trace_paths
-from ..tracing.scenes import MESHES
-from ..tracing.surfaces import scene_surfaces
+from ..tracing.search.surfaces import scene_surfaces
+from ..tracing.sionna.scenes import MESHES
 from .config import InitialConfig
 
 LEAST_SCALE_M = 0.02

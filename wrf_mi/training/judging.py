@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.types import IntArray
-from ..tracing.traced_field import TracedField
+from ..tracing.paths.traced_field import TracedField
 from .fit_plan import FitPlan
 from .predictor import Predictor
 from .reach import Reach, choose_reach, improves

@@ -31,7 +31,7 @@ from .static_operator import StaticOperator
 from .step import Params, evaluated, places_of
 
 if TYPE_CHECKING:
-    from ..tracing.traced_field import TracedField
+    from ..tracing.paths.traced_field import TracedField
 
 TOGETHER = 16
 """Transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch."""

@@ -14,7 +14,7 @@ from ..runs.scene_view import surfaces_of
 from ..scene.mesh.surfaces import Surface
 from ..scene.preview import ceiling_faces, free_edges
 from ..tracing import open_scene
-from ..tracing.scenes import MESHES
+from ..tracing.sionna.scenes import MESHES
 from .content import MaterialMesh, SceneContent
 
 MOST_TRIANGLES = 100_000

@@ -11,8 +11,7 @@ from ...core import Split
 from ...correction import default_options
 from ...tasks import instrument_of, task_of
 from ...tracing import TraceOptions
-from ...tracing.offsets import fit_offsets
-from ...tracing.tracer import RayTracer
+from ...tracing.tracer import RayTracer, fit_offsets
 from ..model import Fitted, Inputs, PredictAll, Problem
 from .paths import FittedPaths
 from .scene_side import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, SceneSide

@@ -22,9 +22,9 @@ from ...core import InputError, Prediction, Receiver, Split
 from ...core.files import write_atomically
 from ...correction.options import STRENGTHS
 from ...tasks import task_of
-from ...tracing.polarization import check_polarization
+from ...tracing.paths.solve import Prepared
 from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
-from ...tracing.solve import Prepared
+from ...tracing.tracer import check_polarization
 from .. import MODELS
 from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths

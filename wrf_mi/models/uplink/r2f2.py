@@ -65,8 +65,8 @@ class ScenePaths:
     """
 
     def __init__(self, scene: Any, receiver: Receiver, tx_antenna: Antenna, options: TraceOptions) -> None:
-        from ...tracing.solve import Prepared
-        from ...tracing.traced_field import TracedOptions
+        from ...tracing.paths.solve import Prepared
+        from ...tracing.paths.traced_field import TracedOptions
 
         assert receiver.array_m is not None
         self._scene, self._receiver, self._prepared = scene, receiver, Prepared(scene)
@@ -101,7 +101,7 @@ class ScenePaths:
 
     def _rows(self, tx_pos_m: FloatArray, heading_rad: FloatArray | None) -> Iterator[FloatArray]:
         """Lengths and direction cosines [k, p] of each transmitter's paths, seen from the middle of the array."""
-        from ...tracing.traced_field import TracedField
+        from ...tracing.paths.traced_field import TracedField
 
         for start in range(0, len(tx_pos_m), CHUNK_SIZE):
             part = slice(start, start + CHUNK_SIZE)

@@ -5,7 +5,7 @@ A plane n . x = d with unit vectors a, b in it and the centroid c of its faces b
     n' = (n + t_a a + t_b b) / abs(n + t_a a + t_b b),   d' = n' . c + s
 
 with the shift s in metres and the tilts t_a, t_b in rad: small tilts are rotations about b and -a through c.
-`wrf_mi.tracing.surfaces.Surfaces.moved_planes` is the NumPy version.
+`wrf_mi.tracing.search.surfaces.Surfaces.moved_planes` is the NumPy version.
 
 The chains of surfaces are searched for on the mesh as stated and kept when planes move, as a moved mesh has gaps at its
 corners through which rays leave. Paths follow their planes continuously. Not modelled are paths that appear or vanish
@@ -24,11 +24,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import columns_on_device, on_device, to_uint
-from ..core.types import IntArray
+from ...backend.device import columns_on_device, on_device, to_uint
+from ...core.types import IntArray
+from ..search.surfaces import Surfaces
 from .field_calculator import Float64, Level, Vector
 from .material_parameters import MaterialGrouping, SlabMaterials, slabs_of_faces
-from .surfaces import Surfaces
 
 SHIFT, TILT = "plane.shift", "plane.tilt"
 """Names of the parameters [q] in metres and [q, 2] in rad of the q planes of `Surfaces`, shared by all receivers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .options import TraceOptions
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import TraceOptions
 from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ MARGIN_M = 1e-3
 """Slack of the bounds of planes."""
 BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
-displaced by `wrf_mi.tracing.images`."""
+displaced by `wrf_mi.tracing.search.images`."""
 MOST_KEPT = 1 << 27
 """Bytes of chains that a process keeps."""
 SECONDS_PER_HIT = 1.2e-7
@@ -55,12 +55,6 @@ class ReflectionChains:
     image: FloatArray
     source: IntArray
 
-    @classmethod
-    def joined(cls, chains: Sequence[ReflectionChains]) -> ReflectionChains:
-        """Chains from one source each, which are numbered in order."""
-        source = np.repeat(np.arange(len(chains)), [len(part) for part in chains])
-        return cls(np.concatenate([part.plane for part in chains]), np.concatenate([p.image for p in chains]), source)
-
     def __len__(self) -> int:
         """Number of chains."""
         return len(self.plane)
@@ -75,48 +69,39 @@ class ReflectionChains:
         """Numbers of reflections; planes, and images of the source, of each reflection: Dr.Jit arrays [c]."""
         import mitsuba as mi
 
-        from ..backend.device import columns_on_device, to_uint, to_vectors
+        from ...backend.device import columns_on_device, to_uint, to_vectors
 
         planes = columns_on_device(np.maximum(self.plane, 0).T, mi.UInt32)
         return to_uint(self.length), planes, [to_vectors(image, mi.Point3f) for image in self.image.swapaxes(0, 1)]
 
 
 def shoot(
-    scene: Any,
-    surfaces: Surfaces,
-    source_m: FloatArray,
-    rays: int,
-    depth: int,
-    reflections: int,
-    seed: int,
-    passing: bool = True,
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
     """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
 
     Rays leave on a randomly rotated Fibonacci lattice. Where waves pass surfaces, the rays are shot once for each
-    choice of the hits that reflect: up to two to the power of the depth. What they found is kept in the
-    process for `MOST_KEPT` bytes of the last calls: models, folds and carriers trace the same rooms from the same
-    receivers.
+    choice of the hits that reflect: up to two to the power of the depth. The process keeps `MOST_KEPT` bytes of the
+    last results: models, folds and carriers trace the same rooms from the same receivers.
 
     Args:
         scene: ``sionna.rt.Scene``.
         surfaces: surfaces of the scene.
         source_m: position [3], metres.
+        options: numbers of surfaces met and of reflections, and whether rays pass surfaces.
         rays: number of rays.
-        depth: largest number of surfaces met.
-        reflections: largest number of reflections.
         seed: seed of the lattice's random rotation.
-        passing: whether rays pass surfaces, or are reflected at each.
 
     Returns:
         Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
     """
-    key = surfaces.digest, source_m.tobytes(), rays, depth, reflections, seed, passing
+    reach = options.surfaces_met, options.reflections, options.transmission
+    key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
     else:
         turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, depth, patterns(depth, reflections, passing))
+        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, options.surfaces_met, patterns(*reach))
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -127,9 +112,9 @@ def _chains(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, turn: FloatArray, depth: int, choices: Choices
 ) -> IntArray:
     reflections = len(choices[0])
-    found = [np.zeros((0, reflections), np.int64)]
+    chains = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
-        return found[0]
+        return chains[0]
     for reflecting in choices:
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
@@ -137,8 +122,8 @@ def _chains(
             hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
             for column, level in enumerate(reflecting):
                 sequence[:, column] = hits[level]
-            found.append(unique_chains(sequence))
-    return unique_chains(np.concatenate(found))
+            chains.append(unique_chains(sequence))  # chunk by chunk: most rays find the same few chains
+    return unique_chains(np.concatenate(chains))
 
 
 def patterns(depth: int, reflections: int, passing: bool) -> Choices:
@@ -175,11 +160,11 @@ def _shoot(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     ray = mi.Ray3f(to_vectors(source_m[None], mi.Point3f), to_vectors(directions.T, mi.Vector3f))
     first, plane = surfaces.faces_on_device
-    # As data, not as code: the same kernel serves every pattern.
+    # Runtime argument, so that Dr.Jit reuses the kernel for every pattern.
     pattern = dr.opaque(mi.UInt32, sum(1 << level for level in reflecting))
     active = dr.full(mi.Bool, True, directions.shape[1])
     planes: list[Any] = []
@@ -223,12 +208,12 @@ def possible(
     import drjit as dr
     import mitsuba as mi
 
-    from ..backend.device import to_vectors
+    from ...backend.device import to_vectors
 
     length, targets = chains.length, to_vectors(targets_m, mi.Point3f)
     (reflections, planes, images), tables = chains.on_device, surfaces.planes_on_device
     step = max(1, PAIRS_PER_CHUNK // len(targets_m))
-    # As data, not as code: the same kernel serves all numbers of targets.
+    # Runtime arguments, so that Dr.Jit reuses the kernel for all numbers of targets.
     count, beside = dr.opaque(mi.UInt32, len(targets_m)), dr.opaque(mi.Float, BESIDE * surfaces.scale_m)
     for start in range(0, len(chains), step):
         part = min(step, len(chains) - start)
@@ -243,15 +228,17 @@ def possible(
             plane = dr.gather(mi.UInt32, planes[level], row, active)
             image = dr.gather(mi.Point3f, images[level], row, active)
             n, d, u, v, low, high = (dr.gather(type(table), table, plane, active) for table in tables)
-            here, there = dr.dot(n, point) - d, dr.dot(n, image) - d
-            met: Any = point + (image - point) * (here / (here - there))
+            # Backwards from the target: the line to the image meets the plane where the wave is reflected, if both
+            # are on opposite sides of it.
+            height, image_height = dr.dot(n, point) - d, dr.dot(n, image) - d
+            met: Any = point + (image - point) * (height / (height - image_height))
             along = mi.Point2f(dr.dot(u, met), dr.dot(v, met))
             within: Any = dr.all(along >= low - MARGIN_M) & dr.all(along <= high + MARGIN_M)
-            opposite = dr.select(there > 0, here < beside, here > -beside)
+            opposite = dr.select(image_height > 0, height < beside, height > -beside)
             valid &= ~active | (opposite & within)
             point = dr.select(active, met, point)
-        found = np.asarray(dr.compress(valid), np.int64)
-        chain, target = found // len(targets_m) + start, found % len(targets_m)
+        pairs = np.asarray(dr.compress(valid), np.int64)
+        chain, target = pairs // len(targets_m) + start, pairs % len(targets_m)
         order = np.argsort(length[chain], kind="stable")
         yield chain[order], target[order]
 
@@ -262,8 +249,10 @@ def hits(options: TraceOptions, rays: int) -> int:
     Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
     (`shoot`), of which there are up to two to the power of the depth.
     """
-    met = options.max_depth if options.transmission else options.reflections
-    return len(patterns(met, options.reflections, options.transmission)) * rays * met if options.reflections else 0
+    if not options.reflections:
+        return 0
+    met = options.surfaces_met
+    return len(patterns(met, options.reflections, options.transmission)) * rays * met
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
@@ -275,8 +264,8 @@ def check_search(options: TraceOptions, rays: int, sources: int) -> None:
     duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
     if duration_s < WARN_S:
         return
-    what = f"search for paths with up to {options.reflections} reflections"
+    search = f"search for paths with up to {options.reflections} reflections"
     remedy = f"a smaller --depth (max_depth, {options.max_depth}) or --reflections (max_reflections)"
     if duration_s > MOST_S:
-        raise InputError(f"{what}: about {duration_s / 3600:.1f} hours; give {remedy}")
-    logger.warning("%s: about %.0f s; faster with %s", what, duration_s, remedy)
+        raise InputError(f"{search}: about {duration_s / 3600:.1f} hours; give {remedy}")
+    logger.warning("%s: about %.0f s; faster with %s", search, duration_s, remedy)

@@ -1,8 +1,8 @@
 """Scenes with planes and materials as training has changed them: as a folder, and for the search of paths.
 
-Planes that move take paths with them (`wrf_mi.tracing.plane_parameters`), but edges that move uncover some paths and
-hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated one,
-so that paths found there are paths of the stated scene with these parameters.
+Planes that move take paths with them (`wrf_mi.tracing.paths.plane_parameters`), but edges that move uncover some paths
+and hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated
+one, so that paths found there are paths of the stated scene with these parameters.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
-from ..backend.device import on_device, to_tensor
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from ..scene.folder import plain_name, write_scene
-from ..scene.materials import CARRIER, THICKNESS_M, Materials
-from ..scene.materials import EXPONENT as LAW
-from ..scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
+from ...backend.device import on_device, to_tensor
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ...scene.folder import plain_name, write_scene
+from ...scene.materials import CARRIER, THICKNESS_M, Materials
+from ...scene.materials import EXPONENT as LAW
+from ...scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
+from ..search.surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
+from ..sionna.materials import absorbs, in_itu_range
 from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
-from .materials import absorbs, in_itu_range
 from .plane_parameters import SHIFT, TILT
 from .solve import Prepared
-from .surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
 
 FLAT = 0.2
 """Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
@@ -122,8 +122,8 @@ def check_materials(scene: Any) -> None:
         InputError: a material that is neither a slab nor an absorber.
     """
     slabs = read_materials(scene).names
-    for name, thing in scene.objects.items():
-        if (material := thing.radio_material.name) not in slabs and not absorbs(thing.radio_material):
+    for name, scene_object in scene.objects.items():
+        if (material := scene_object.radio_material.name) not in slabs and not absorbs(scene_object.radio_material):
             raise InputError(f"object {name}: material {material} is not a slab with constants; a folder needs one")
 
 
@@ -148,7 +148,7 @@ def write_corrected_scene(
         folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
-            `wrf_mi.tracing.material_parameters`); others are ignored.
+            `wrf_mi.tracing.paths.material_parameters`); others are ignored.
         grouping: grouping of the parameters of materials.
         kinds: kinds of objects by name; by default ``other``.
         absent: slabs, in the order of their parameters, whose surfaces are left out.
@@ -201,11 +201,10 @@ def write_corrected_scene(
                 if owner not in fitted_names:
                     fitted_names[owner] = plain_name(f"fitted_{owner}", ODD_IN_MATERIALS, constants)
                 material = fitted_names[owner]
-                law = {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
-                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True)) | law
+                constants[material] = _constants(fitted[slab]) | {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
             elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):
                 material = f"{itu}_{carrier_hz / 1e6:.0f}mhz"
-                constants[material] = dict(zip(PERFECT_CONSTANTS, map(_rounded, fitted[slab]), strict=True))
+                constants[material] = _constants(fitted[slab])
             else:
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
@@ -230,12 +229,16 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
     corners = np.round(surfaces.triangles.reshape(-1, 3) / SAME_CORNER_M)
     vertices, same = np.unique(corners, axis=0, return_inverse=True)
     pairs = trimesh.Trimesh(vertices, same.reshape(-1, 3), process=False).face_adjacency
-    plane, thing = surfaces.plane[pairs], surfaces.object_of(pairs)
+    plane, object_index = surfaces.plane[pairs], surfaces.object_of(pairs)
     bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
-    smooth = (plane[:, 0] != plane[:, 1]) & (thing[:, 0] == thing[:, 1]) & (bend > CREASE_COS)
+    smooth = (plane[:, 0] != plane[:, 1]) & (object_index[:, 0] == object_index[:, 1]) & (bend > CREASE_COS)
     smooth &= known[pairs].all(axis=1)
     facets[slab_of_face[pairs[smooth]]] = True
     return facets
+
+
+def _constants(slab: FloatArray) -> dict[str, float]:
+    return dict(zip(PERFECT_CONSTANTS, map(_rounded, slab), strict=True))
 
 
 def _rounded(value: float) -> float:
@@ -248,7 +251,7 @@ class MovedSearch:
 
     Attributes:
         prepared: shared state of traces in the moved scene.
-        parameters: parameters of the traced fields, Dr.Jit tensors by name, by which faint paths are told.
+        parameters: parameters of the traced fields, Dr.Jit tensors by name, used to prune weak paths.
     """
 
     prepared: Prepared
@@ -264,7 +267,7 @@ def moved_search(
         copy: ``sionna.rt.Scene`` with the objects of the stated one, which may have been moved before; nothing else
             may use it.
         stated: surfaces of the scene as stated.
-        parameters: parameters of `wrf_mi.tracing.traced_field.TracedField` by name, those of planes among them.
+        parameters: parameters of `wrf_mi.tracing.paths.traced_field.TracedField` by name, those of planes among them.
         absent: slabs of surfaces, in the order of their parameters, that no ray shall meet.
 
     Raises:

@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
-from ..backend.device import columns_on_device
-from ..backend.vectors import Pose, cross, dot, tangent_basis
-from ..core import Antenna
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from .buffer import SPECULAR, TRANSMISSION
-from .surfaces import Surfaces
+from ...backend.device import columns_on_device
+from ...backend.vectors import Pose, cross, dot, tangent_basis
+from ...core import Antenna
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.types import IntArray
+from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.surfaces import Surfaces
 
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
@@ -127,16 +127,14 @@ def evaluate_paths(
     """
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
-        height = dr.select(level.reflects, dot(image, level.normal) - level.offset_m, 0)
-        image = [x - 2 * height * n for x, n in zip(image, level.normal, strict=True)]
+        image = _mirrored(image, level, level.offset_m)
     towards = [x - p for x, p in zip(image, pose.position, strict=True)]
     length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 
     directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
-        back = dr.select(level.reflects, dot(directions[0], level.normal), 0)
-        directions.insert(0, [k - 2 * back * n for k, n in zip(directions[0], level.normal, strict=True)])
+        directions.insert(0, _mirrored(directions[0], level, 0))
 
     float_type = type(length)
     zero, one = float_type(0), float_type(1)
@@ -152,10 +150,16 @@ def evaluate_paths(
     world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
-    taken = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
-    loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length
-    gain = dot(taken, real) * loss, dot(taken, imaginary) * loss
+    received = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
+    loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length  # Friis
+    gain = dot(received, real) * loss, dot(received, imaginary) * loss
     return gain, length, departure, pose.to_local(arrival)
+
+
+def _mirrored(vector: Vector, level: Level, offset_m: Any) -> Vector:
+    """Points mirrored in the planes of a level's reflections, or directions with an offset of 0; others as they are."""
+    height = dr.select(level.reflects, dot(vector, level.normal) - offset_m, 0)
+    return [x - 2 * height * n for x, n in zip(vector, level.normal, strict=True)]
 
 
 def _interact(
@@ -169,6 +173,7 @@ def _interact(
     c = slab(cosine, permittivity, conductivity, thickness_m, frequency_hz)
     te = dr.select(level.reflects, c.reflected_te * share, c.transmitted_te)
     tm = dr.select(level.reflects, c.reflected_tm * share, c.transmitted_tm)
+    # The TE component is along the normal of the plane of incidence, before and after; the TM component turns.
     across = cross(before, level.normal)
     square = dot(across, across)
     oblique: Any = square > ALONG
@@ -183,6 +188,13 @@ def _interact(
         new = [s_part * a + p_part * b for a, b in zip(across, along_after, strict=True)]
         out.append([dr.select(met, n, o) for n, o in zip(new, old, strict=True)])
     return out[0], out[1]
+
+
+def complex_exponential(logarithm: Any, phase: Any) -> Complex:
+    """Complex numbers of a logarithmic amplitude and a phase in rad."""
+    sine, cosine = dr.sincos(phase)
+    amplitude = dr.exp(logarithm)
+    return amplitude * cosine, amplitude * sine
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:

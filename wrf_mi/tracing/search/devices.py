@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from trimesh.triangles import closest_point
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.types import IntArray
 from .surfaces import Solid, Surfaces
 
 logger = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ BEHIND_M = 0.01
 BEFORE_M = 1e-4
 """Least distance before a surface from which an antenna on it is traced."""
 CLEAR = 2.5e-5
-"""The same as a share of `Surfaces.scale_m`: twice as far as `wrf_mi.tracing.images.displaced` moves an antenna."""
+"""That distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
 ON_SHARE = 0.1
@@ -36,12 +36,12 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     Raises:
         InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
     """
-    thing = solid_around(surfaces, positions_m)
-    if (thing >= 0).any():
-        first = int(np.argmax(thing >= 0))
+    enclosing = solid_around(surfaces, positions_m)
+    if (enclosing >= 0).any():
+        first = int(np.argmax(enclosing >= 0))
         at = ", ".join(f"{x:.2f}" for x in positions_m[first])
-        what = surfaces.called(int(thing[first]))
-        raise InputError(f"{names[first]} at ({at}) m is inside the solid {what}; move one of them")
+        solid = surfaces.called(int(enclosing[first]))
+        raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
     low, high = surfaces.bounds_m
@@ -68,11 +68,13 @@ def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     for point, plane in _pairs_near(surfaces, moved):
         for index in np.unique(plane):
             normal, offset = surfaces.normal[index], surfaces.offset[index]
-            scene = surfaces.triangles @ normal - offset
-            side, near = 1.0 if scene.max() > -scene.min() else -1.0, point[plane == index]
+            corner_heights, near = surfaces.triangles @ normal - offset, point[plane == index]
+            inner_side = 1.0 if corner_heights.max() > -corner_heights.min() else -1.0
+            inwards = inner_side * corner_heights
             height = moved[near] @ normal - offset
-            outer = (side * scene).min() >= -BEHIND_M and (side * scene).max() >= BEHIND_M
-            sides = np.full(len(near), side) if outer else np.where(height < -ON_M, -1.0, 1.0)
+            # An outer wall has the whole scene before it; any other sheet may carry antennas on both sides.
+            outer = inwards.min() >= -BEHIND_M and inwards.max() >= BEHIND_M
+            sides = np.full(len(near), inner_side) if outer else np.where(height < -ON_M, -1.0, 1.0)
             low = sides * height < clear
             moved[near[low]] += (sides * clear - height)[low, None] * normal
     return moved
@@ -89,8 +91,9 @@ def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -
     """Solids with the positions [n, 3] that lie within their bounds and a margin."""
     low, high = surfaces.solid_bounds_m
     near = np.ones((len(positions_m), len(low)), bool)
-    for axis, here in enumerate(positions_m.T):
-        near &= (here[:, None] >= low[:, axis] - margin_m) & (here[:, None] <= high[:, axis] + margin_m)
+    # Axis by axis: furnished scenes have hundreds of solids, and predictions few positions.
+    for axis, coordinate in enumerate(positions_m.T):
+        near &= (coordinate[:, None] >= low[:, axis] - margin_m) & (coordinate[:, None] <= high[:, axis] + margin_m)
     for number in np.flatnonzero(near.any(axis=0)):
         yield surfaces.solids[number], np.flatnonzero(near[:, number])
 
@@ -102,7 +105,7 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     for (_, corners, normal), rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
         if len(normal) < len(corners):
             continue
-        # Most positions are far from all planes of the faces, which is told faster than distances from faces.
+        # Distances from planes are computed faster than those from faces, and rule out most positions.
         height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
         inside = winding_number(corners, moved[rows]) > 0.5
         for row, limit in zip(rows, np.where(inside, BEHIND_M, clear), strict=True):
@@ -115,12 +118,12 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 
 
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
-    """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.surfaces.Surfaces`."""
-    thing = np.full(len(positions_m), -1)
+    """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.search.surfaces.Surfaces`."""
+    enclosing = np.full(len(positions_m), -1)
     for solid, rows in _near_solids(surfaces, positions_m, 0.0):
         inside = winding_number(solid.corners, positions_m[rows]) > 0.5
-        thing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
-    return thing
+        enclosing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
+    return enclosing
 
 
 def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:

@@ -1,4 +1,8 @@
-"""Gains of known paths by Sionna RT's field calculator, with the present materials of the scene."""
+"""Sionna RT's path solver on plain arrays: its random search, its image method, its field calculator.
+
+Sionna RT's path solver has three stages: a search for candidates, the image method that makes exact paths of them, and
+the field calculator. This module alone sets attributes of ``PathsBuffer`` that have no setter; the version is pinned.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +16,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.antenna import MountedAntenna
-from .buffer import SPECULAR, TRANSMISSION, Legs, point_array, to_buffer
-from .images import image_sources
-from .options import TraceOptions
-from .surfaces import Surfaces
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.antenna import MountedAntenna
+from ..options import TraceOptions
+from ..search.images import image_sources
+from ..search.legs import SPECULAR, TRANSMISSION, Legs, join
+from ..search.surfaces import Surfaces
 
+SLOTS_PER_CHUNK = 1 << 22
+"""Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
+for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
+WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
+"""Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
 PATHS_PER_CHUNK = 1 << 19
 """Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
 AT_ANTENNA_M = 1e-9
@@ -65,6 +74,116 @@ def sionna_orientation(to_world: ArrayLike) -> FloatArray:
         return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
 
 
+def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
+    """A ``PathsBuffer`` of these paths."""
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+    from ...backend.device import columns_on_device, on_device, to_vectors
+
+    count, depth = legs.face.shape
+    buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
+    used = legs.interactions != 0
+    face = np.where(used, legs.face, 0)
+    object_index = surfaces.object_of(face)
+    shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
+    shape[used] = surfaces.shape_ids[object_index[used]]
+    primitive[used] = (face - surfaces.first_face[object_index])[used]
+    buffer._valid = dr.opaque(mi.Bool, True, count)
+    buffer._src_indices, buffer._tgt_indices = columns_on_device((legs.source, legs.target), mi.UInt32)
+    integers: Any = mi.TensorXu
+    numbers = columns_on_device((legs.interactions, shape, primitive), mi.UInt32)
+    buffer._interaction_types, buffer._shapes, buffer._primitives = (integers(values, face.shape) for values in numbers)
+    vertices = np.nan_to_num(legs.vertices_m, nan=0.0).astype(np.float32)
+    for level in range(1, depth):  # beyond the last interaction Sionna RT reads the last point, and adds its distance
+        vertices[:, level] = np.where(used[:, level, None], vertices[:, level], vertices[:, level - 1])
+    values = columns_on_device((legs.probability, *np.moveaxis(vertices, -1, 0)), mi.Float)
+    for name, column in zip(("_probs", "_vertices_x", "_vertices_y", "_vertices_z"), values, strict=True):
+        setattr(buffer, name, mi.TensorXf(column, face.shape))
+    if legs.wedge:
+        for name in WEDGE:
+            kind: Any = type(getattr(buffer._diffracting_wedges, name))
+            convert = to_vectors if dr.depth_v(kind) > 1 else on_device
+            setattr(buffer._diffracting_wedges, name, convert(legs.wedge[name], kind))
+    buffer._paths_counter = mi.UInt32(count)
+    return buffer
+
+
+def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
+    """The valid paths in a buffer."""
+    import drjit as dr
+
+    buffer.schedule()
+    dr.eval()
+    valid = np.flatnonzero(buffer.valid.numpy())
+    types = buffer.interaction_types.numpy()[valid].astype(np.uint8)
+    used = types != 0
+    shape, primitive = (tensor.numpy()[valid].astype(np.int64) for tensor in (buffer.shapes, buffer.primitives))
+    face = np.full(shape.shape, -1, np.int64)
+    face[used] = surfaces.first_by_shape[shape[used]] + primitive[used]
+    vertices = np.stack([getattr(buffer, f"vertices_{axis}").numpy()[valid] for axis in "xyz"], axis=-1).astype(float)
+    vertices[~used] = np.nan
+    wedges = buffer.diffracting_wedges
+    wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[valid] for name in WEDGE}
+    source, target = (index.numpy()[valid].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
+    return Legs(source, target, types, face, vertices, buffer.probs.numpy()[valid], wedge)
+
+
+def sampled_paths(
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions, rays: int
+) -> Legs:
+    """Paths with at least one diffuse reflection or diffraction from a source [3] to each target [n, 3], metres.
+
+    Source 0, target 0..n-1; vertices are in single precision.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.image_method import ImageMethod
+    from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+    from ...backend.device import to_vectors
+
+    step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
+    parts = []
+    for start in range(0, len(targets_m), step):
+        batch = targets_m[start : start + step]
+        ends = to_vectors(source_m[None], mi.Point3f), to_vectors(batch, mi.Point3f)
+        dr.make_opaque(*ends)
+        buffer = SBDeterministicCandidateGenerator()(
+            mi_scene=scene.mi_scene,
+            src_positions=ends[0],
+            tgt_positions=ends[1],
+            samples_per_src=rays,
+            max_num_paths_per_src=rays * options.max_depth * len(batch),
+            max_depth=options.max_depth,
+            los=False,
+            specular_reflection=options.reflection,
+            diffuse_reflection=options.scattering,
+            refraction=options.transmission,
+            diffraction=options.diffraction,
+            edge_diffraction=options.diffraction,
+            seed=options.seed,
+        )
+        buffer.schedule()
+        dr.eval()
+        buffer.shrink()
+        buffer = ImageMethod()(
+            scene=scene.mi_scene,
+            paths=buffer,
+            diffraction=buffer.diffracting_wedges is not None,
+            diffraction_lit_region=True,
+            src_positions=ends[0],
+            tgt_positions=ends[1],
+        )
+        legs = from_buffer(buffer, surfaces)
+        # Specular paths are those of `images`: Sionna RT's search finds them by chance, in single precision.
+        specular = np.isin(legs.interactions, (0, SPECULAR, TRANSMISSION)).all(axis=1)
+        legs = legs.select(np.flatnonzero(~specular))
+        parts.append(replace(legs, target=legs.target + start))
+    return join(parts)
+
+
 def field_of(
     scene: Any,
     buffer: Any,
@@ -76,7 +195,7 @@ def field_of(
 
     Args:
         scene: ``sionna.rt.Scene``.
-        buffer: p paths from source to target, from `wrf_mi.tracing.buffer.to_buffer`; may be used again.
+        buffer: p paths from source to target, from `to_buffer`; may be used again.
         ends: sources and targets.
         rays: number of rays shot per source, for diffuse reflections.
         loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
@@ -85,24 +204,29 @@ def field_of(
     import mitsuba as mi
     from sionna.rt.path_solvers.field_calculator import FieldCalculator
 
+    from ...backend.device import to_vectors
+
     if buffer.buffer_size == 0:
         return mi.Float(), mi.Float()
     calculator = FieldCalculator()
     calculator.loop_mode = loop_mode
+    # The calculator marks paths of gain zero as invalid; all are evaluated again in the next call.
     buffer.valid = dr.full(mi.Bool, True, buffer.buffer_size)
-    done = calculator(
+    points = (values for end in ends for values in (end.position_m, end.angles))
+    source_m, source_angles, target_m, target_angles = (to_vectors(rows, mi.Point3f) for rows in points)
+    evaluated = calculator(
         wavelength=scene.wavelength,
         paths=buffer,
         samples_per_src=rays,
         diffraction=buffer.diffracting_wedges is not None,
-        src_positions=point_array(ends[0].position_m),
-        tgt_positions=point_array(ends[1].position_m),
-        src_orientations=point_array(ends[0].angles),
-        tgt_orientations=point_array(ends[1].angles),
+        src_positions=source_m,
+        tgt_positions=target_m,
+        src_orientations=source_angles,
+        tgt_orientations=target_angles,
         src_antenna_patterns=[_pattern(ends[0], buffer.source_indices)],
         tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices)],
     )
-    gain = done.a[0][0]
+    gain = evaluated.a[0][0]
     return gain.real, gain.imag
 
 
@@ -112,13 +236,14 @@ def _pattern(devices: Devices, index: Any) -> Any:
     import mitsuba as mi
     from sionna.rt.antenna_pattern import antenna_pattern_registry
 
-    from ..backend.device import to_uint
+    from ...backend.device import to_uint
 
     antennas = [mounted.antenna for mounted in devices.antennas]
     distinct = list(dict.fromkeys(antennas))
     functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
     if len(distinct) == 1:
         return functions[0]
+    # The field calculator takes one pattern for all paths: this one evaluates each and selects by the path's antenna.
     kind = dr.gather(mi.UInt32, to_uint(np.array([distinct.index(antenna) for antenna in antennas])), index)
 
     def mixed(theta: Any, phi: Any) -> tuple[Any, Any]:
@@ -173,7 +298,8 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     direction = points[row, 1:] - image
     size = np.linalg.norm(direction, axis=2, keepdims=True)
     direction /= np.maximum(size, 1e-30)
-    for leg in reversed(range(direction.shape[1] - 1)):  # an antenna within a sheet that its path passes
+    # An antenna within a sheet that its path passes is at its first point: that leg takes the next one's direction.
+    for leg in reversed(range(direction.shape[1] - 1)):
         at_image = size[:, leg] < AT_ANTENNA_M
         direction[:, leg] = np.where(at_image, direction[:, leg + 1], direction[:, leg])
     moved = np.zeros_like(points[row])
@@ -194,11 +320,11 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
 def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
     """Set the scattering coefficient of all materials while the block lasts, if scattering is on."""
     able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
-    before = [material.scattering_coefficient for material in able]
+    stated = [material.scattering_coefficient for material in able]
     for material in able:
         material.scattering_coefficient = options.scattering_coefficient
     try:
         yield
     finally:
-        for material, coefficient in zip(able, before, strict=True):
+        for material, coefficient in zip(able, stated, strict=True):
             material.scattering_coefficient = coefficient

@@ -1,6 +1,6 @@
 """Specular paths from sources to many targets: possible chains, tested by rays, made exact in float64.
 
-Planes are n . x = d with unit normals n. `wrf_mi.tracing.field_calculator` has the differentiable image method in
+Planes are n . x = d with unit normals n. `wrf_mi.tracing.paths.field_calculator` has the differentiable image method in
 Dr.Jit. Source: Balanis, "Advanced Engineering Electromagnetics" (2012), section 7.4.
 """
 
@@ -11,15 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .buffer import SPECULAR, Legs, join, specular_legs
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import TraceOptions
+from .chains import ReflectionChains, possible
 from .devices import before_surfaces, clear_m
-from .options import TraceOptions
-from .seams import reflect_on_faces
-from .search import ReflectionChains, possible
+from .legs import SPECULAR, Legs, join
 from .surfaces import Surfaces
-from .visibility import unobstructed
+from .visibility import reflect_on_faces, unobstructed
 
 CANDIDATES_PER_CHUNK = 1 << 20
 """Candidates in a chunk, which take some 100 bytes for each interaction."""
@@ -54,6 +53,7 @@ def image_sources(normal: FloatArray, offset_m: FloatArray, plane: IntArray, sou
         source_m: source [3], or the source of each chain [c, 3], metres.
     """
     image = np.repeat(np.broadcast_to(source_m, (len(plane), 3))[:, None], plane.shape[1] + 1, axis=1)
+    # The image after a reflection is that before it, mirrored in the plane that reflects: Balanis (2012), section 7.4.
     for level in range(plane.shape[1]):
         image[:, level + 1] = image[:, level]
         row = np.flatnonzero(plane[:, level] >= 0)
@@ -93,7 +93,7 @@ def specular_paths(
 
     Args:
         surfaces: surfaces of the scene.
-        chains: chains from these sources, see `wrf_mi.tracing.search.shoot`.
+        chains: chains from these sources, see `wrf_mi.tracing.search.chains.shoot`.
         sources_m: positions [s, 3], metres.
         targets_m: positions [n, 3], metres.
         options: kinds of interaction and depth.
@@ -113,21 +113,22 @@ def specular_paths(
         before_surfaces(surfaces, ends) - surfaces.centre_m for ends in (sources_m, targets_m)
     )
     parts = []
-    for start in range(0, len(candidates[0]), CANDIDATES_PER_CHUNK):
+    for start in range(0, max(1, len(candidates[0])), CANDIDATES_PER_CHUNK):
         chain, source, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         plane = np.where(chain[:, None] >= 0, chains.plane[chain], -1) if len(chains) else chain[:, None][:, :0]
-        # Whether a path exists is told near its ends, not at them; its points are exact.
+        # Existence of a path is judged for displaced antennas (`displaced`); its points are exact for the stated ones.
         near = displaced(surfaces.scale_m, clear_sources[source], clear_targets[target])
         vertices, meets = _vertices(surfaces, plane, *(ends + surfaces.centre_m for ends in near))
         meets &= ~_mounted(surfaces, plane, sources_m[source], targets_m[target])
         row = np.flatnonzero(meets)
         met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission)
-        kept = row[met.candidate]
-        found = specular_legs(source[kept], target[kept], met.interactions, met.face, met.points_m)
-        exact = _exact(surfaces, chains, chain[kept], found, sources_m, targets_m)
+        is_path = row[met.candidate]
+        exhaustive = np.ones(met.face.shape, np.float32)
+        single = Legs(source[is_path], target[is_path], met.interactions, met.face, met.points_m, exhaustive, {})
+        exact = _exact(surfaces, chains, chain[is_path], single, sources_m, targets_m)
         valid = reflect_on_faces(surfaces, exact)
         parts.append(exact if valid.all() else exact.select(valid))
-    return join(parts, depth)
+    return join(parts)
 
 
 def displaced(scale_m: float, source_m: FloatArray, target_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -158,15 +159,16 @@ def _vertices(
     """
     images = image_sources(surfaces.normal, surfaces.offset, plane, source_m)
     length, levels = np.count_nonzero(plane >= 0, axis=1), plane.shape[1]
-    vertices, here = np.full((len(plane), levels + 2, 3), np.nan), target_m.copy()
+    vertices, point = np.full((len(plane), levels + 2, 3), np.nan), target_m.copy()
     vertices[:, 0], meets = source_m, np.ones(len(plane), bool)
-    vertices[np.arange(len(plane)), length + 1] = here
+    vertices[np.arange(len(plane)), length + 1] = point
+    # From the target backwards: the line from a vertex to the image before it meets the plane at the vertex before.
     for level in reversed(range(levels)):
         row = np.flatnonzero(length > level)
         mirror, image = plane[row, level], images[row, level + 1]
-        here[row], near, far = meeting_point(here[row], image, surfaces.normal[mirror], surfaces.offset[mirror])
-        vertices[row, level + 1] = here[row]
-        meets[row] &= near * far < 0
+        point[row], near, far = meeting_point(point[row], image, surfaces.normal[mirror], surfaces.offset[mirror])
+        vertices[row, level + 1] = point[row]
+        meets[row] &= near * far < 0  # else the image is on the vertex's side, and nothing is reflected
     return vertices, meets
 
 
@@ -188,20 +190,21 @@ def _exact(
     surfaces: Surfaces,
     chains: ReflectionChains,
     chain: IntArray,
-    found: Legs,
+    single: Legs,
     sources_m: FloatArray,
     targets_m: FloatArray,
 ) -> Legs:
     """Vertices in float64, from the target back to the images of the source: single precision loses the phase."""
-    here, vertices = targets_m[found.target], found.vertices_m.copy()
-    reflected = np.cumsum(found.interactions == SPECULAR, axis=1)
+    point, vertices = targets_m[single.target], single.vertices_m.copy()
+    reflected = np.cumsum(single.interactions == SPECULAR, axis=1)
     for level in reversed(range(vertices.shape[1])):
-        row = np.flatnonzero(found.interactions[:, level])
-        image = sources_m[found.source[row]]
+        row = np.flatnonzero(single.interactions[:, level])
+        image = sources_m[single.source[row]]
         before = reflected[row, level]
+        # A wave that passes a surface goes on towards the same image; without a reflection before, that is the source.
         image[before > 0] = chains.image[chain[row[before > 0]], before[before > 0] - 1]
-        plane = surfaces.plane[found.face[row, level]]
-        met, near, far = meeting_point(here[row], image, surfaces.normal[plane], surfaces.offset[plane])
+        plane = surfaces.plane[single.face[row, level]]
+        met, near, far = meeting_point(point[row], image, surfaces.normal[plane], surfaces.offset[plane])
         crosses = np.abs(near - far) > PARALLEL
-        here[row] = vertices[row, level] = np.where(crosses[:, None], met, vertices[row, level])
-    return replace(found, vertices_m=vertices)
+        point[row] = vertices[row, level] = np.where(crosses[:, None], met, vertices[row, level])
+    return replace(single, vertices_m=vertices)

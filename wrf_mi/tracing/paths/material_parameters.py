@@ -20,11 +20,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import columns_on_device
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .materials import conductivity_exponent
-from .surfaces import Surfaces
+from ...backend.device import columns_on_device
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..search.surfaces import Surfaces
+from ..sionna.materials import conductivity_exponent
 
 LEAST_SUSCEPTIBILITY = 1e-3
 """Start of permittivity - 1 for materials of permittivity 1 (metal, air), whose logarithm has no derivative."""
@@ -138,13 +138,13 @@ class SlabMaterials:
                 return LEAST[quantity] + dr.exp(x) if quantity in LEAST else x
 
             if self.grouping == "surface":
-                whole = parameters.get(name_of(SURFACE, quantity))
-                return constant if whole is None else value(whole)
+                of_all = parameters.get(name_of(SURFACE, quantity))
+                return constant if of_all is None else value(of_all)
             each = [parameters.get(name_of(name, quantity)) for name in self.names]
             if all(parameter is None for parameter in each):
                 return constant
             pairs = zip(getattr(self, attribute), each, strict=True)
-            return dr.concat([float_type(float(one)) if p is None else value(p) for one, p in pairs])
+            return dr.concat([float_type(float(x)) if p is None else value(p) for x, p in pairs])
 
         conductivity = column("conductivity")
         if frequency_ratio != 1:
@@ -174,12 +174,12 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]
     number = np.array([named.names.index(kind) if kind in named.names else -1 for kind in kinds], np.int64)
-    thing = surfaces.object_of(np.arange(len(surfaces.plane)))
-    slab_of_face = number[thing] if len(thing) else np.zeros(0, np.int64)
+    object_index = surfaces.object_of(np.arange(len(surfaces.plane)))
+    slab_of_face = number[object_index] if len(object_index) else np.zeros(0, np.int64)
     if grouping == "named":
         return named, slab_of_face
     is_slab = slab_of_face >= 0
-    pairs, surface = np.unique(np.stack([thing, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
+    pairs, surface = np.unique(np.stack([object_index, surfaces.plane], axis=1)[is_slab], axis=0, return_inverse=True)
     slab_of_face[is_slab] = surface.reshape(-1)
     names = tuple(f"{surfaces.names[index]}/{plane}" for index, plane in pairs)
     return replace(named.select(number[pairs[:, 0]]), names=names, grouping=grouping), slab_of_face

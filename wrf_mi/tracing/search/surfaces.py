@@ -1,4 +1,9 @@
-"""Triangles of a Sionna RT scene in float64, and their planes."""
+"""Triangles of a Sionna RT scene in float64, their planes, and closed screens of them for rays.
+
+Rays in single precision miss triangles that they meet on an edge, and sheets that were modelled one by one may leave a
+gap of rounding at their seam. A wave that meets an edge counts as meeting its surface (`visibility`), so faces are
+enlarged a little at free and sharp edges, and no ray passes at a seam.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,10 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.digest import content_digest
-from ..core.types import IntArray
-from ..scene.mesh.surfaces import bodies
-from .screens import ENLARGED, scale_m, screens
+from ...core.angles import FloatArray
+from ...core.digest import content_digest
+from ...core.types import IntArray
+from ...scene.mesh.surfaces import bodies, shared_edges
 
 COPLANAR_M = 2e-5
 """Largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m."""
@@ -33,6 +37,20 @@ MERGED_COUNT = 1000
 SOLID_M = 0.5
 """Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
 room of 3 x 3 x 2.5 m 0.94 m."""
+ENLARGED = 4e-5
+"""Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are
+displaced (`images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
+OVERLAP = 5e-7
+"""The same at edges at which a face goes on in another: eight times the rounding of a coordinate in single precision,
+by which edges of enlarged faces do not match."""
+SMOOTH_COS = np.cos(np.radians(10))
+"""Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
+overlap, and waves that pass such a body would meet two facets in place of one."""
+FARTHEST = 25.0
+"""Largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors."""
+MOST_AT_CORNER = 8.0
+"""Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
+infinity."""
 
 
 class Solid(NamedTuple):
@@ -95,7 +113,7 @@ class Surfaces:
     @cached_property
     def faces_on_device(self) -> tuple[Any, Any]:
         """`first_by_shape`, and plane of each face: Dr.Jit arrays, ``mi.UInt32``."""
-        from ..backend.device import to_uint
+        from ...backend.device import to_uint
 
         return to_uint(self.first_by_shape), to_uint(self.plane)
 
@@ -107,12 +125,12 @@ class Surfaces:
 
     @cached_property
     def scale_m(self) -> float:
-        """Length by which distances that single precision does not resolve grow, see `wrf_mi.tracing.screens`."""
+        """Length by which distances that single precision does not resolve grow."""
         return scale_m(self.triangles, self.centre_m)
 
     @cached_property
     def screens(self) -> Any:
-        """Mitsuba scene of the faces about `centre_m`, closed at their seams, see `wrf_mi.tracing.screens.screens`."""
+        """Mitsuba scene of the faces about `centre_m`, closed at their seams."""
         return screens(self.triangles - self.centre_m, self.scale_m)
 
     @cached_property
@@ -151,7 +169,7 @@ class Surfaces:
     def moved_planes(
         self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.plane_parameters`.
+        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.plane_parameters`.
 
         Args:
             shift_m: shifts along the normals [k].
@@ -167,7 +185,7 @@ class Surfaces:
         """``normal``, ``offset``, both ``axes``, ``low`` and ``high`` of the planes: Dr.Jit vectors [q]."""
         import mitsuba as mi
 
-        from ..backend.device import columns_on_device
+        from ...backend.device import columns_on_device
 
         columns = (self.normal, self.offset[:, None], self.axes[:, 0], self.axes[:, 1], self.low, self.high)
         x = columns_on_device(np.hstack(columns).T, mi.Float)
@@ -187,18 +205,18 @@ class Surfaces:
     @cached_property
     def solid_bounds_m(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest coordinates of the solids [s, 3], metres."""
-        empty = [np.zeros((0, 3))]
-        low, high = ([getattr(one.corners, side)((0, 1))[None] for one in self.solids] for side in ("min", "max"))
-        return np.concatenate(empty + low), np.concatenate(empty + high)
+        bounds = [np.stack([solid.corners.min((0, 1)), solid.corners.max((0, 1))]) for solid in self.solids]
+        low, high = np.reshape(bounds, (-1, 2, 3)).swapaxes(0, 1)
+        return low, high
 
     @cached_property
     def bounds_m(self) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest coordinates of the faces [3], metres."""
         return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
 
-    def called(self, thing: int) -> str:
+    def called(self, index: int) -> str:
         """Name of an object in error messages, with its mesh file if that has another name."""
-        name, file = self.names[thing], self.files[thing] if self.files else ""
+        name, file = self.names[index], self.files[index] if self.files else ""
         return repr(name) if Path(file).stem in ("", name) else f"{name!r} ({file})"
 
     def object_of(self, face: IntArray) -> IntArray:
@@ -218,8 +236,8 @@ def scene_surfaces(scene: Any) -> Surfaces:
         corners = np.asarray(parameters["vertex_positions"], float).reshape(-1, 3)
         triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
         ids.append(shape_id(mesh))
-        found = MESH_FILE.search(str(mesh))
-        files.append(found[1] if found else "")
+        stated_file = MESH_FILE.search(str(mesh))
+        files.append(stated_file[1] if stated_file else "")
     first = np.cumsum([len(part) for part in triangles])
     surfaces = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
     return replace(surfaces, files=tuple(files))
@@ -242,13 +260,15 @@ def find_planes(
     The second step joins a wall with its slivers, whose normals are inexact.
     """
     centre, cross = triangles.mean(axis=1), trimesh.triangles.cross(triangles)
-    area = np.linalg.norm(cross, axis=1)[:, None] / 2
-    normal = np.divide(cross, 2 * area, out=np.tile([0.0, 0.0, 1.0], (len(cross), 1)), where=area > 0)
-    area = area[:, 0]
+    area = np.linalg.norm(cross, axis=1) / 2
+    # Faces without area get any normal: no ray meets them.
+    normal = np.tile([0.0, 0.0, 1.0], (len(cross), 1))
+    np.divide(cross, 2 * area[:, None], out=normal, where=area[:, None] > 0)
     largest = np.abs(normal).argmax(axis=1)[:, None]
     normal *= np.sign(np.take_along_axis(normal, largest, axis=1))  # both sides of a sheet have one normal
     offset = (normal * centre).sum(axis=1)
 
+    # First equal rounded normals and offsets, in one pass; a face on the border of two cells is taken in below.
     rounded = np.round(np.column_stack([normal, offset]) / COPLANAR_M).astype(np.int64)
     _, plane = np.unique(rounded, axis=0, return_inverse=True)
     plane = plane.reshape(-1)
@@ -263,14 +283,14 @@ def find_planes(
         candidates = np.flatnonzero(free & (np.abs(centre @ normal[face] - offset[face]) < COPLANAR_M))
         near = np.abs(triangles[candidates] @ normal[face] - offset[face]).max(axis=1) < COPLANAR_M
         near &= np.abs(normal[candidates] @ normal[face]) > COPLANAR_COS
-        near |= candidates == face
+        near |= candidates == face  # its own corners may be off by more: the normal of a sliver is inexact
         plane[candidates[near]] = seed
         free[candidates[near]] = False
     labels, plane = np.unique(plane, return_inverse=True)
     plane = plane.reshape(-1)
     # The plane is that of the face which took in the others: theirs may be tilted within the tolerance.
-    kept = plane[biggest[labels]] == np.arange(len(labels))
-    face = np.where(kept, biggest[labels], largest_face(plane, area))
+    is_own_plane = plane[biggest[labels]] == np.arange(len(labels))
+    face = np.where(is_own_plane, biggest[labels], largest_face(plane, area))
     normal, offset = normal[face], offset[face]
     edge = triangles[face][:, 1] - triangles[face][:, 0]
     edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
@@ -291,3 +311,69 @@ def plane_bounds(plane: IntArray, flat_m: FloatArray, count: int) -> tuple[Float
     np.minimum.at(low, plane, flat_m.min(axis=1))
     np.maximum.at(high, plane, flat_m.max(axis=1))
     return low, high
+
+
+def scale_m(triangles: FloatArray, centre_m: FloatArray) -> float:
+    """Largest coordinate of triangles [f, 3, 3] plus 1 m: the rounding of their corners in files grows with it.
+
+    Far from the origin it is bounded by `FARTHEST` times the same about the middle [3] of the scene.
+    """
+    stated, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in (triangles, triangles - centre_m))
+    return min(stated, FARTHEST * centred)
+
+
+def screens(triangles: FloatArray, scale_m: float) -> Any:
+    """A Mitsuba scene of one mesh for rays, whose primitives are the triangles [f, 3, 3] in their order, enlarged."""
+    import mitsuba as mi
+
+    from ...backend.device import on_device
+
+    mesh: Any = mi.Mesh("screens", 3 * len(triangles), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = on_device(enlarged(triangles, scale_m), mi.Float)
+    parameters["faces"] = on_device(np.arange(3 * len(triangles)), mi.UInt32)
+    parameters.update()
+    # Embree's robust mode loses fewer rays at edges; OptiX is watertight as it is.
+    return mi.load_dict({"type": "scene", "mesh": mesh, "embree_use_robust_intersections": True})
+
+
+def enlarged(triangles: FloatArray, scale_m: float) -> FloatArray:
+    """Triangles [f, 3, 3] enlarged in their planes by `ENLARGED` at edges that are free, sharp or of three faces.
+
+    At other edges they overlap by rounding. Degenerate triangles stay as they are.
+    """
+    if not len(triangles):
+        return triangles
+    along = np.roll(triangles, -1, axis=1) - triangles  # edge k runs from corner k to corner k + 1
+    length = np.linalg.norm(along, axis=2, keepdims=True)
+    along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
+    incoming = np.roll(along, 1, axis=1)
+    sine = np.linalg.norm(np.cross(incoming, along), axis=2, keepdims=True)
+    margin = np.where(_smooth(triangles), OVERLAP, ENLARGED)[..., None] * scale_m
+    # Both edges at a corner are shifted outwards by their margins: the corner moves to where the shifted lines meet.
+    moved = np.roll(margin, 1, axis=1) * -along + margin * incoming
+    moved = np.divide(moved, sine, out=np.zeros_like(moved), where=sine > 0)
+    farthest = MOST_AT_CORNER * margin.max(initial=0.0)
+    size = np.linalg.norm(moved, axis=2, keepdims=True)
+    moved *= np.minimum(1.0, np.divide(farthest, size, out=np.ones_like(size), where=size > 0))
+    solid = trimesh.triangles.area(triangles) > 0
+    return np.where(solid[:, None, None], triangles + moved, triangles)
+
+
+def _smooth(triangles: FloatArray) -> Any:
+    """Mask of edges [f, 3] at which a face goes on in exactly one other face, bent by less than 10 degrees."""
+    edge = shared_edges(triangles)[0]
+    count = np.bincount(edge)
+    order = np.argsort(edge, kind="stable")
+    pairs = order[np.repeat(count, count) == 2].reshape(-1, 2)
+    # From the edge to the third corner of each of both faces: opposite directions where the faces are in one plane.
+    start, end, third = (np.roll(triangles, -k, axis=1).reshape(-1, 3)[pairs] for k in range(3))
+    along = end - start
+    share = ((third - start) * along).sum(axis=-1, keepdims=True)
+    square = (along * along).sum(axis=-1, keepdims=True)
+    away = third - start - along * np.divide(share, square, out=np.zeros_like(share), where=square > 0)
+    cosine = (away[:, 0] * away[:, 1]).sum(axis=-1)
+    sizes = np.linalg.norm(away, axis=-1).prod(axis=1)
+    smooth = np.zeros(3 * len(triangles), bool)
+    smooth[pairs[cosine < -SMOOTH_COS * sizes]] = True
+    return smooth.reshape(-1, 3)

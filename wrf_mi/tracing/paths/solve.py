@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,18 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from ..core import Antenna, InputError, Paths, Receiver
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from .buffer import Legs, join, sampled_paths
-from .devices import before_surfaces, check_devices, from_behind
-from .fields import AT_ANTENNA_M, path_gains, scattering_materials
-from .images import image_sources, specular_paths
-from .options import DEFAULTS, MAX_RAYS, TraceOptions
+from ...core import Antenna, InputError, Paths, Receiver
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.types import IntArray
+from ..options import DEFAULTS, MAX_RAYS, TraceOptions
+from ..search.chains import ReflectionChains, check_search, shoot
+from ..search.devices import before_surfaces, check_devices, from_behind
+from ..search.images import image_sources, specular_paths
+from ..search.legs import Legs, join
+from ..search.surfaces import Surfaces, scene_surfaces
+from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scattering_materials
 from .result import TraceResult, device_ends
-from .search import ReflectionChains, check_search, shoot
-from .surfaces import Surfaces, scene_surfaces
 
 if TYPE_CHECKING:
     from .material_parameters import MaterialGrouping
@@ -63,13 +62,12 @@ class Prepared:
         """Refuse antennas inside solids and warn of those near surfaces, each position once, as stated.
 
         Raises:
-            InputError: see `wrf_mi.tracing.devices.check_devices`.
+            InputError: see `wrf_mi.tracing.search.devices.check_devices`.
         """
-        names = [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))]
-        names += [f"receiver {receiver.name}" for receiver in receivers]
-        stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
-        for side in np.split(np.arange(len(names)), [len(tx_pos_m)]):
-            new = np.array([row for row in side if stated[row].tobytes() not in self._checked], int)
+        transmitters, receiver_names = _names(len(tx_pos_m), receivers, first_row)
+        sides = (transmitters, tx_pos_m), (receiver_names, np.stack([receiver.position_m for receiver in receivers]))
+        for names, stated in sides:
+            new = np.array([row for row in range(len(names)) if stated[row].tobytes() not in self._checked], int)
             traced = from_behind(self.surfaces, stated[new])
             if len(moved := new[(stated[new] != traced).any(axis=1)]):
                 text = "%d of %d antennas lie up to 1 cm behind a surface (first: %s): traced from 0.1 mm before it"
@@ -78,15 +76,15 @@ class Prepared:
             self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
-        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.devices.from_behind`."""
+        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.search.devices.from_behind`."""
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         # Those on a surface stay: their paths are searched for before it, and have the lengths from the surface.
         positions, others = np.split(from_behind(self.surfaces, stated), [len(tx_pos_m)])
-        return positions, tuple(replace(rx, position_m=here) for rx, here in zip(receivers, others, strict=True))
+        return positions, tuple(replace(rx, position_m=at) for rx, at in zip(receivers, others, strict=True))
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .plane_parameters import SceneTables
+        from .plane_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
@@ -110,12 +108,12 @@ class Prepared:
 
     def new_chains(self, sources_m: FloatArray, options: TraceOptions, rays: int, seed: int) -> ReflectionChains:
         """Chains from points [s, 3] by rays of any seed, not kept here."""
-        met, surfaces, found = options.max_depth if options.transmission else options.reflections, self.surfaces, []
-        for source_m in sources_m:
-            plane = shoot(self.scene, surfaces, source_m, rays, met, options.reflections, seed, options.transmission)
-            image = image_sources(surfaces.normal, surfaces.offset, plane, source_m)[:, 1:]
-            found.append(ReflectionChains(plane, image, np.zeros(len(plane), np.int64)))
-        return ReflectionChains.joined(found)
+        surfaces = self.surfaces
+        planes = [shoot(self.scene, surfaces, source_m, options, rays, seed) for source_m in sources_m]
+        source = np.repeat(np.arange(len(planes)), [len(plane) for plane in planes])
+        plane = np.concatenate(planes)
+        image = image_sources(surfaces.normal, surfaces.offset, plane, sources_m[source])[:, 1:]
+        return ReflectionChains(plane, image, source)
 
 
 def trace_paths(
@@ -134,13 +132,13 @@ def trace_paths(
     """Trace the paths from every transmitter position to every receiver.
 
     Sequences of reflecting planes that the rays of one source find are tried for every position of the other side, so
-    that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.visibility`), and
-    Sionna RT's field calculator gives their gains. The paths of a pair are the same alone and among others, as long as
-    the number of rays is not ``"auto"``.
+    that rays are not shot for each; rays along their legs decide which are paths (`wrf_mi.tracing.search.visibility`),
+    and Sionna RT's field calculator gives their gains. The paths of a pair are the same alone and among others, as long
+    as the number of rays is not ``"auto"``.
 
     Memory grows with the paths found, about 1 kB for each at six interactions (measured), and not with the positions
-    tried: chunks are bounded by `wrf_mi.tracing.images.CANDIDATES_PER_CHUNK` and
-    `wrf_mi.tracing.search.PAIRS_PER_CHUNK`.
+    tried: chunks are bounded by `wrf_mi.tracing.search.images.CANDIDATES_PER_CHUNK` and
+    `wrf_mi.tracing.search.chains.PAIRS_PER_CHUNK`.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`, at the carrier frequency.
@@ -194,12 +192,17 @@ def trace_paths(
     return traced
 
 
+def _names(transmitters: int, receivers: Sequence[Receiver], first_row: int) -> tuple[list[str], list[str]]:
+    """Names of transmitters, by their rows from 1, and of receivers in messages."""
+    rows = range(first_row + 1, first_row + 1 + transmitters)
+    return [f"transmitter {row}" for row in rows], [f"receiver {receiver.name}" for receiver in receivers]
+
+
 def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Receiver], first_row: int) -> None:
     """Warn of transmitters and of receivers without any path: behind a wall, or of too few interactions."""
-    sides = [
-        ("transmitters", paths.tx, [f"transmitter {first_row + row + 1}" for row in range(len(tx_pos_m))], tx_pos_m)
-    ]
-    sides += [("receivers", paths.rx, [rx.name for rx in receivers], np.stack([rx.position_m for rx in receivers]))]
+    transmitters, receiver_names = _names(len(tx_pos_m), receivers, first_row)
+    sides = [("transmitters", paths.tx, transmitters, tx_pos_m)]
+    sides += [("receivers", paths.rx, receiver_names, np.stack([rx.position_m for rx in receivers]))]
     for what, reached, names, positions in sides:
         silent = np.setdiff1d(np.arange(len(names)), reached)
         if len(silent):
@@ -218,33 +221,23 @@ def _search(
     progress: bool,
 ) -> Legs:
     """Paths from all sources to all targets."""
-    parts, depth = [], max(options.max_depth, 1)
-    with _progress("tracing paths", len(sources) * len(targets), progress) as advance:
+    parts = []
+    with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
+        task = bar.add_task("tracing paths", total=len(sources) * len(targets))
         for first in range(0, len(sources), SOURCES_TOGETHER):
-            some = sources[first : first + SOURCES_TOGETHER]
-            chains, step = shared.chains(some, options, rays), max(1, PAIRS_TOGETHER // len(some))
+            group = sources[first : first + SOURCES_TOGETHER]
+            chains, step = shared.chains(group, options, rays), max(1, PAIRS_TOGETHER // len(group))
             for start in range(0, len(targets), step):
                 batch = targets[start : start + step]
-                found = [specular_paths(shared.surfaces, chains, some, batch, options)]
+                kinds = [specular_paths(shared.surfaces, chains, group, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
-                    for index, source in enumerate(some):
+                    for index, source in enumerate(group):
                         legs = sampled_paths(scene, shared.surfaces, source, batch, options, rays)
-                        found.append(replace(legs, source=np.full_like(legs.source, index)))
-                legs = join(found, depth)
+                        kinds.append(replace(legs, source=np.full_like(legs.source, index)))
+                legs = join(kinds)
                 parts.append(replace(legs, source=legs.source + first, target=legs.target + start))
-                advance(len(some) * len(batch))
-    return join(parts, depth)
-
-
-@contextmanager
-def _progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
-    """A function that advances a progress bar on standard error; a hidden bar would cost as much as a short search."""
-    if not shown:
-        yield lambda count: None
-        return
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=total)
-        yield lambda count: bar.advance(task, count)
+                bar.advance(task, len(group) * len(batch))
+    return join(parts)
 
 
 def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
@@ -266,10 +259,10 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
     while True:
         chains = shared.new_chains(sources, plain, rays, options.seed + rays.bit_length())
         legs = specular_paths(shared.surfaces, chains, sources, targets, plain)
-        found = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
-        calm = calm + 1 if (found <= best * (1 + GROWTH)).all() else 0
-        best = np.maximum(best, found)
-        logger.info("%d rays: %d paths on a sample of positions", rays, found[0])
+        count_and_power = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
+        calm = calm + 1 if (count_and_power <= best * (1 + GROWTH)).all() else 0
+        best = np.maximum(best, count_and_power)
+        logger.info("%d rays: %d paths on a sample of positions", rays, len(legs))
         if calm == 2:
             return rays // 4
         if rays >= MAX_RAYS:
@@ -285,12 +278,12 @@ def spread(count: int, most: int) -> IntArray:
 
 def _lengths(legs: Legs, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
     """Unfolded lengths [p] in float64."""
-    here, length = sources_m[legs.source], np.zeros(len(legs))
+    point, length = sources_m[legs.source], np.zeros(len(legs))
     for level in range(legs.interactions.shape[1]):
-        there = np.where(legs.interactions[:, level, None] != 0, legs.vertices_m[:, level], here)
-        length += np.linalg.norm(there - here, axis=1)
-        here = there
-    return length + np.linalg.norm(targets_m[legs.target] - here, axis=1)
+        following = np.where(legs.interactions[:, level, None] != 0, legs.vertices_m[:, level], point)
+        length += np.linalg.norm(following - point, axis=1)
+        point = following
+    return length + np.linalg.norm(targets_m[legs.target] - point, axis=1)
 
 
 def _paths(

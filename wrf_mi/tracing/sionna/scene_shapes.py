@@ -21,11 +21,11 @@ import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
-from ..core import InputError
-from ..core.angles import FloatArray
-from ..core.files import one_line
-from ..scene.mesh.files import mesh_parts
-from ..scene.xml_file import FILES, named_shapes
+from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.files import one_line
+from ...scene.mesh.files import mesh_parts
+from ...scene.xml_file import FILES, named_shapes
 from .materials import CONSTANTS
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,7 @@ def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) 
     if _same_triangles(corners, _triangles_by_mitsuba(file, plugin)):
         return None
     logger.info("%s: read as %d triangles, which Mitsuba reads otherwise or not at all", file, len(corners))
-    return _ply(mesh)
+    return plain_ply(mesh)
 
 
 def _triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
@@ -198,11 +198,11 @@ def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: 
         round_axes, angles = (3, 2) if plugin == "sphere" else (2, 1)
         off_m = (1 - np.cos(np.pi / SEGMENTS) ** angles) * np.linalg.norm(to_world[:3, :round_axes], 2)
         logger.info("%s: a %s as %d triangles, up to %.2g m off it", where, plugin, len(placed.faces), off_m)
-    return _ply(placed)
+    return plain_ply(placed)
 
 
-def _ply(mesh: trimesh.Trimesh) -> bytes:
-    # Vertices and faces only: Mitsuba warns of unknown attributes.
+def plain_ply(mesh: trimesh.Trimesh) -> bytes:
+    """PLY of vertices and faces alone: Mitsuba warns of unknown attributes."""
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     return cast(bytes, bare.export(file_type="ply", vertex_normal=False))
 
@@ -213,14 +213,12 @@ def check_materials(root: Element, path: Path) -> None:
     Raises:
         InputError: a BSDF, in a shape or beside the shapes, without id.
     """
-    remedy = 'give it one of its own, such as id="mat-my_material"'
-    for number, bsdf in enumerate(root.findall("bsdf"), start=1):
+    materials = [(f"<bsdf> {number}", bsdf) for number, bsdf in enumerate(root.findall("bsdf"), start=1)]
+    materials += [(f"{name}: its <bsdf>", bsdf) for name, shape in named_shapes(root) for bsdf in shape.findall("bsdf")]
+    for where, bsdf in materials:
         if not bsdf.get("id"):
-            raise InputError(f"{path}: <bsdf> {number} ({bsdf.get('type')}) has no id; {remedy}")
-    for name, shape in named_shapes(root):
-        for bsdf in shape.findall("bsdf"):
-            if not bsdf.get("id"):
-                raise InputError(f"{path}: {name}: its <bsdf> ({bsdf.get('type')}) has no id; {remedy}")
+            remedy = 'give it one of its own, such as id="mat-my_material"'
+            raise InputError(f"{path}: {where} ({bsdf.get('type')}) has no id; {remedy}")
 
 
 def load_checked(root: Element, path: Path, folder: Path) -> Any:

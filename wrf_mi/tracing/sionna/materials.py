@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M, THICKNESS_M
 
-from ..core import InputError
-from ..scene.materials import EXPONENT
+from ...core import InputError
+from ...scene.materials import EXPONENT
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +177,7 @@ def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:
     """
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES, itu_material
 
-    found = {}
+    constants = {}
     for name in ITU_MATERIALS_PROPERTIES:
         if in_itu_range(name, frequency_hz):
             permittivity, conductivity = (float(np.ravel(value)[0]) for value in itu_material(name, frequency_hz))
@@ -185,5 +185,5 @@ def itu_constants(frequency_hz: float) -> dict[str, tuple[float, float, float]]:
             permittivity, conductivity = BELOW_1_GHZ[name]
         else:
             continue
-        found[name] = permittivity, conductivity, THICKNESS_M[f"itu_{name}"]
-    return found
+        constants[name] = permittivity, conductivity, THICKNESS_M[f"itu_{name}"]
+    return constants

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..backend.device import on_device
-from ..core.angles import FloatArray
-from ..core.types import IntArray
-from .field_calculator import Complex
-from .options import DISC, FACTOR
+from ...backend.device import on_device
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ..options import DISC, FACTOR
+from .field_calculator import Complex, Float64, complex_exponential
 
 NEAREST = 6
 """Gaussians that change one interaction."""
@@ -39,8 +39,6 @@ LEAST_POINTS = 4
 """Fewest interactions of training paths in a cell of the lattice that gets a Gaussian."""
 SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99
 """Largest distance along the normal, and smallest cosine between normals, of a plane that scans find twice."""
-
-Float64: Any = dr.float64_array_t(mi.Float)
 
 
 @dataclass(frozen=True)
@@ -104,17 +102,17 @@ class SurfaceGaussians:
         # Twice as many neighbours as needed, as those of other planes do not count.
         count = min(2 * NEAREST, len(self))
         ranks = np.arange(1, count + 1)
-        distance, found = self._tree.query(met.position_m, ranks, distance_upper_bound=EXTENT * self.size_m)
-        real = found < len(self)
-        found = np.where(real, found, 0)
-        normal = self.discs[3:].T[found]
-        away = np.abs(((met.position_m[:, None] - self.discs[:3].T[found]) * normal).sum(axis=-1))
+        distance, neighbour = self._tree.query(met.position_m, ranks, distance_upper_bound=EXTENT * self.size_m)
+        exists = neighbour < len(self)  # SciPy fills up with the number of points
+        neighbour = np.where(exists, neighbour, 0)
+        normal = self.discs[3:].T[neighbour]
+        away = np.abs(((met.position_m[:, None] - self.discs[:3].T[neighbour]) * normal).sum(axis=-1))
         turned = np.abs((met.normal[:, None] * normal).sum(axis=-1))
-        same = real & (away < SAME_PLANE_M) & (turned > SAME_PLANE_COS)
-        every = np.where(same, np.exp(-0.5 * np.square(np.where(real, distance, 0) / self.size_m)), 0)
-        order = np.argsort(-every, axis=1, kind="stable")[:, :NEAREST]
-        index[:, : order.shape[1]] = np.take_along_axis(found, order, axis=1)
-        weight[:, : order.shape[1]] = np.take_along_axis(every, order, axis=1)
+        same = exists & (away < SAME_PLANE_M) & (turned > SAME_PLANE_COS)
+        weights = np.where(same, np.exp(-0.5 * np.square(np.where(exists, distance, 0) / self.size_m)), 0)
+        order = np.argsort(-weights, axis=1, kind="stable")[:, :NEAREST]
+        index[:, : order.shape[1]] = np.take_along_axis(neighbour, order, axis=1)
+        weight[:, : order.shape[1]] = np.take_along_axis(weights, order, axis=1)
         return index, weight
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
@@ -164,12 +162,5 @@ class PathWeights:
             entry = dr.gather(mi.UInt32, paths, slot // self.each) * self.each + slot % self.each
             index, weight = dr.gather(mi.UInt32, index, entry), dr.gather(Float64, weight, entry)
         flat, count = factors.array, factors.shape[1]
-        amplitude, phase = (
-            dr.block_reduce(
-                dr.ReduceOp.Add, weight * Float64(dr.gather(type(flat), flat, index + part * count)), self.each
-            )
-            for part in (0, 1)
-        )
-        sine, cosine = dr.sincos(phase)
-        amplitude = dr.exp(amplitude)
-        return amplitude * cosine, amplitude * sine
+        values = (Float64(dr.gather(type(flat), flat, index + part * count)) for part in (0, 1))
+        return complex_exponential(*(dr.block_reduce(dr.ReduceOp.Add, weight * x, self.each) for x in values))

@@ -11,16 +11,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.paths import read_paths_file, save_paths
-from ..core.types import IntArray
-from .buffer import Legs
-from .fields import Devices, Ends, path_gains, scattering_materials
-from .materials import absorbs
-from .options import TraceOptions
-from .surfaces import Surfaces, scene_surfaces
+from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.paths import read_paths_file, save_paths
+from ...core.types import IntArray
+from ..options import TraceOptions
+from ..search.legs import Legs
+from ..search.surfaces import Surfaces, scene_surfaces
+from ..sionna.materials import absorbs
+from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class TraceResult:
         tx_pos_m: transmitters [n_tx, 3], metres.
         receivers: the ``n_rx`` receivers.
         primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
-        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.buffer.Legs`.
-        wedge: edges of diffraction, see `wrf_mi.tracing.buffer.Legs`; empty without diffraction.
+        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.search.legs.Legs`.
+        wedge: edges of diffraction, see `wrf_mi.tracing.search.legs.Legs`; empty without diffraction.
         options: the options of the trace.
         rays: number of rays from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: whether the search went from receivers to transmitters.
@@ -58,8 +58,8 @@ class TraceResult:
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
         wedge = {name: values[which] for name, values in self.wedge.items()}
-        kept = self.primitives[which], self.probability[which]
-        return replace(self, paths=self.paths.select(which), primitives=kept[0], probability=kept[1], wedge=wedge)
+        paths, primitives, probability = self.paths.select(which), self.primitives[which], self.probability[which]
+        return replace(self, paths=paths, primitives=primitives, probability=probability, wedge=wedge)
 
     def unabsorbed(self, scene: Any) -> TraceResult:
         """The paths that meet no absorber of the ``sionna.rt.Scene``; others have no gain."""
@@ -72,15 +72,15 @@ class TraceResult:
     def of_transmitters(self, which: IntArray) -> TraceResult:
         """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""
         paths = self.paths
-        pair = paths.n_tx * paths.rx + paths.tx  # ascending
+        pair = paths.n_tx * paths.rx + paths.tx  # ascending, so that the paths of a pair are a range
         wanted = (paths.n_tx * np.arange(paths.n_rx)[:, None] + which).ravel()
         first, end = (np.searchsorted(pair, wanted, side) for side in ("left", "right"))
         count = end - first
         row = np.repeat(np.arange(len(wanted)), count)
-        found = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
+        selected = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
         carriers = None if self.carriers_hz is None else self.carriers_hz[which]
-        paths = replace(found.paths, tx=row % len(which), n_tx=len(which))
-        return replace(found, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
+        paths = replace(selected.paths, tx=row % len(which), n_tx=len(which))
+        return replace(selected, paths=paths, tx_pos_m=self.tx_pos_m[which], carriers_hz=carriers)
 
     def of_receivers(self, which: IntArray) -> TraceResult:
         """The trace of the receivers of ascending indices ``which`` [n]."""
@@ -218,7 +218,7 @@ def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[
     order = np.lexsort((amplitude, tx))
     ordered, upto = tx[order], np.cumsum(amplitude[order])
     first = np.searchsorted(ordered, ordered)
-    upto -= (upto - amplitude[order])[first]
-    kept = np.empty(len(tx), bool)
-    kept[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
-    return kept
+    upto -= (upto - amplitude[order])[first]  # sum of a transmitter's weaker paths and the path itself
+    strong = np.empty(len(tx), bool)
+    strong[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
+    return strong

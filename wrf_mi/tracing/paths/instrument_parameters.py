@@ -23,9 +23,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.vectors import Pose, principal_axes
-from ..core import Receiver
-from ..core.angles import FloatArray
+from ...backend.vectors import Pose, principal_axes, times
+from ...core import Receiver
+from ...core.angles import FloatArray
+from .field_calculator import Complex, Vector, complex_exponential
 
 TX_PATTERN = "pattern.transmitter"
 """Name of the parameter [2, c] of the transmitters' pattern."""
@@ -101,7 +102,23 @@ def spread_pose(pose: Pose, count: int) -> Pose:
     return Pose(wide[:3], [wide[3:6], wide[6:9], wide[9:12]])
 
 
-def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
+def with_antennas(
+    gain: Complex, receiver: Receiver, parameters: Mapping[str, Any], arrival: Vector, departure: Vector
+) -> Complex:
+    """Gains of paths times the instrument's gain and both antennas' pattern factors, of those that are parameters.
+
+    Directions are those of `wrf_mi.tracing.paths.field_calculator.evaluate_paths`. Differentiable.
+    """
+    if (name := gain_name(receiver)) in parameters:
+        float_type = type(gain[0])
+        gain = times(gain, complex_exponential(*(float_type(component(parameters[name], i)) for i in (0, 1))))
+    for name, direction in ((pattern_name(receiver), arrival), (TX_PATTERN, departure)):
+        if name in parameters:
+            gain = times(gain, pattern_factor(parameters[name], direction))
+    return gain
+
+
+def pattern_factor(coefficients: Any, direction: Vector) -> Complex:
     """Complex factor F(u) of directions in the antenna's frame. Differentiable in both arguments.
 
     Args:
@@ -122,7 +139,4 @@ def pattern_factor(coefficients: Any, direction: list[Any]) -> tuple[Any, Any]:
     table = tensor_type(dr.concat(harmonics), (count, paths))
     series = (tensor_type(coefficients) @ table).array
     index = dr.arange(dr.uint32_array_t(float_type), paths)
-    amplitude, phase = (dr.gather(float_type, series, index + part * paths) for part in (0, 1))
-    sine, cosine = dr.sincos(phase)
-    amplitude = dr.exp(amplitude)
-    return amplitude * cosine, amplitude * sine
+    return complex_exponential(*(dr.gather(float_type, series, index + part * paths) for part in (0, 1)))

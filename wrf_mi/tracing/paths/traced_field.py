@@ -1,7 +1,7 @@
 """Traced paths with derivatives: gains, lengths and directions of Sionna RT's paths follow parameters.
 
 The search for the surfaces that a wave meets (`wrf_mi.tracing.trace_paths`) has no derivative; its result is kept. The
-image method and the field along each path are evaluated in each call (`wrf_mi.tracing.field_calculator`) with the
+image method and the field along each path are evaluated in each call (`wrf_mi.tracing.paths.field_calculator`) with the
 present parameters: materials, the scene's planes, the instrument's gain, antenna patterns and the receiver's pose.
 
 Everything is float64 over planes in float64, so that phases k d are exact to 1e-12 rad for the scene as stated (the
@@ -9,7 +9,7 @@ float32 corners of its files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
 further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
-searches again. Planes that move keep their paths (see `wrf_mi.tracing.plane_parameters`).
+searches again. Planes that move keep their paths (see `wrf_mi.tracing.paths.plane_parameters`).
 """
 
 from __future__ import annotations
@@ -25,34 +25,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
-from ..backend.device import columns_on_device, on_device
-from ..backend.vectors import times
-from ..core import Antenna, InputError, Receiver
-from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA
-from ..core.types import IntArray
-from ..receivers.spreads import PathStatistics
-from . import TraceOptions, TraceResult, trace_paths
-from .buffer import SPECULAR, TRANSMISSION
+from ...backend.device import columns_on_device, on_device
+from ...backend.vectors import times
+from ...core import Antenna, InputError, Receiver
+from ...core.angles import FloatArray
+from ...core.antenna import ANTENNA
+from ...core.carriers import rows_by_carrier
+from ...core.types import IntArray
+from ...receivers.spreads import PathStatistics
+from ..options import FACTOR, TraceOptions
+from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.surfaces import Surfaces
+from .corrected_scene import MovedSearch
 from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
 from .instrument_parameters import (
-    TX_PATTERN,
-    component,
     gain_name,
     instrument_parameters,
     moved_m,
-    pattern_factor,
-    pattern_name,
     receiver_pose,
     spread_pose,
+    with_antennas,
 )
 from .material_parameters import TRAINED, MaterialGrouping
-from .options import FACTOR
 from .plane_parameters import SceneTables, renumbered
-from .result import without_faint
-from .solve import Prepared
+from .result import TraceResult, without_faint
+from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
-from .surfaces import Surfaces
 
 SINGLE = 16
 """Numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all."""
@@ -65,14 +63,14 @@ class TracedOptions:
     Attributes:
         trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
         pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
-            `wrf_mi.tracing.instrument_parameters`).
+            `wrf_mi.tracing.paths.instrument_parameters`).
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
-        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.plane_parameters`).
+        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.plane_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
-        constants: constants of materials that are parameters, of `wrf_mi.tracing.material_parameters.QUANTITIES`.
+        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.material_parameters.QUANTITIES`.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -125,10 +123,10 @@ class TracedField:
         tx_heading_rad: yaw of each transmitter's frame about +z, rad, shape [n]; None: 0.
         traced: known paths from these transmitters to this receiver; None: paths are searched.
         prepared: shared state of the scene for several fields in it: rays of a receiver are then shot once, and the
-            caller checks the antennas (`wrf_mi.tracing.solve.Prepared.check`).
+            caller checks the antennas (`wrf_mi.tracing.paths.solve.Prepared.check`).
         frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
-        present: Dr.Jit tensors by the names of `parameters` by which faint paths are told; None: as stated.
+        present: parameter values used to prune weak paths, Dr.Jit tensors by name; None: as stated.
 
     Attributes:
         frequency_hz: carrier of the paths.
@@ -170,12 +168,12 @@ class TracedField:
         self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
         self.searches = 0
         self.surfaces: Surfaces = self._shared.surfaces
-        here = receiver.position_m if searched_at_m is None else searched_at_m
+        position_m = receiver.position_m if searched_at_m is None else searched_at_m
         self._set_tables(self._shared.tables(options.materials))
         if traced is None:
-            self.search(here)
+            self.search(position_m)
         else:
-            self._take(traced, here)
+            self._set_paths(traced, position_m)
 
     def __len__(self) -> int:
         """Number of transmitters."""
@@ -198,15 +196,15 @@ class TracedField:
 
     @property
     def gain_name(self) -> str:
-        """See `wrf_mi.tracing.instrument_parameters.gain_name`."""
+        """See `wrf_mi.tracing.paths.instrument_parameters.gain_name`."""
         return gain_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
-        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.material_parameters`), or of n
-        surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m and
-        ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.plane_parameters`);
+        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.paths.material_parameters`), or
+        of n surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m
+        and ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.paths.plane_parameters`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
@@ -218,10 +216,10 @@ class TracedField:
 
     def refresh(self, parameters: Mapping[str, Any]) -> bool:
         """Search for paths again if the receiver is too far from the position of the last search; whether it was."""
-        here = moved_m(self.receiver, parameters)
-        if not needs_search(here, self.searched_at_m, self.frequency_hz):
+        position_m = moved_m(self.receiver, parameters)
+        if not _needs_search(position_m, self.searched_at_m, self.frequency_hz):
             return False
-        self.search(here)
+        self.search(position_m)
         return True
 
     def __call__(
@@ -249,13 +247,7 @@ class TracedField:
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
         dr.eval(paths)
         gain, length_m, departure, arrival = paths
-        if self.gain_name in parameters:
-            amplitude, phase = (Float64(component(parameters[self.gain_name], i)) for i in (0, 1))
-            sine, cosine = dr.sincos(phase)
-            gain = times(gain, (dr.exp(amplitude) * cosine, dr.exp(amplitude) * sine))
-        for name, direction in ((pattern_name(self.receiver), arrival), (TX_PATTERN, departure)):
-            if name in parameters:
-                gain = times(gain, pattern_factor(parameters[name], direction))
+        gain = with_antennas(gain, self.receiver, parameters, arrival, departure)
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
         return TracedPaths(gain, length_m, arrival, batch, each)
@@ -298,35 +290,32 @@ class TracedField:
         count = len(self) * self._each
         self._weights = PathWeights.of(gaussians, self.interactions, self._path_of_met, count)
 
-    def search(self, here_m: FloatArray) -> None:
+    def search(self, position_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
-        how: dict[str, Any] = {"prepared": self._shared, "tx_antenna": self.options.tx_antenna}
-        receiver = replace(self.receiver, position_m=here_m)
-        found = trace_paths(
-            self.scene, self.tx_pos_m, receiver, self.options.trace, check=self._checks, gains=False, **how
-        )
-        self._take(found, here_m)
+        receiver = replace(self.receiver, position_m=position_m)
+        traced = _search(self.scene, self.tx_pos_m, receiver, self.options, self._shared, self._checks)
+        self._set_paths(traced, position_m)
         self.searches += 1
 
-    def _take(self, traced: TraceResult, here_m: FloatArray) -> None:
+    def _set_paths(self, traced: TraceResult, position_m: FloatArray) -> None:
         """Lay out paths on the device, with as many entries for each transmitter as the largest number of paths."""
         surfaces, types, tx = self.surfaces, traced.paths.interactions, traced.paths.tx
         legs = traced.legs(surfaces)
         face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
-        found = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
-        share, kept = self.options.faint, np.arange(len(tx))
+        chains = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
+        share, strong = self.options.faint, np.arange(len(tx))
         if share:
-            kept = np.flatnonzero(without_faint(tx, self._amplitudes(found), share))
-        tx, types, face, vertices_m = tx[kept], types[kept], face[kept], traced.paths.vertices_m[kept]
+            strong = np.flatnonzero(without_faint(tx, self._amplitudes(chains), share))
+        tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         if len(self) == 1:
             each = -(-each // SINGLE) * SINGLE
-        entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)
+        entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)  # paths are sorted by transmitter
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
-        place[entry], present[entry] = kept, True
-        self._each, self.searched_at_m = each, np.array(here_m, float)
+        place[entry], present[entry] = strong, True
+        self._each, self.searched_at_m = each, np.array(position_m, float)
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
         self.interactions = Interactions(vertices_m[met], normal)
@@ -339,10 +328,10 @@ class TracedField:
         bounces[entry] = np.sqrt((types == SPECULAR).sum(axis=1))
         self.bounces = on_device(bounces, Float64)
         self.chains = Chains(sources[:3], tuple(sources[3:]), dr.zeros(Float64, len(place)), [])
-        if len(kept):
+        if len(strong):
             index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)
-            self.chains.exists = dr.gather(Float64, found.exists, index, mask)
-            self.chains.levels = [dr.gather(Level, level, index, mask) for level in found.levels]
+            self.chains.exists = dr.gather(Float64, chains.exists, index, mask)
+            self.chains.levels = [dr.gather(Level, level, index, mask) for level in chains.levels]
         dr.eval(self.chains)
 
     def _source_columns(self, tx: IntArray) -> list[FloatArray]:
@@ -373,6 +362,53 @@ class TracedField:
         return number
 
 
-def needs_search(here_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
+def _search(
+    scene: Any, tx_pos_m: FloatArray, receiver: Receiver, options: TracedOptions, prepared: Prepared, check: bool
+) -> TraceResult:
+    """Paths without gains, which follow from the parameters."""
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna, "check": check, "gains": False}
+    return trace_paths(scene, tx_pos_m, receiver, options.trace, **how)
+
+
+def _needs_search(position_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
     """Whether a receiver is further than a quarter of a wavelength from where paths were searched, both [3], metres."""
-    return bool(np.linalg.norm(here_m - searched_at_m) > speed_of_light / frequency_hz / 4)
+    return bool(np.linalg.norm(position_m - searched_at_m) > speed_of_light / frequency_hz / 4)
+
+
+def traced_fields(
+    scene: Any,
+    tx_pos_m: ArrayLike,
+    receiver: Receiver,
+    options: TracedOptions,
+    prepared: Prepared,
+    tx_heading_rad: ArrayLike | None = None,
+    carriers_hz: FloatArray | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    searched: MovedSearch | None = None,
+) -> list[TracedField]:
+    """Traced fields of the transmitters of each carrier at a receiver, in ascending order of the carriers.
+
+    Paths are searched once for all carriers, and once at positions that repeat; wavelength and materials of a field are
+    those of its carrier. Arguments and errors are those of `TracedField`, and ``carriers_hz``: carrier of each
+    transmitter [n], Hz (None: that of the scene); ``parameters``: Dr.Jit tensors by the names of
+    `TracedField.parameters`, where they move the receiver further than `TracedField.refresh` allows at a carrier, paths
+    are searched from there (None: the stated pose); ``searched``: where paths are searched (None: in the stated scene).
+    """
+    positions = np.atleast_2d(np.asarray(tx_pos_m, float))
+    heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
+    distinct, number = np.unique(positions, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    stated_m, moved_to_m = receiver.position_m, moved_m(receiver, parameters or {})
+    place, present = (searched.prepared, searched.parameters) if searched else (prepared, None)
+    traces, fields = dict[bool, TraceResult](), list[TracedField]()
+    for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
+        # The stated position serves the carriers for which the receiver has not moved by a quarter of a wavelength.
+        moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(scene.frequency[0]))
+        position_m = moved_to_m if moved else stated_m
+        if moved not in traces:
+            at = replace(receiver, position_m=position_m)
+            traces[moved] = _search(place.scene, distinct, at, options, place, check=False)
+        traced, yaw = traces[moved].of_transmitters(number[rows]), None if heading is None else heading[rows]
+        of_carrier = positions[rows], receiver, options, yaw, traced
+        fields.append(TracedField(scene, *of_carrier, prepared, carrier_hz, position_m, present))
+    return fields

@@ -8,22 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
-from .. import backend
-from ..core import InputError
-from ..core.yaml_files import read_yaml
-from ..scene.coordinates import require_near, up_of, warn_of_up
-from ..scene.folder import FACTS_FILE, read_scene_folder, scene_file
-from ..scene.materials import FILE as MATERIALS_FILE
-from ..scene.materials import thicknesses
-from ..scene.mesh.files import mesh_parts
-from ..scene.mesh.surfaces import sampled
-from ..scene.xml_file import read_scene_xml
+from ... import backend
+from ...core import InputError
+from ...core.yaml_files import read_yaml
+from ...scene.coordinates import require_near, up_of, warn_of_up
+from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
+from ...scene.materials import FILE as MATERIALS_FILE
+from ...scene.materials import thicknesses
+from ...scene.mesh.files import mesh_parts
+from ...scene.mesh.surfaces import sampled
+from ...scene.xml_file import read_scene_xml
 from .materials import perfect_reflector, set_frequency
-from .scene_shapes import check_materials, load_checked, replace_shapes
+from .scene_shapes import check_materials, load_checked, plain_ply, replace_shapes
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
 HIGHEST_M = 500.0
@@ -131,11 +130,10 @@ def _from_mesh(path: Path, material: str) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
-            # Vertices and faces only: Mitsuba warns of unknown attributes.
             stem = path.stem.replace(".", "_")  # Mitsuba's names have no dots
             name = stem if len(parts) == 1 else f"{stem}_{index}"
             file = Path(folder) / f"{name}.ply"
-            trimesh.Trimesh(part.vertices, part.faces, process=False).export(file, vertex_normal=False)
+            file.write_bytes(plain_ply(part))
             objects.append(rt.SceneObject(fname=str(file), name=name, radio_material=radio_material))
         if objects:
             scene.edit(add=objects)
