@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.device import to_uint
 from ..backend.vectors import Complex, Pose
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
@@ -52,6 +53,8 @@ SHARE = 0.1
 """Unit of the learned side as a share of the paths' amplitude: it begins as a correction."""
 MATCHING = 3
 """Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
+MATCHED = 256
+"""Most transmitters whose reports it compares."""
 
 
 @dataclass
@@ -369,13 +372,15 @@ class Graph:
         """
         model = self.models[number]
         unscaled: Any = getattr(model, "unscaled", model)
-        known = np.isfinite(observed).reshape(len(observed), -1).all(axis=1)
+        known = np.flatnonzero(np.isfinite(observed).reshape(len(observed), -1).all(axis=1))
+        # A mean of some hundred rows starts training as well as that of thousands, whose images take gigabytes.
+        rows = known[:: -(-len(known) // MATCHED)] if len(known) else known
         gain = np.zeros(2, np.float32)
-        for _ in range(MATCHING if known.any() else 0):
+        for _ in range(MATCHING if len(rows) else 0):
             with dr.suspend_grad():
-                report = unscaled(side({side.gain_name: mi.TensorXf(gain)}), None).numpy()
-            report = report.astype(float).reshape(np.shape(observed))
-            gain[0] += model.missing_gain(report[known], observed[known])
+                report = unscaled(side({side.gain_name: mi.TensorXf(gain)}, to_uint(rows)), None).numpy()
+            report = report.astype(float).reshape(len(rows), *np.shape(observed)[1:])
+            gain[0] += model.missing_gain(report, observed[rows])
         return gain
 
 
