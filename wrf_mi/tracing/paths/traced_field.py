@@ -187,7 +187,7 @@ class TracedField:
     @property
     def arrays(self) -> list[Any]:
         """Device arrays that a call reads beside its arguments, the inputs of a recording."""
-        return [self.chains, self._constants, self._planes, self._weights, self.bounces]
+        return [self.chains, self._constants, self._planes, self.bounces, self._weights]
 
     @property
     def form(self) -> tuple[int, int, int]:
