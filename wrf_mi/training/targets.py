@@ -6,6 +6,7 @@ A *condition* is the input of a field: a row's transmitter position, or the upli
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +63,14 @@ class Targets:
     def received(self, port: int, rows: IntArray) -> IntArray:
         """Conditions of those rows that a port's receiver observed at its carrier."""
         chosen = self.at(port, self.conditions(rows))
-        seen = np.isfinite(self.truth[port // self.carriers, chosen]).all(axis=tuple(range(1, self.truth.ndim - 1)))
-        return chosen[seen]
+        return chosen[self._complete[port // self.carriers, chosen]]
+
+    @cached_property
+    def _complete(self) -> NDArray[np.bool_]:
+        """Whether each receiver observed each condition [n_rx, c]; of images it takes long, and is asked for often."""
+        return np.stack(
+            [np.isfinite(of_receiver).all(axis=tuple(range(1, of_receiver.ndim))) for of_receiver in self.truth]
+        )
 
 
 def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
