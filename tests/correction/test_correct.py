@@ -21,7 +21,7 @@ import wrf_mi
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
-from wrf_mi.correction.correct import _error_ratio
+from wrf_mi.correction.correct import _error_ratio, _last_is_best
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import PARTS
 from wrf_mi.correction.page import _facts, _picture
@@ -406,3 +406,13 @@ def test_few_rows_are_refused(tmp_path: Path) -> None:
     record = channels(scene, 18)
     with pytest.raises(InputError, match=r"training rows are too few to hold some out"):
         correct_scene(scene, record, make_splits(record, "official", n_train=5)[0])
+
+
+@pytest.mark.parametrize(
+    ("higher_is_better", "last", "best"), [(True, 2.0, True), (True, 1.2, False), (False, 1.2, True)]
+)
+def test_paths_are_searched_anew_for_the_best_stage_alone(higher_is_better: bool, last: float, best: bool) -> None:
+    """Of scores whose differences vary; a row that was not received does not count."""
+    noise = np.array([0.1, -0.1, 0.2, np.nan])
+    scores = {"": 1.3 + noise, "materials": 1.5 - noise, "planes": np.full(4, last)}
+    assert _last_is_best(scores, higher_is_better) == best

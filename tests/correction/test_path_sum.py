@@ -9,6 +9,7 @@ import pytest
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.correction import path_sum
 from wrf_mi.correction.correct import default_options
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
@@ -20,6 +21,8 @@ from wrf_mi.tracing.paths.solve import Prepared
 
 ROUNDING = 1e-5
 """Single precision of the tracer's residuals and parameters, k d of 1e3 rad."""
+SAME_SUM = 1e-9
+"""Sums over the same paths in double precision, beside other paths that are unchanged."""
 DECIBEL = 1e-4
 """Single precision of strengths of -100 dB and of logarithms of materials."""
 
@@ -63,6 +66,25 @@ def test_trials_of_one_plane_and_its_material_follow_the_tracer(misfit: Misfit, 
     change = np.nanmax(np.abs(expected - before))
     assert change > 0.05
     np.testing.assert_allclose(trials.residual(there), expected, atol=0.05 * change)
+
+
+def test_trials_together_are_those_of_each(misfit: Misfit, strengths: Misfit, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of vectors that change different planes, materials and gains, or nothing, in parts of few vectors and in one."""
+    vector = moved(misfit)
+    vectors = np.tile(vector, (5, 1))
+    for number, step_m in enumerate((0.0, 0.0, 0.01, -0.02)):
+        vectors[number, misfit.parts[SHIFT].start + number] += step_m
+    vectors[1:4, misfit.parts[name_of(SURFACE, "permittivity")].start] += 0.9
+    cases = [
+        (PathSum(misfit, vector), vectors),
+        (PathSum(strengths, changed(strengths)[0]), np.stack(changed(strengths))),
+    ]
+    for trials, several in cases:
+        expected = [np.square(trials.residual(one)).mean(axis=1) for one in several]
+        assert not np.array_equal(expected[0], expected[1], equal_nan=True)
+        for together in (1, 1 << 20):
+            monkeypatch.setattr(path_sum, "TOGETHER", together)
+            np.testing.assert_allclose(trials.mean_squares(several), expected, rtol=SAME_SUM)
 
 
 @pytest.mark.parametrize("trial", [False, True])

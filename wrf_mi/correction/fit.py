@@ -141,10 +141,10 @@ class Fit:
         free = self.free(state.stage)
         return noise.cost(self.misfit.residual(state.vector)) + self.prior(state.mean, free).cost(state.vector[free])
 
-    def trial_costs(self, trials: Misfit | PathSum, noise: Noise, vectors: Sequence[FloatArray]) -> list[float]:
-        """Negative logarithms of the likelihood of vectors [p] and of the planes' prior, without its constant."""
+    def trial_costs(self, trials: Misfit | PathSum, noise: Noise, vectors: FloatArray) -> list[float]:
+        """Negative logarithms of the likelihood of vectors [v, p] and of the planes' prior, without its constant."""
         free, prior = self._planes_prior
-        costs = noise.costs(trials.mean_squares(np.stack(vectors)))
+        costs = noise.costs(trials.mean_squares(vectors))
         return [float(cost) + prior.cost(vector[free]) for cost, vector in zip(costs, vectors, strict=True)]
 
     @cached_property

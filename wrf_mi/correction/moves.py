@@ -116,7 +116,7 @@ class Moves:
                     break  # the alternatives of the others were tried beside what is chosen now
                 fit.on_stage(what, (sweep + number / len(choices)) / SWEEPS)
                 least, name, other = self._alternatives(trials, noise, choice, vector)[0]
-                if least < fit.trial_costs(trials, noise, [vector])[0] - GAIN:
+                if least < fit.trial_costs(trials, noise, vector[None])[0] - GAIN:
                     chosen[choice.what], vector, changed = name.partition(",")[0], other, True
                     last = number
                     trials.accept(other)
@@ -140,7 +140,7 @@ class Moves:
         vectors = np.tile(vector, (len(choice.values), 1))
         for other, values in zip(vectors, choice.values.values(), strict=True):
             other[choice.places] = np.where(np.isnan(values), expected, values)
-        costs = self.fit.trial_costs(trials, noise, list(vectors))
+        costs = self.fit.trial_costs(trials, noise, vectors)
         tried = sorted(zip(costs, choice.values, vectors, strict=True), key=itemgetter(0))
         if choice.joint:
             # A plane that is tilted, too, fits at the right shift only once its tilts do.
@@ -158,7 +158,7 @@ class Moves:
             work = partial(self.fit.refined, trials, places=places)
             starts = [other for _, other in few]
             better = on_threads(work, starts) if isinstance(trials, PathSum) else [work(start) for start in starts]
-            costs = self.fit.trial_costs(trials, noise, better)
+            costs = self.fit.trial_costs(trials, noise, np.stack(better))
             tried += zip(costs, [name for name, _ in few], better, strict=True)
         return sorted(tried, key=itemgetter(0))
 
@@ -183,7 +183,7 @@ class Moves:
                 for face in faces:
                     if face.what in shifts:
                         vector = self._alternatives(trials, state.noise, shifts[face.what], vector)[0][2]
-                alternatives.append((fit.trial_costs(trials, state.noise, [vector])[0], material, vector))
+                alternatives.append((fit.trial_costs(trials, state.noise, vector[None])[0], material, vector))
             _, material, vector = min(alternatives, key=itemgetter(0))
             changed = [face for face in faces if state.materials.get(face.what) != material]
             if not changed:

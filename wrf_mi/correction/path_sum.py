@@ -109,8 +109,7 @@ class PathSum:
             for side, places in zip(misfit.sides, misfit.places, strict=True)
             if side.gain_name in misfit.parts
         ]
-        every = np.arange(len(self._paths.row))
-        self._gain = self.misfit.gains(self.at, every)
+        self._gain = self.misfit.gains(self.at, self._every.paths)
         self._waves = self._waves_of(self._every, self._gain[None], np.zeros((1, len(self._plane_places))))[:, 0]
         self._total = np.zeros((len(misfit.observed), self._waves.shape[1]), complex)
         self._total[self._every.rows] = self._every.sums(self._waves)
