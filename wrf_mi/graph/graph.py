@@ -373,7 +373,7 @@ class Graph:
         model = self.models[number]
         unscaled: Any = getattr(model, "unscaled", model)
         known = np.flatnonzero(np.isfinite(observed).reshape(len(observed), -1).all(axis=1))
-        # A mean of some hundred rows starts training as well as that of thousands, whose images take gigabytes.
+        # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
         rows = known[:: -(-len(known) // MATCHED)] if len(known) else known
         gain = np.zeros(2, np.float32)
         for _ in range(MATCHING if len(rows) else 0):
