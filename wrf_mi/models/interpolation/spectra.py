@@ -102,6 +102,8 @@ class SpectrumKrigingSettings(KrigingSettings):
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of abs(z), z complex Gaussian with E z = mean, E |z - mean|^2 = variance."""
+    # In double precision: the spread is the difference of two squares that may be 2 CLEAR times as large.
+    mean, variance, kind = mean.astype(complex), variance.astype(float), variance.dtype
     power = np.abs(mean) ** 2
     # Without variance the ratio is large; without mean and variance it is 0.
     half = power / np.maximum(2 * variance, 1e-9 * power + np.finfo(power.dtype).tiny)
@@ -111,7 +113,8 @@ def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, Floa
     series = 1 / (8 * np.maximum(half, CLEAR))
     far = half >= CLEAR
     expected = np.where(far, np.sqrt(power + variance / 2 * (1 + series)), expected)
-    return expected, np.sqrt(np.where(far, variance / 2 * (1 - series), spread))
+    deviation = np.sqrt(np.where(far, variance / 2 * (1 - series), spread))
+    return expected.astype(kind), deviation.astype(kind)
 
 
 class ExpectedSpectrum:
