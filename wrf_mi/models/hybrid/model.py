@@ -54,7 +54,7 @@ from ..model import (
 from .contributions import by_stage
 from .mixture import Mixture, choose, constant
 from .parts import KRIGING, PATHS, TRACED, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
-from .residuals import Residuals
+from .residuals import Residuals, left_over
 from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
 
 logger = logging.getLogger(__name__)
@@ -298,13 +298,15 @@ def _residuals(
     Both are residuals of the final parameters, which have seen the held-out rows, too: an approximation. To keep
     those of the chosen state would take the reports of all rows.
     """
-    among_known, mean = Residuals.of(fitted, record, fold, problem.seed), np.array(before.mean)
+    left, mean = left_over(fitted, record, split), np.array(before.mean)
+    among_known = Residuals.of(left, record, fold, problem.seed)
     for receiver in np.unique(held.receiver):
         places = held.receiver == receiver
         mean[places] += among_known(record.tx_pos_m[held.row[places]], int(receiver), mean.shape[1:])
+    del among_known  # as large as those of all rows
     if task_of(record).image:
         mean = np.clip(mean, 0, 1)
-    return Residuals.of(fitted, record, split, problem.seed), Prediction(mean)
+    return Residuals.of(left, record, split, problem.seed), Prediction(mean)
 
 
 def _weights(

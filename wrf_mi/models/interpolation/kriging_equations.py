@@ -49,6 +49,8 @@ VARIANCE = 1e-12
 """Least variance of grey values, for equal spectra."""
 MOST_ROWS = 400
 """Rows in the likelihood at most."""
+COLUMNS = 4096
+"""Components that are solved for at once: 50 MB of a thousand rows and a half in double precision."""
 
 KERNELS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "exponential": lambda d: np.exp(-d),
@@ -112,6 +114,19 @@ class KrigingSystem:
         """K^-1 (y - B beta) [n, q]: a prediction is b . beta plus covariances with the rows times these."""
         return self.solve(values - self.trend @ coefficients)
 
+    def regression(self, values: Values) -> tuple[Values, Values]:
+        """`coefficients` [p, q] and `weights` [n, q] of observations [n, q] of any precision, both in double precision.
+
+        A thousand images in double precision are gigabytes, so their pixels are solved for in parts.
+        """
+        kind = np.result_type(values, float)
+        beta, weights = (np.empty((rows, values.shape[1]), kind) for rows in (self.trend.shape[1], len(values)))
+        for part in column_parts(values.shape[1]):
+            columns = values[:, part].astype(kind)
+            beta[:, part] = self.coefficients(columns)
+            weights[:, part] = self.weights(columns, beta[:, part])
+        return beta, weights
+
     def variance(
         self, prior: float, cross: FloatArray, trend: FloatArray | None = None, information: FloatArray | None = None
     ) -> FloatArray:
@@ -162,11 +177,21 @@ def component_root(values: Values) -> FloatArray:
 
     The likelihood needs no more of them, and an image has many more pixels than there are rows.
     """
-    parts = np.concatenate([values.real, values.imag], axis=1) if np.iscomplexobj(values) else values
-    if parts.shape[1] <= len(parts):
-        return np.ascontiguousarray(parts)
-    power, basis = np.linalg.eigh(parts @ parts.T)
+    parts = (values.real, values.imag) if np.iscomplexobj(values) else (values,)
+    if len(parts) * values.shape[1] <= len(values):
+        return np.concatenate(parts, axis=1, dtype=float)
+    gram = np.zeros((len(values), len(values)))
+    for part in column_parts(values.shape[1]):
+        for component in parts:
+            columns = component[:, part].astype(float)
+            gram += columns @ columns.T
+    power, basis = np.linalg.eigh(gram)
     return np.asarray(basis * np.sqrt(np.maximum(power, 0)))
+
+
+def column_parts(count: int) -> list[slice]:
+    """Slices of at most `COLUMNS` of ``count`` columns."""
+    return [slice(first, first + COLUMNS) for first in range(0, count, COLUMNS)]
 
 
 def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, float]:
