@@ -8,6 +8,7 @@ kernels depend on the alignment of memory, so that another process compiles them
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Iterable
 from operator import and_, mul
@@ -29,6 +30,15 @@ HOST: dict[Any, type[np.generic]] = {
     dr.VarType.UInt32: np.uint32,
     dr.VarType.Bool: np.bool_,
 }
+
+
+def release_memory() -> None:
+    """Give the memory of arrays that nothing uses any more back to the system; Dr.Jit keeps it for further arrays.
+
+    After a fit that is most of what the process has, and what follows allocates by NumPy.
+    """
+    gc.collect()  # recorded functions refer to what records them
+    dr.flush_malloc_cache()
 
 
 def on_device(values: ArrayLike, kind: Any) -> Any:

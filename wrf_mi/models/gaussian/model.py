@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.device import release_memory
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split, receiver_arrays, stored_receivers
 from ...graph.graph import LEVEL, Graph
 from ...graph.receivers import GAPS, Form
@@ -214,7 +215,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
         append_log(folder, progress)
         session.on_progress(session.fold or "training", progress.step / config.steps, progress)
 
-    if not trainer.run(on_progress, lambda: write_checkpoint(folder, trainer), session.stop):
+    if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
     receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
     params, reach = of_all_receivers(*_used(trainer), receivers, without_rows(split))
@@ -229,6 +230,8 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
         arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
     fitted = load(arrays, problem, folder)
     fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.held_out_reports()
+    del trainer
+    release_memory()
     return fitted
 
 

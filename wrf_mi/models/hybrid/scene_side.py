@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ...backend.device import release_memory
 from ...core import InputError, Prediction, Record, Split
 from ...core.files import write_atomically
 from ...correction import Correction, correct_scene, default_options, write_page
@@ -124,6 +125,8 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
             if correction.kept:
                 write_page(correction, session.folder / SCENE, replace=True)
             reports = _reports(correction, task_of(record).higher_is_better)
+            del correction
+            release_memory()
     write_reports(session.folder, reports)
     return in_scene(problem, session.folder), reports
 
