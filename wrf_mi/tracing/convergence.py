@@ -216,10 +216,10 @@ def choose_options(
 
 def _depth(sample: _Sampled, options: TraceOptions, share: float) -> tuple[TraceOptions, float]:
     """Options with the converged depth, and the remainder in dB."""
-    now, changes = replace(options, max_depth=1, rays=FIRST_RAYS), list[float]()
-    while now.max_depth < MAX_DEPTH:
-        deeper = replace(now, max_depth=now.max_depth + 1)
-        changes.append(sample.change("depth", deeper.max_depth, now, deeper))
+    now, changes = replace(options, depth=1, rays=FIRST_RAYS), list[float]()
+    while now.depth < MAX_DEPTH:
+        deeper = replace(now, depth=now.depth + 1)
+        changes.append(sample.change("depth", deeper.depth, now, deeper))
         now = deeper
         # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
         if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:

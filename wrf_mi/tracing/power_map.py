@@ -127,9 +127,8 @@ Traced = PowerMap | TracedPower
 """Mean of signal strengths."""
 
 
-def power_tracer(scene: Any, record: Record, max_depth: int, max_reflections: int) -> Tracer:
+def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
     """Function of `TracedPower` that traces a scene for a record's receivers."""
-    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
     prepared = Prepared(scene)
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
 
@@ -144,9 +143,7 @@ def power_tracer(scene: Any, record: Record, max_depth: int, max_reflections: in
     return trace
 
 
-def trace_map(
-    scene: Any, record: Record, spacing_m: float, smooth_m: float, max_depth: int, max_reflections: int
-) -> PowerMap:
+def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions) -> PowerMap:
     """Trace a scene on a grid over its extent and all of a record's positions.
 
     Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: local means
@@ -157,8 +154,7 @@ def trace_map(
         record: receivers and heights of the transmitter.
         spacing_m: spacing of the grid.
         smooth_m: standard deviation of the Gaussian over which powers are averaged; 0: none.
-        max_depth: interactions of a path at most, transmissions included.
-        max_reflections: reflections of a path at most.
+        options: kinds of path, depth, rays.
 
     Raises:
         InputError: no path to a receiver from anywhere, or a scene filled by a solid.
@@ -172,7 +168,6 @@ def trace_map(
     spacing = max(spacing_m, float(np.sqrt(np.prod(high - low) * layers / MOST_POINTS)))
     x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
-    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
     points, prepared = grid.reshape(-1, 3), Prepared(scene)
     outside = solid_around(prepared.surfaces, points) < 0
     if not outside.any():
@@ -186,7 +181,7 @@ def trace_map(
     power = _means_outside(power, outside.reshape(grid.shape[:3]), sigma, steps)
     for receiver, grid_mw in zip(record.receivers, power, strict=True):
         if not (grid_mw > 0).any():
-            raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or max_depth")
+            raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or depth")
         grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()
     return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
 

@@ -30,7 +30,7 @@ GAIN_DB = 10.0
 polarisation of some paths, but a co-polarised link keeps most of its power."""
 SAMPLE = 256
 """Transmitters on which the gain is judged."""
-TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections=1, rays=1 << 12)
+TRACED, ROUGH = 32, TraceOptions(transmission=True, depth=2, reflections=1, rays=1 << 12)
 """Transmitters and options of the trace for models that do not trace all transmitters at once."""
 
 

@@ -95,7 +95,7 @@ def shoot(
     Returns:
         Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
     """
-    reach = options.surfaces_met, options.reflections, options.transmission
+    reach = options.surfaces_met, options.most_reflections, options.transmission
     key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
@@ -249,10 +249,10 @@ def hits(options: TraceOptions, rays: int) -> int:
     Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
     (`shoot`), of which there are up to two to the power of the depth.
     """
-    if not options.reflections:
+    if not options.most_reflections:
         return 0
     met = options.surfaces_met
-    return len(patterns(met, options.reflections, options.transmission)) * rays * met
+    return len(patterns(met, options.most_reflections, options.transmission)) * rays * met
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
@@ -264,8 +264,8 @@ def check_search(options: TraceOptions, rays: int, sources: int) -> None:
     duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
     if duration_s < WARN_S:
         return
-    search = f"search for paths with up to {options.reflections} reflections"
-    remedy = f"a smaller --depth (max_depth, {options.max_depth}) or --reflections (max_reflections)"
+    search = f"search for paths with up to {options.most_reflections} reflections"
+    remedy = f"a smaller --depth ({options.depth}) or --reflections"
     if duration_s > MOST_S:
         raise InputError(f"{search}: about {duration_s / 3600:.1f} hours; give {remedy}")
     logger.warning("%s: about %.0f s; faster with %s", search, duration_s, remedy)

@@ -101,7 +101,7 @@ def specular_paths(
     Returns:
         Paths with source 0..s-1 and target 0..n-1, vertices in float64 on the surfaces' planes.
     """
-    depth = max(options.max_depth, 1)
+    depth = max(options.depth, 1)
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
     source, target = np.divmod(direct, len(targets_m))
     apart = np.linalg.norm(targets_m[target] - sources_m[source], axis=1) > COINCIDENT_M

@@ -144,7 +144,7 @@ def sampled_paths(
 
     from ...backend.device import to_vectors
 
-    step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
+    step = max(1, SLOTS_PER_CHUNK // (rays * options.depth))
     parts = []
     for start in range(0, len(targets_m), step):
         batch = targets_m[start : start + step]
@@ -155,8 +155,8 @@ def sampled_paths(
             src_positions=ends[0],
             tgt_positions=ends[1],
             samples_per_src=rays,
-            max_num_paths_per_src=rays * options.max_depth * len(batch),
-            max_depth=options.max_depth,
+            max_num_paths_per_src=rays * options.depth * len(batch),
+            max_depth=options.depth,
             los=False,
             specular_reflection=options.reflection,
             diffuse_reflection=options.scattering,
