@@ -92,8 +92,8 @@ def read_building(path: Path) -> Building:
     else:
         raw = read_mesh(path)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
-    closed_bodies = [corners[faces] for faces, closed, volume in bodies(corners) if closed and volume]
-    solids = [body for body in closed_bodies if np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M]
+    closed = [body for body in bodies(corners) if body.closed and body.volume_m3]
+    solids = [body.corners_m for body in closed if np.ptp(body.bounds_m, axis=0).min() <= THICKEST_SOLID_M]
     return Building(path, planes_of_mesh(raw), solids, np.empty((0, 2, 2)))
 
 

@@ -18,7 +18,7 @@ from ..core.angles import FloatArray
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
 from .mesh.files import mesh_parts
-from .mesh.surfaces import KINDS, Kind, Surface, box_of, moved
+from .mesh.surfaces import KINDS, Kind, Surface, bounds, box_of, moved
 
 logger = logging.getLogger(__name__)
 
@@ -189,7 +189,7 @@ def _crossing_depth(part: Surface, other: Surface) -> float:
     Of an edge that is cut, the shorter piece counts; of all such edges of a surface, the longest.
     """
     triangles, cut = part.vertices_m[part.faces], other.vertices_m[other.faces]
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low, high = bounds(triangles)
     # Where surfaces touch, edges lie in faces and rounding decides what is cut: a smaller part touches nothing.
     smaller = np.clip(triangles, np.minimum(low + TOUCH_M, high), np.maximum(high - TOUCH_M, low))
     cut = cut[((cut.max(axis=1) >= low) & (cut.min(axis=1) <= high)).all(axis=1)]  # others are out of reach

@@ -173,9 +173,8 @@ def _faces_of_box(base: FloatArray, low: float, high: float) -> Iterator[Rectang
 def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
     """Upright and level faces of surfaces."""
     for surface in surfaces:
-        triangles = surface.vertices_m[surface.faces]
-        for members, _, _ in bodies(triangles):
-            corners = triangles[members].reshape(-1, 3)
+        for body in bodies(surface.vertices_m[surface.faces]):
+            corners = body.corners_m.reshape(-1, 3)
             centre = corners.mean(axis=0)
             # The direction in which the corners spread least.
             normal = np.linalg.svd(corners - centre, full_matrices=False)[2][2]

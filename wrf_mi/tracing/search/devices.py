@@ -11,7 +11,8 @@ from trimesh.triangles import closest_point
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .surfaces import Solid, Surfaces
+from ...scene.mesh.surfaces import Body, bounds
+from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
-    low, high = surfaces.bounds_m
+    low, high = bounds(surfaces.triangles)
     beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
@@ -87,23 +88,25 @@ def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     return np.where(behind[:, None], moved, positions_m)
 
 
-def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -> Iterator[tuple[Solid, IntArray]]:
-    """Solids with the positions [n, 3] that lie within their bounds and a margin."""
+def _near_solids(
+    surfaces: Surfaces, positions_m: FloatArray, margin_m: float
+) -> Iterator[tuple[Body, FloatArray, IntArray]]:
+    """Solids, with their normals, and the positions [n, 3] that lie within their bounds and a margin."""
     low, high = surfaces.solid_bounds_m
     near = np.ones((len(positions_m), len(low)), bool)
     # Axis by axis: furnished scenes have hundreds of solids, and predictions few positions.
     for axis, coordinate in enumerate(positions_m.T):
         near &= (coordinate[:, None] >= low[:, axis] - margin_m) & (coordinate[:, None] <= high[:, axis] + margin_m)
     for number in np.flatnonzero(near.any(axis=0)):
-        yield surfaces.solids[number], np.flatnonzero(near[:, number])
+        yield *surfaces.solids[number], np.flatnonzero(near[:, number])
 
 
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Positions [n, 3], moved before the nearest face where they are on a solid, or up to `BEHIND_M` inside."""
     moved, clear = positions_m.copy(), clear_m(surfaces)
     # What one solid moves may come to lie at the next one.
-    for (_, corners, normal), rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
-        if len(normal) < len(corners):
+    for solid, normal, rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
+        if len(normal) < len(corners := solid.corners_m):
             continue
         # Distances from planes are computed faster than those from faces, and rule out most positions.
         height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
@@ -120,9 +123,9 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.search.surfaces.Surfaces`."""
     enclosing = np.full(len(positions_m), -1)
-    for solid, rows in _near_solids(surfaces, positions_m, 0.0):
-        inside = winding_number(solid.corners, positions_m[rows]) > 0.5
-        enclosing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
+    for solid, _, rows in _near_solids(surfaces, positions_m, 0.0):
+        inside = winding_number(solid.corners_m, positions_m[rows]) > 0.5
+        enclosing[rows[inside]] = surfaces.object_of(solid.faces[:1])[0]
     return enclosing
 
 
@@ -131,7 +134,7 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
     Source: van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), IEEE Trans. Biomed. Eng. 30(2).
     """
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low, high = bounds(triangles)
     number = np.zeros(len(points))
     candidates = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     step = max(1, PAIRS_PER_CHUNK // len(triangles))
