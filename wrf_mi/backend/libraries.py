@@ -57,13 +57,9 @@ def version_from_name(name: str) -> tuple[int, ...] | None:
 
 
 def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
-    """All LLVM libraries of this machine, newest first, those without a version in their names last.
+    """All LLVM libraries of this machine, newest first, those without a version in their names last; none is loaded.
 
-    If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file). Neither Dr.Jit nor an
-    LLVM is loaded.
-
-    Args:
-        ignore_variable: ignore ``DRJIT_LIBLLVM_PATH``.
+    If ``DRJIT_LIBLLVM_PATH`` is set, and not to be ignored, only that file is returned (or none, if it is not a file).
     """
     asked = None if ignore_variable else os.environ.get(LLVM_VARIABLE)
     files = [file for file in [Path(asked)] if file.is_file()] if asked else list(_llvm_files())

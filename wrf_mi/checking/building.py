@@ -74,11 +74,7 @@ def building_file(source: str | Path) -> Path | None:
 
 
 def read_building(path: Path) -> Building:
-    """Read a plan, a mesh or a scene folder.
-
-    Raises:
-        InputError: it is not readable.
-    """
+    """Read a plan, a mesh or a scene folder; `InputError` for one that is not readable."""
     if path.name == LAYOUT:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)

@@ -104,11 +104,7 @@ class DataReport:
         return not self.faults
 
     def lines(self, most: int = MOST_LINES) -> list[str]:
-        """A line for each fault, suspicion and note, and a summary.
-
-        Args:
-            most: largest number of lines for faults of one kind in one file.
-        """
+        """A line for each fault (at most some of one kind in one file), suspicion and note, and a summary."""
         lines = list(self._fault_lines(most))
         lines += [f"suspicion {suspicion.name}: {suspicion.text}" for suspicion in self.suspicions]
         lines += [f"note: {text}" for text in self.notes]
@@ -199,10 +195,8 @@ def warn_of_suspicions(record: Record) -> None:
 
 
 def _path(dataset: str | Path) -> Path | None:
-    """The data's folder or file; None if it has yet to be made on this machine.
-
-    Raises:
-        InputError: there is no such data set.
+    """The data's folder or file; None if it has yet to be made on this machine; `InputError`: there is no such data
+    set.
     """
     is_name = isinstance(dataset, str) and Path(dataset).name == dataset and not Path(dataset).exists()
     if is_name and known(str(dataset)).base_url is None:

@@ -54,7 +54,7 @@ def placements(positions_m: FloatArray, *centres_m: FloatArray) -> Iterator[Plac
     """The seven other orientations of positions [n, 3], by right angles and mirror images, seen from above.
 
     Each one is taken about the origin, as where a sign was changed, and about points [2], such as the middle of a
-    picture that was turned over.
+    picture.
     """
     for about in (*centres_m, np.zeros(2)):
         for motion, rows in _MOTIONS.items():

@@ -70,9 +70,9 @@ def extent(points_m: FloatArray) -> FloatArray:
 def looks_y_up(points_m: FloatArray) -> bool:
     """Whether points [n, 3] on the surfaces of a room or building look as if y were up and not z.
 
-    They do if they are a room's height along y, and more than that along z, where more area is seen along y than along
-    z; or if they begin at zero along y and end at zero along z, as after a change of axes. Corridors and shafts, whose
-    walls are larger than their floor, are no such rooms.
+    They do if they are a room's height along y and higher along z, where more area is seen along y than along z; or if
+    they begin at zero along y and end at zero along z. Corridors and shafts have walls larger than their floor, and do
+    not.
     """
     points_m = points_m[:: len(points_m) // MOST_POINTS + 1]
     low, high = extent(points_m)
@@ -113,11 +113,7 @@ def check_extent(points_m: FloatArray, name: str | Path) -> None:
 
 
 def require_near(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse points [n, 3] so far from the origin that single precision would move them by a millimetre.
-
-    Raises:
-        InputError: with an origin to subtract.
-    """
+    """Refuse (`InputError`) points [n, 3] so far away that single precision would move them by a millimetre."""
     if not len(points_m) or (far := float(np.abs(points_m).max())) < FARTHEST_M:
         return
     low = points_m.min(axis=0)
@@ -129,11 +125,7 @@ def require_near(points_m: FloatArray, name: str | Path) -> None:
 
 
 def require_precise(points: FloatArray, unit_m: float, name: str | Path) -> None:
-    """Refuse points [n, 3] of a file, in its unit, that were rounded to single precision far from the origin.
-
-    Raises:
-        InputError: with the steps that are left.
-    """
+    """Refuse (`InputError`) points [n, 3] of a file, in its unit, that single precision rounded far from the origin."""
     if not len(points):
         return
     farthest = np.abs(points).max(axis=0)
@@ -155,11 +147,7 @@ def _on_grid(values: FloatArray, spacing: float) -> bool:
 
 
 def require_fine(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse a scan [n, 3] whose coordinates are stored in coarse steps; log steps that blur its planes.
-
-    Raises:
-        InputError: with the steps.
-    """
+    """Refuse (`InputError`) a scan [n, 3] stored in coarse steps, and log steps that blur its planes."""
     # Steps are those of two axes: on a third all points may lie on floor and ceiling.
     step = sorted(_step(values) for values in points_m[:: len(points_m) // MOST_POINTS + 1].T)[1]
     text = f"{name}: coordinates are in steps of {step:.2g} m (the scale of a LAS, or digits of a text)"

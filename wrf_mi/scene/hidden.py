@@ -87,12 +87,7 @@ class Rectangle:
 
 
 class Boxes(NamedTuple):
-    """Boxes of furniture.
-
-    Attributes:
-        hidden: faces that complete them, as surfaces.
-        members: names of the surfaces of each box, those of ``hidden`` included.
-    """
+    """Boxes of furniture: faces that complete them, and names of the surfaces of each box, those faces included."""
 
     hidden: list[Surface]
     members: list[frozenset[str]]
@@ -102,10 +97,8 @@ class Boxes(NamedTuple):
 def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
     """A scene folder with the hidden faces of its `boxes` for as long as the context lasts, and these.
 
-    They are of the material that its rules give furniture. The scene itself where it has none.
-
-    Args:
-        scene: see `wrf_mi.tracing.open_scene`.
+    They are of the material that its rules give furniture. The scene (see `wrf_mi.tracing.open_scene`) itself where it
+    has none.
     """
     supposed = Boxes([], [])
     if (Path(scene) / FILE).is_file():
@@ -128,12 +121,9 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
 
 
 def boxes(surfaces: Sequence[Surface]) -> Boxes:
-    """Boxes of furniture, with faces that complete them where no other surfaces lie.
+    """Boxes of surfaces of the kind ``other``, with faces that complete them where no other surfaces lie.
 
     Faces are named ``hidden_01`` and so on, less the names that surfaces have.
-
-    Args:
-        surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
     """
     furniture, around = (
         list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))

@@ -87,8 +87,7 @@ class Materials:
     def complete(self, kinds: Mapping[str, str]) -> Materials:
         """Materials with every rule, every surface and the thickness of every used material stated.
 
-        Args:
-            kinds: kind of every surface in the scene by its name; an entry in ``surfaces`` overrides it.
+        Surfaces have the kinds by name that are given, unless ``surfaces`` states otherwise.
         """
         entries = {name: self.surfaces.get(name, kind) for name, kind in kinds.items()}
         full = replace(self, rules={**RULES, **self.rules}, surfaces=entries)

@@ -47,10 +47,8 @@ LARGEST_SHARE = 0.1
 
 
 def read_positions(path: str | Path) -> FloatArray:
-    """Measured positions from a CSV file with the columns x, y and perhaps z in metres; others are ignored.
-
-    Returns:
-        Shape [n, 3], z NaN where the file has none.
+    """Measured positions [n, 3] from a CSV file with the columns x, y and perhaps z in metres, else NaN; others are
+    ignored.
 
     Raises:
         InputError: missing, no such column, or a field that is not a finite number.
@@ -67,12 +65,8 @@ def read_positions(path: str | Path) -> FloatArray:
 def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int, int]:
     """Number of lines between neighbouring positions that cross a wall, and of positions outside all floors.
 
-    Args:
-        positions_m: shape [n, 3]; z NaN where it is not known.
-        surfaces: surfaces of the scene, in the same frame.
-
-    Raises:
-        InputError: there is no wall.
+    Of positions [n, 3], z NaN where it is not known, and the surfaces of a scene, which must have a wall
+    (`InputError`).
     """
     walls = [surface for surface in surfaces if surface.kind == "wall"]
     if not walls:
@@ -132,11 +126,10 @@ def reflections(
     motion: FloatArray,
     known_walls_m: FloatArray | None,
 ) -> list[tuple[str, list[Surface]]]:
-    """The scenes of a source with its y or its x reversed.
+    """Remedies and surfaces of the scenes of a source with its y or its x reversed.
 
     ``grid`` are the cells of an occupancy grid, ``motion`` moves the source to the scene's frame [4, 4], and each
-    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any. Returns the remedy and the surfaces of each
-    reflection.
+    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any.
     """
     if grid is not None:
         # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.

@@ -180,12 +180,8 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
 
 
 def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
-    """Faces [f] that hide the inside of a scene from above: ceilings, and level faces near the top.
-
-    Args:
-        surface: a surface of the scene.
-        low: lower corner of the scene [3], metres.
-        high: upper corner of the scene [3], metres.
+    """Faces [f] of a surface that hide the inside of a scene between two corners [3] from above: ceilings, level faces
+    near the top.
     """
     if surface.kind in ("floor", "ceiling"):
         return np.full(len(surface.faces), surface.kind == "ceiling")
@@ -195,12 +191,7 @@ def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArra
 
 
 def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
-    """Edges [n, 2, 3] of a surface of few faces that bound one face; none of a larger surface.
-
-    Args:
-        surface: a surface of the scene whose faces share their vertices.
-        creases: with edges where two faces meet at more than `CREASE_RAD`.
-    """
+    """Edges [n, 2, 3] of a surface that bound one face, and perhaps its creases; none of a surface of many faces."""
     if len(surface.faces) > MOST_OUTLINED:
         return np.empty((0, 2, 3))
     edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)

@@ -47,13 +47,10 @@ APART_CELLS, APART_RAD = 5, np.radians(12)
 
 
 def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
-    """Pairs of points from a CSV file: ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y`` in metres.
+    """Pairs of points, [n, 2] or [n, 3] in the scene's frame and in the target's, metres, from a CSV file.
 
-    Returns:
-        Points in the scene's frame and in the target's, shapes [n, 2] or [n, 3].
-
-    Raises:
-        InputError: wrong header or a row without as many numbers.
+    Its header is ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y``; `InputError` for another one, or a row without as many
+    numbers.
     """
     table = read_columns(Path(path), "x,y,z,to_x,to_y,to_z", "x,y,to_x,to_y")
     n = table.shape[1] // 2
@@ -103,11 +100,7 @@ def _motion(pose: FloatArray) -> FloatArray:
 
 
 def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
-    """Points [n, 2] along the walls of surfaces seen from above, in equal steps.
-
-    Raises:
-        InputError: there is no wall.
-    """
+    """Points [n, 2] along the walls of surfaces seen from above, in equal steps; `InputError`: there is no wall."""
     walls = []
     for surface in surfaces:
         if surface.kind == "wall":
@@ -213,8 +206,8 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
 
 
 def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> float:
-    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows, each point
-    weighted by exp(-(d / 0.1 m)^2 / 2).
+    """Mean of the shares of the scene at walls, and of the walls in the scene, where distances d count exp(-(d / 0.1
+    m)^2 / 2).
     """
     to_walls, to_points = distance_to_walls(placed, walls), cKDTree(placed).query(targets)[0]
     near, shown = (np.exp(-0.5 * (away / (NEAR_M / 2)) ** 2) for away in (to_walls, to_points))

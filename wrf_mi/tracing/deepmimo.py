@@ -38,11 +38,8 @@ LOADED_PATHS = 25
 
 
 def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
-    """Refuse a folder that cannot be written, or whose name ``deepmimo.load`` does not find.
-
-    Raises:
-        InputError: the folder exists and may not be replaced, or its name has capital letters or characters that
-            DeepMIMO refuses.
+    """Refuse (`InputError`) a folder that exists and may not be replaced, or that ``deepmimo.load`` does not find by
+    its name.
     """
     folder = Path(path)
     name = folder.resolve().name
@@ -123,6 +120,7 @@ def _ranks(paths: Paths) -> IntArray:
 
 def _matrices(paths: Paths, carrier_hz: float) -> dict[str, NDArray[Any]]:
     """Matrices by DeepMIMO's names with first axis p: dBW, degrees, seconds, metres."""
+    # Gains are without the carrier's phase, which DeepMIMO expects; whole turns are removed before the exponential.
     delay = paths.length_m / speed_of_light
     phase = np.angle(paths.gain * np.exp(-2j * np.pi * np.remainder(carrier_hz * delay, 1)), deg=True)
     # From the base station: the interactions of a path backwards.
@@ -131,6 +129,7 @@ def _matrices(paths: Paths, carrier_hz: float) -> dict[str, NDArray[Any]]:
     backwards = np.arange(len(paths))[:, None], bounces[:, None] - 1 - np.arange(depth)
     kinds = np.where(backwards[1] >= 0, paths.interactions[backwards], 0)
     vertices = np.where(backwards[1][..., None] >= 0, paths.vertices_m[backwards], np.nan)
+    # A decimal digit for each interaction, the first in the leading place.
     code = np.zeros(len(paths))
     for level in range(depth):
         digit = np.array([CODES[int(kind)] for kind in kinds[:, level]], float)

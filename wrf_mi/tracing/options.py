@@ -80,11 +80,7 @@ class TraceOptions(SpecularOptions):
     phase_error: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            InputError: a setting that is out of range.
-        """
+        """Check the settings; `InputError` for one that is out of range."""
         if not 0 <= self.depth <= MAX_DEPTH:
             raise InputError(f"depth {self.depth}: give 0 to {MAX_DEPTH}")
         if self.reflections is not None and self.reflections < 0:
@@ -125,10 +121,10 @@ KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scatteri
 
 
 def stated_kinds(text: str) -> dict[str, bool]:
-    """Fields of `TraceOptions` that trace the kinds of path, of `KINDS`, in a list separated by commas, and no others.
+    """Fields of `TraceOptions` that trace the kinds of path in a list separated by commas, and no others.
 
     Raises:
-        InputError: an unknown kind.
+        InputError: a kind that is not among `KINDS`.
     """
     asked = [kind.strip() for kind in text.split(",")]
     if unknown := [kind for kind in asked if kind not in KINDS]:

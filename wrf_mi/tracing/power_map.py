@@ -146,8 +146,8 @@ def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
 def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions) -> PowerMap:
     """Trace a scene on a grid over its extent and all of a record's positions.
 
-    Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: local means
-    exclude them, and they take the mean of the points outside, or the value of the nearest of these.
+    Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: they take the
+    mean of the points around them that are outside, or the nearest such mean.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`.
@@ -159,6 +159,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
     Raises:
         InputError: no path to a receiver from anywhere, or a scene filled by a solid.
     """
+    # The grid covers the scene and all positions; storeys of the transmitter's heights are layers of it.
     box = scene.mi_scene.bbox()
     low = np.minimum([box.min.x, box.min.y], record.tx_pos_m[:, :2].min(axis=0))
     high = np.maximum([box.max.x, box.max.y], record.tx_pos_m[:, :2].max(axis=0))
@@ -168,6 +169,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
     spacing = max(spacing_m, float(np.sqrt(np.prod(high - low) * layers / MOST_POINTS)))
     x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
+    # Antennas inside solids have no path: nobody has stated these positions, so they are no error.
     points, prepared = grid.reshape(-1, 3), Prepared(scene)
     outside = solid_around(prepared.surfaces, points) < 0
     if not outside.any():
@@ -182,7 +184,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
     for receiver, grid_mw in zip(record.receivers, power, strict=True):
         if not (grid_mw > 0).any():
             raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or depth")
-        grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()
+        grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()  # no path: as weak as the weakest point with one
     return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
 
 
@@ -206,6 +208,7 @@ def traced_powers(
     tx_antenna: Antenna,
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
+    # The key holds all that determines the powers, code and versions included; a stale file is never read.
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
     if (slab_of_face >= 0).all():  # other materials have no digest

@@ -134,10 +134,7 @@ def _is_large(facet: _Facet) -> bool:
 
 
 def _bounds_rooms(body: Body, others: Sequence[Body], shell_m: Sequence[FloatArray]) -> bool:
-    """Whether the facets of a body may be floors, ceilings and walls.
-
-    ``others`` are the other bodies but for slabs, and ``shell_m`` the bounds [2, 3] of all slabs, if there are any.
-    """
+    """Whether the facets of a body may bound rooms, among other bodies and a shell of slabs [2, 3]."""
     if not body.closed:
         return True
     height_m = np.ptp(body.bounds_m[:, 2])

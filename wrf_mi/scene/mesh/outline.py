@@ -74,8 +74,8 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
 def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
     """The area of a floor, ceiling or wall with its shadows filled: gaps before which things stand.
 
-    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. ``points_m`` [n,
-    3] are those of things alone: floors, ceilings and walls are seen through a gap and do not hide it.
+    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. The points [n, 3]
+    are those of things alone, since floors, ceilings and walls are seen through a gap and do not hide it.
     """
     if kind == "other":
         return area
@@ -100,11 +100,10 @@ def polygons(area: Any) -> list[Any]:
 
 
 def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]) -> list[Any]:
-    """Extend or cut areas to the lines where their planes meet.
+    """Areas (shapely, each in its plane's coordinates) extended or cut to the lines where their planes meet.
 
     Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
-    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
-    coordinates of their planes.
+    line is made to end there; an area on both sides stays, and the other ends at it.
     """
     areas = list(areas)
     corners = [_corners(plane, area) for plane, area in zip(planes, areas, strict=True)]

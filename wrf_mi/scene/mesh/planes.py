@@ -116,12 +116,7 @@ def over(plane: Plane, area: Any, points_m: FloatArray, band_m: float) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A plane where it was seen.
-
-    Attributes:
-        plane: the plane.
-        area: shapely, in the coordinates of the plane.
-    """
+    """A plane where it was seen: its area (shapely) in the coordinates of the plane."""
 
     plane: Plane
     area: Any
@@ -154,11 +149,11 @@ class Face:
 
 
 def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
-    """The role of each face.
+    """The role of each face, of which the median height of the points separates floors from ceilings if there is one
+    alone.
 
     Level faces that are large are floors and ceilings in turn from the lowest up, at least `STOREY_M` apart; steeper
-    large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls. The median
-    height of the points, ``middle_m``, separates floors from ceilings where there is only one of them.
+    large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls.
     """
     least_m2 = least_level_area(faces)
     large = sorted((face for face in faces if face.area.area >= least_m2), key=lambda face: face.span_m[0])

@@ -100,8 +100,7 @@ def cut_lines(surface: Surface, height_m: float) -> FloatArray:
 def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
     """Edges of triangles [f, 3, 3], the same for faces whose corners coincide.
 
-    Returns:
-        Number of the edge from each corner of each face to its next, shape [3 f], and both ends' vertices [3 f, 2].
+    Returns the number of the edge from each corner of each face to its next [3 f], and both ends' vertices [3 f, 2].
     """
     _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)

@@ -116,12 +116,8 @@ class _Canvas:
 def grid_from_scans(xy_m: FloatArray, time_s: FloatArray) -> PlanGrid:
     """A map in cells of `POINT_CELL_M`: cells that were hit, and cells that beams went through.
 
-    Args:
-        xy_m: returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres.
-        time_s: time of each return's scan, shape [n].
-
-    Raises:
-        InputError: as `wrf_mi.scene.plan.sources.grid_from_points`.
+    Of returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres, and the time
+    of each return's scan [n]. Errors are those of `wrf_mi.scene.plan.sources.grid_from_points`.
     """
     grid_from_points(xy_m)  # raises before the search
     canvas = _Canvas(xy_m)
@@ -165,9 +161,6 @@ def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]
 def sensor_of(scan_m: FloatArray) -> FloatArray | None:
     """Place [2] of the sensor of a scan [n, 2]: the fewest returns lie behind others; None where too many do
     everywhere.
-
-    Of places in a convex room that see all returns, it is the place from which they are spread most evenly over the
-    directions, because a sensor turns at a constant rate.
     """
     # Most returns surround the sensor, few come from far away.
     low, high = np.percentile(scan_m, (2, 98), axis=0)
@@ -176,7 +169,8 @@ def sensor_of(scan_m: FloatArray) -> FloatArray | None:
     hidden, uneven = np.array([_seen_from(scan_m, place) for place in places]).T
     if hidden.min() > HIDDEN_SHARE * len(scan_m):
         return None
-    # In a convex room all places see all returns: among those that hide as few, the evenest is taken.
+    # In a convex room all places see all returns: among those that hide as few, returns are spread most evenly about
+    # the sensor, because it turns at a constant rate.
     possible = hidden <= hidden.min() + 0.01 * len(scan_m)
     return np.asarray(places[possible][np.argmin(uneven[possible])])
 

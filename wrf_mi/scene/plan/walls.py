@@ -58,12 +58,9 @@ FREE_SHARE = 0.1
 
 
 def find_walls(grid: PlanGrid) -> FloatArray:
-    """Straight walls of a plan: end points [n, 2, 2] in metres, the longest wall first.
+    """Straight walls of a plan [n, 2, 2], metres, the longest wall first; `InputError`: it shows none.
 
     Walls along and across the main direction are taken first; the remaining cells may show further directions.
-
-    Raises:
-        InputError: no wall was found.
     """
     grid = without_specks(grid)
     left, walls = grid, list[FloatArray]()

@@ -94,10 +94,7 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
 
 
 def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[_Piece]:
-    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first.
-
-    A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
-    """
+    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first."""
     pieces = list[_Piece]()
     free = np.ones(len(points), bool)
     for refined in _refined(planes, points, noise_m):
@@ -121,7 +118,7 @@ def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list
         inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
         if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
             pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
-            free &= ~over(plane, area, points, BAND * noise_m)
+            free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
     return pieces
 
 
@@ -145,16 +142,15 @@ def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> lis
 
 
 def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
-    """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre.
-
-    A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one standard
-    deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real slope stays.
-    """
+    """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre."""
     up = np.array([0.0, 0.0, 1.0])
     headings: list[FloatArray] = []
     turned = []
     for plane in planes:
         side = np.ptp(plane.flat(plane.patches_m.reshape(-1, 3)), axis=0).min()
+        # A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one
+        # standard deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real
+        # slope stays.
         error = max(ERRORS * plane.angle_error_rad, noise_m / max(side, noise_m))
         tolerance = float(np.clip(error, *TOLERANCE_RANGE_RAD))
         n = plane.normal

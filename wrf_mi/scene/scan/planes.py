@@ -67,10 +67,8 @@ NORMAL_MAD = 1.4826
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
-    """The planes of a thinned cloud and its noise.
-
-    Returns:
-        Planes, the one with the most points first, and the standard deviation of the points from them in metres.
+    """The planes of a thinned cloud, that with the most points first, and the standard deviation of points from them,
+    metres.
     """
     planes: list[Plane] = []
     free = np.ones(len(cloud.points_m), bool)
@@ -216,11 +214,9 @@ def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
 
 
 def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
-    """The parallel planes within a patch, none where it is bent.
-
-    The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
-    all points about it may run across two real layers. The sharper of both is used.
-    """
+    """The parallel planes within a patch, none where it is bent."""
+    # The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
+    # all points about it may run across two real layers. The sharper of both is used.
     middle, _ = _box_plane(box)
     fitted = _fit_near(cloud, free & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
     step = max(noise_m / 4, 0.002)
@@ -274,11 +270,8 @@ class Layer:
 def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tuple[Plane, list[Layer]]:
     """The plane of most cells, and the layers of others.
 
-    Args:
-        plane: a plane with its axes.
-        points_m: points of the scan [n, 3], metres.
-        free: points that belong to no other plane [n].
-        noise_m: standard deviation of points from planes.
+    Of a plane with its axes, points of the scan [n, 3], metres, those that belong to no other plane [n], and their
+    noise.
     """
     reach = min(AROUND * noise_m, SEARCH_M)
     rows = np.flatnonzero(free & near(plane, points_m, reach))

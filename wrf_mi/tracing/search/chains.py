@@ -78,24 +78,14 @@ class ReflectionChains:
 def shoot(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
-    """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
+    """Chains of planes [c, reflections] at which rays from a point [3] are reflected, -1 beyond the last.
 
-    Rays leave on a randomly rotated Fibonacci lattice. Where waves pass surfaces, the rays are shot once for each
-    choice of the hits that reflect: up to two to the power of the depth. The process keeps `MOST_KEPT` bytes of the
-    last results: models, folds and carriers trace the same rooms from the same receivers.
-
-    Args:
-        scene: ``sionna.rt.Scene``.
-        surfaces: surfaces of the scene.
-        source_m: position [3], metres.
-        options: numbers of surfaces met and of reflections, and whether rays pass surfaces.
-        rays: number of rays.
-        seed: seed of the lattice's random rotation.
-
-    Returns:
-        Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
+    Each chain comes once, with all its prefixes, in lexical order; the array is not to be written to. Where waves pass
+    surfaces, the rays are shot once for each choice of the hits that reflect: up to two to the power of the depth. The
+    seed turns the rays' lattice.
     """
     reach = options.surfaces_met, options.most_reflections, options.transmission
+    # Models, folds and carriers trace the same rooms from the same receivers.
     key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
@@ -174,6 +164,7 @@ def _shoot(
         shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
         face = dr.gather(mi.UInt32, first, shape, active) + hit.prim_index
         planes.append(dr.select(active, mi.Int32(dr.gather(mi.UInt32, plane, face, active)), -1))
+        # Law of reflection, d' = d - 2 (d . n) n; a ray that passes keeps its direction.
         mirrored = ray.d - 2 * dr.dot(ray.d, hit.n) * hit.n
         ray = hit.spawn_ray(dr.select((pattern >> level) & 1 == 1, mirrored, ray.d))
     dr.eval(planes)
@@ -182,6 +173,7 @@ def _shoot(
 
 def unique_chains(sequence: IntArray) -> IntArray:
     """Distinct sequences of planes [n, depth] with all their prefixes, without empty ones, in lexical order."""
+    # Prefixes are paths, too: the wave may reach the target before the ray meets a further plane.
     once = _unique_rows(sequence)
     level = np.arange(sequence.shape[1])
     together = _unique_rows(np.concatenate([np.where(level < length, once, -1) for length in level + 1]))
@@ -198,12 +190,10 @@ def _unique_rows(rows: IntArray) -> IntArray:
 def possible(
     surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of chain and target [n, 3] whose points of reflection lie within the bounds of the chain's planes.
+    """Indices of chains and of targets [n, 3] whose points of reflection lie within the bounds of the chain's planes.
 
     A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
-
-    Yields:
-        Indices of chains and of targets, in chunks; in a chunk by the number of reflections.
+    Pairs come in chunks, each by the number of reflections.
     """
     import drjit as dr
     import mitsuba as mi
@@ -244,11 +234,7 @@ def possible(
 
 
 def hits(options: TraceOptions, rays: int) -> int:
-    """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere.
-
-    Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
-    (`shoot`), of which there are up to two to the power of the depth.
-    """
+    """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere."""
     if not options.most_reflections:
         return 0
     met = options.surfaces_met
@@ -256,11 +242,7 @@ def hits(options: TraceOptions, rays: int) -> int:
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
-    """Announce a search from a number of sources that takes long.
-
-    Raises:
-        InputError: a search of more than an hour, naming what makes it shorter.
-    """
+    """Announce a search from a number of sources that takes long; `InputError` for one of more than an hour."""
     duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
     if duration_s < WARN_S:
         return

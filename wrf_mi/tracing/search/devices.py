@@ -32,7 +32,7 @@ PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Refuse antennas at positions [n, 3], metres, inside a solid object; warn of those outside the scene.
+    """Warn of antennas at positions [n, 3], metres, outside the scene.
 
     Raises:
         InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
@@ -61,10 +61,11 @@ def clear_m(surfaces: Surfaces) -> float:
 def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Move antennas at positions [n, 3] that are mounted on a surface before it, so that they have a side.
 
-    Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where no
-    path arrives, or inside a cabinet. Outer walls, with all of the scene on one side, and solids have a right side, to
-    which antennas up to `BEHIND_M` behind are moved; at other sheets an antenna keeps its side.
+    Outer walls, with all of the scene on one side, and solids have a right side, to which antennas up to `BEHIND_M`
+    behind are moved; at other sheets an antenna keeps its side.
     """
+    # Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where
+    # no path arrives, or inside a cabinet.
     moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)
     for point, plane in _pairs_near(surfaces, moved):
         for index in np.unique(plane):
@@ -142,9 +143,11 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
         part = candidates[start : start + step]
         a, b, c = (triangles[None, :, k] - points[part, None] for k in range(3))
         la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-        dot = lambda u, v: (u * v).sum(axis=-1)  # noqa: E731
-        solid = np.arctan2(dot(a, np.cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
-        number[part] = np.abs(solid.sum(axis=1)) / (2 * np.pi)
+        ab, bc, ca = ((u * v).sum(axis=-1) for u, v in ((a, b), (b, c), (c, a)))
+        # tan(omega / 2) = a . (b x c) / (|a| |b| |c| + (a . b) |c| + (b . c) |a| + (c . a) |b|), in the quadrant of
+        # both terms; the solid angles omega of a closed surface add up to 4 pi inside it, and to 0 outside.
+        half_angle = np.arctan2((a * np.cross(b, c)).sum(axis=-1), la * lb * lc + ab * lc + bc * la + ca * lb)
+        number[part] = np.abs(half_angle.sum(axis=1)) / (2 * np.pi)
     return number
 
 

@@ -128,6 +128,7 @@ class Surfaces:
     @cached_property
     def face_edges(self) -> tuple[FloatArray, FloatArray]:
         """Unit vectors [f, 3, 3] in each face across its edges, inwards, and their products with the edges [f, 3]."""
+        # Across an edge, in the face: the product of the face's normal and the edge.
         along = np.roll(self.triangles, -1, axis=1) - self.triangles
         inwards = np.cross(trimesh.triangles.cross(self.triangles)[:, None], along)
         size = np.linalg.norm(inwards, axis=2, keepdims=True)
@@ -152,13 +153,12 @@ class Surfaces:
     def moved_planes(
         self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.plane_parameters`.
+        """Normals [k, 3] and offsets [k], metres, of planes (by default all) that are shifted and tilted.
 
-        Args:
-            shift_m: shifts along the normals [k].
-            tilt: tilts about the centres towards both axes [k, 2], rad.
-            planes: numbers of the planes; by default all.
+        Shifts [k] are along the normals, metres; tilts [k, 2], rad, are about the centres towards both axes
+        (`wrf_mi.tracing.paths.plane_parameters`).
         """
+        # A tilt is a rotation to first order; the normal is scaled to unit length again.
         normal = self.normal[planes] + np.einsum("qa,qad->qd", tilt, self.axes[planes])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return normal, (normal * self.plane_centres_m[planes]).sum(axis=1) + shift_m
@@ -183,6 +183,7 @@ class Surfaces:
         """
         solids = []
         for body in bodies(self.triangles):
+            # Mean thickness 2 V / A of a slab: thin bodies are objects, thick ones rooms, whose inside is air.
             area = trimesh.triangles.area(body.corners_m).sum()
             if body.closed and 0 < 2 * abs(body.volume_m3) < SOLID_M * area:
                 normals, _ = trimesh.triangles.normals(body.corners_m)
@@ -272,6 +273,7 @@ def find_planes(
     is_own_plane = plane[biggest[labels]] == np.arange(len(labels))
     face = np.where(is_own_plane, biggest[labels], largest_face(plane, area))
     normal, offset = normal[face], offset[face]
+    # Axes along and across an edge of the largest face.
     edge = triangles[face][:, 1] - triangles[face][:, 0]
     edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
     axes = np.stack([edge, np.cross(normal, edge)], axis=1)

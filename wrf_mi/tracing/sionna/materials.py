@@ -120,13 +120,11 @@ def set_frequency(
 
 
 def _share_kernels(scene: Any, frequency_hz: float) -> None:
-    """Make carrier and constants inputs of Dr.Jit's kernels.
-
-    As literals they are part of the compiled code, which LLVM then compiles for each material and carrier anew.
-    """
+    """Make carrier and constants inputs of Dr.Jit's kernels."""
     import drjit as dr
     import mitsuba as mi
 
+    # As literals they are part of the compiled code, which LLVM then compiles for each material and carrier anew.
     values = [
         (material, name, float(getattr(material, name)[0]))
         for material in scene.radio_materials.values()

@@ -118,11 +118,8 @@ def _mesh_content(shape: Element) -> bytes | None:
 
 @lru_cache(CHECKED_FILES)
 def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) -> bytes | None:
-    """`_mesh_content` of a file, which is read again if its state (inode, bytes, time of change) is another one.
-
-    Faces of vertices that are not there are refused before Mitsuba reads the file: Mitsuba follows them, and ends the
-    process.
-    """
+    """`_mesh_content` of a file, which is read again if its state (inode, bytes, time of change) is another one."""
+    # Faces of vertices that are not there are refused first: Mitsuba follows them, and ends the process.
     parts = mesh_parts(file)
     if not parts:
         raise InputError(f"{file}: holds no triangles; remove the shape or restore the file")
@@ -208,11 +205,7 @@ def plain_ply(mesh: trimesh.Trimesh) -> bytes:
 
 
 def check_materials(root: Element, path: Path) -> None:
-    """Refuse materials without the names by which Sionna RT knows them.
-
-    Raises:
-        InputError: a BSDF, in a shape or beside the shapes, without id.
-    """
+    """Refuse (`InputError`) a BSDF, in a shape or beside the shapes, without the id by which Sionna RT knows it."""
     materials = [(f"<bsdf> {number}", bsdf) for number, bsdf in enumerate(root.findall("bsdf"), start=1)]
     materials += [(f"{name}: its <bsdf>", bsdf) for name, shape in named_shapes(root) for bsdf in shape.findall("bsdf")]
     for where, bsdf in materials:
@@ -224,8 +217,7 @@ def check_materials(root: Element, path: Path) -> None:
 def load_checked(root: Element, path: Path, folder: Path) -> Any:
     """Load a scene in Sionna RT from the root of its file, by way of a file in a folder.
 
-    Raises:
-        InputError: naming the file, the shape at fault where it is one, and Mitsuba's or Sionna RT's reason.
+    `InputError` names the file, the shape at fault where it is one, and Mitsuba's or Sionna RT's reason.
     """
     try:
         return _load(root, folder / "scene.xml")

@@ -61,9 +61,7 @@ def load_scene(
 ) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
     """Load a scene in Sionna RT without setting its frequency, with the arguments and errors of `open_scene`.
 
-    Returns:
-        A ``sionna.rt.Scene``, thicknesses of its materials in metres, and laws of their conductivities, as
-        `set_frequency` takes them.
+    Returns a ``sionna.rt.Scene``, and thicknesses and laws of its materials as `set_frequency` takes them.
     """
     backend.init()
     path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()
