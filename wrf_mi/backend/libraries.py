@@ -19,11 +19,9 @@ from itertools import starmap
 from pathlib import Path
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
-CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"
-"""Environment variables that name the libraries for Dr.Jit to load."""
+CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"  # environment variables that name the libraries for Dr.Jit to load
 
-READ_TIMEOUT_S = 60
-"""Reading the linker's cache takes milliseconds; a cold network disk may need much longer."""
+READ_TIMEOUT_S = 60  # reading the linker's cache takes milliseconds; a cold network disk may need much longer
 
 _LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
 

@@ -8,8 +8,7 @@ import shutil
 import subprocess
 import sys
 
-GOOD_FROM = 19
-"""Oldest LLVM that works with Dr.Jit 1.5 in our tests."""
+GOOD_FROM = 19  # oldest LLVM that works with Dr.Jit 1.5 in our tests
 
 
 def package_manager() -> str | None:

@@ -25,19 +25,15 @@ from .plans import placements
 from .repeats import named_rows
 from .units import Found
 
-LAYOUT = "layout.csv"
-"""File of wall vertices in a data set's folder."""
-HEIGHT_M = 2.7
-"""Height of the walls of a plan, at which positions are not compared."""
-THICKEST_WALL_M = 0.4
-"""Largest distance of the two sides of a wall in a plan."""
+LAYOUT = "layout.csv"  # file of wall vertices in a data set's folder
+HEIGHT_M = 2.7  # height of the walls of a plan, at which positions are not compared
+THICKEST_WALL_M = 0.4  # largest distance of the two sides of a wall in a plan
 PARALLEL = np.cos(np.radians(5))
 DEEP_M = 0.03
 """Least depth within a wall or a solid: what hangs on a surface is at it, with the error of a tape measure."""
 AT_VERTEX_M = 1e-3
 """Largest distance from a vertex of a plan that is no coincidence: positions are measured to a centimetre."""
-THICKEST_SOLID_M = 1.0
-"""Bodies with all sides longer than this are rooms or buildings, whose inside is air."""
+THICKEST_SOLID_M = 1.0  # bodies with all sides longer than this are rooms or buildings, whose inside is air
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,7 @@ WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
 OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
 """Suspicions about directions and distances, which need the unit of positions."""
-MOST_LINES = 10
-"""Faults of one kind in one file that are printed; the others are counted."""
+MOST_LINES = 10  # faults of one kind in one file that are printed; the others are counted
 
 
 @dataclass(frozen=True)

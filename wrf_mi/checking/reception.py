@@ -18,20 +18,16 @@ from ..datasets.observations import LEAST_ROWS, fitted_receivers
 from .repeats import SHOWN, named_rows
 from .units import Found, is_above_0_dbm
 
-IMPOSSIBLE_DBM = -150.0
-"""Thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver reports less."""
-STRONG_DBM = -10.0
-"""Values at the upper end are suspicious from here: below, they are rows next to the receiver."""
+IMPOSSIBLE_DBM = -150.0  # thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver reports less
+STRONG_DBM = -10.0  # values at the upper end are suspicious from here: below, they are rows next to the receiver
 CUSTOMARY_DBM = frozenset({-999.0, -200.0, -128.0, -127.0, -120.0, -113.0, -110.0, -105.0, -101.0, -100.0, 0.0, 100.0})
 """Numbers that drivers and data sets give for "not heard": fewer rows and smaller gaps suffice."""
 ALONE_DB = {1: 40.0, 2: 20.0, 3: 12.0}
 CUSTOMARY_ALONE_DB = {1: 30.0, 2: 12.0, 3: 5.0}
 """Gap beyond which a value at an end stands alone, by its least number of rows: a single deep fade lies some 30 dB
 below the median, and three equal values 12 dB below all others are no fade."""
-STEPS = 4.0
-"""Least such gap in steps of strengths that are quantised coarsely."""
-FEWEST_OTHERS = 10
-"""Least number of other rows beside one or two that stand alone."""
+STEPS = 4.0  # least such gap in steps of strengths that are quantised coarsely
+FEWEST_OTHERS = 10  # least number of other rows beside one or two that stand alone
 NEAR_DB, LEVELS = 3.0, 2.5
 """Values near another: within 3 dB, or within so many of their steps where they are quantised more coarsely."""
 FEWEST, SHARE, RATIO = 6, 0.02, 3.0
@@ -40,8 +36,7 @@ near it. A tail has few rows at its end; one that is cut off, for rows below it 
 INNER_FEWEST, INNER_SHARE, INNER_RATIO, WEAKER = 10, 0.02, 8.0, 0.25
 """The same for a value among the weakest quarter: the mode of strengths in whole dB, of a transmitter that stands still
 for instance, is not near an end, and its neighbours are frequent, too."""
-MOST_VALUES = 4
-"""Largest number of values that are found in one receiver, one after the other."""
+MOST_VALUES = 4  # largest number of values that are found in one receiver, one after the other
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from .units import Found
 FEWEST_STRENGTHS = 4
 """Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
 where a transmitter stands still."""
-SHOWN = 10
-"""Number of rows that a text names."""
+SHOWN = 10  # number of rows that a text names
 
 
 def named_rows(rows: IntArray) -> str:

@@ -14,40 +14,29 @@ from ..core.angles import FloatArray
 logger = logging.getLogger(__name__)
 
 Up = Literal["y", "z"]
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
-"""Length of each unit that a scan or mesh may be in."""
-FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"
-"""Files that points are read from."""
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit that a scan or mesh may be in
+FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"  # files that points are read from
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
-Y_UP_SUFFIXES = (".glb", ".gltf")
-"""Files whose specification has y up (glTF 2.0, section 3.4)."""
+Y_UP_SUFFIXES = (".glb", ".gltf")  # files whose specification has y up (glTF 2.0, section 3.4)
 FARTHEST_M = 2.0**14
 """Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
-LOST_M = 0.005
-"""Steps of single precision in a file from which it is refused: nothing brings back what it has rounded."""
+LOST_M = 0.005  # steps of single precision in a file from which it is refused: nothing brings back what it has rounded
 COARSE_M, COARSEST_M = 0.03, 0.06
 """Steps of a scan's coordinates that blur its planes, and that hide them: one and two of the cells it is thinned to."""
 STEP_TOLERANCE = 0.01
 """Largest deviation from a multiple of a step, in steps: rounding of single precision near the origin."""
-MOST_POINTS = 100_000
-"""Points of a scan by which its axes and steps are judged."""
-ROOM_HEIGHT_M = 1.9, 3.5
-"""Usual heights of rooms."""
-CORRIDOR, CORRIDOR_M = 4.0, 4.5
-"""Least length of a corridor in its widths, and the largest height of one."""
+MOST_POINTS = 100_000  # points of a scan by which its axes and steps are judged
+ROOM_HEIGHT_M = 1.9, 3.5  # usual heights of rooms
+CORRIDOR, CORRIDOR_M = 4.0, 4.5  # least length of a corridor in its widths, and the largest height of one
 SHAFT, SHAFT_HEIGHT = 2.0, 2.0
 """Largest length of a shaft or stairwell in its widths, and its least height in its lengths."""
-TALL = 1.4
-"""Least ratio of the extents along z and y of data that look as if y were up."""
-BROAD = 1.2
-"""Least ratio of the areas seen along y and z of such data; corridors with a tall end have less."""
-FLOOR_M = 0.05
-"""Largest height of a floor that counts as zero."""
-CELLS = 40
-"""Cells along the longest side, in which areas are seen."""
+TALL = 1.4  # least ratio of the extents along z and y of data that look as if y were up
+BROAD = 1.2  # least ratio of the areas seen along y and z of such data; corridors with a tall end have less
+FLOOR_M = 0.05  # largest height of a floor that counts as zero
+CELLS = 40  # cells along the longest side, in which areas are seen
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
 

@@ -22,10 +22,8 @@ from .mesh.surfaces import KINDS, Kind, Surface, bounds, box_of, moved
 
 logger = logging.getLogger(__name__)
 
-TOUCH_M = 0.01
-"""Depth up to which parts touch: surfaces of scans stand up to a centimetre in each other."""
-PAIRS_PER_CHUNK = 1 << 18
-"""Pairs of edge and triangle that are tried together: some 50 MB."""
+TOUCH_M = 0.01  # depth up to which parts touch: surfaces of scans stand up to a centimetre in each other
+PAIRS_PER_CHUNK = 1 << 18  # pairs of edge and triangle that are tried together: some 50 MB
 
 
 @dataclass(frozen=True)

@@ -24,22 +24,14 @@ from .folder import write_scene
 from .materials import FILE
 from .mesh.surfaces import Surface, bodies
 
-PREFIX = "hidden_"
-"""Names of supposed faces begin with it."""
-FLAT_M = 0.03
-"""Largest distance of a face's corners from its plane."""
-UPRIGHT = np.sin(np.radians(10))
-"""Sine of the largest lean of a side, and of the largest deviation from a right angle."""
-TOUCH_M = 0.15
-"""Largest gap where two faces of a box meet: an edge is seen to the point spacing of the scan."""
-SAME_M = 0.1
-"""Distance within which parallel faces are one: a cabinet's back at a wall is the wall."""
-COVERED = 0.3
-"""Share of a face, seen along its normal, from which on another one in its place stands for it."""
-GRID_M = 1e-4
-"""Grid of outlines that are compared."""
-LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0
-"""Sides of boxes."""
+PREFIX = "hidden_"  # names of supposed faces begin with it
+FLAT_M = 0.03  # largest distance of a face's corners from its plane
+UPRIGHT = np.sin(np.radians(10))  # sine of the largest lean of a side, and of the largest deviation from a right angle
+TOUCH_M = 0.15  # largest gap where two faces of a box meet: an edge is seen to the point spacing of the scan
+SAME_M = 0.1  # distance within which parallel faces are one: a cabinet's back at a wall is the wall
+COVERED = 0.3  # share of a face, seen along its normal, from which on another one in its place stands for it
+GRID_M = 1e-4  # grid of outlines that are compared
+LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0  # sides of boxes
 
 
 @dataclass(frozen=True)

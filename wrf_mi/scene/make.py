@@ -30,8 +30,7 @@ from .scan.points import read_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
-RIGID = 1e-6
-"""Largest deviation of a registration's rotation from orthonormal."""
+RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
 def make_scene(

@@ -27,23 +27,17 @@ from .register import best_motion, wall_points
 
 logger = logging.getLogger(__name__)
 
-CELL_M = 0.1
-"""Side of the squares of which a single position is used: a robot that stands still adds nothing."""
-REACH_M = 1.0
-"""Longest line between two positions."""
-NEIGHBOURS = 8
-"""Number of nearest positions that lines may lead to."""
-OUTSIDE_M = 0.2
-"""Least distance beyond the floor's edge of a position outside: the blur of a robot's map."""
+CELL_M = 0.1  # side of the squares of which a single position is used: a robot that stands still adds nothing
+REACH_M = 1.0  # longest line between two positions
+NEIGHBOURS = 8  # number of nearest positions that lines may lead to
+OUTSIDE_M = 0.2  # least distance beyond the floor's edge of a position outside: the blur of a robot's map
 WALKING_HEIGHT_M = 1.0
 """Height above the lowest floor at which walls are cut if the positions have no height; doors are open there."""
-EDGE_SHARE = 0.1
-"""Share of the walls' height, from below and above, within which they are not cut."""
+EDGE_SHARE = 0.1  # share of the walls' height, from below and above, within which they are not cut
 TOLERATED, TOLERATED_SHARE = 1, 0.005
 """Tolerated conflicts, and share of positions in conflict: a cupboard taken for a wall, a wrong position. Walls found
 from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
-LARGEST_SHARE = 0.1
-"""Largest share of positions in conflict where no reflection fits better."""
+LARGEST_SHARE = 0.1  # largest share of positions in conflict where no reflection fits better
 
 
 def read_positions(path: str | Path) -> FloatArray:

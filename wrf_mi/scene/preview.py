@@ -31,24 +31,17 @@ KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "ot
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
 """Points are thinned to their number; of the others the strongest or largest are drawn."""
 OUTLINE_POINTS = 20
-SPAN_DB = 40.0
-"""Range of the colours below the strongest."""
+SPAN_DB = 40.0  # range of the colours below the strongest
 ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
 """Name, marker and colour of each end of paths."""
-ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0
-"""Direction of the viewer of the slanted view."""
-EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))
-"""Unit vector from the scene to the viewer."""
+ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0  # direction of the viewer of the slanted view
+EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))  # unit vector from the scene to the viewer
 LIGHT = np.array([0.35, -0.5, 0.79])
-CUT = 0.45
-"""Share of the height at which the plan is cut."""
-TOP = 0.8
-"""Level faces above this share of the height are taken off like a ceiling."""
+CUT = 0.45  # share of the height at which the plan is cut
+TOP = 0.8  # level faces above this share of the height are taken off like a ceiling
 WHOLE_FACES = 50
-MOST_OUTLINED = 500
-"""Number of faces above which a surface is drawn without its free edges."""
-CREASE_RAD = 0.5
-"""Angle between the normals of two faces from which their common edge is a crease."""
+MOST_OUTLINED = 500  # number of faces above which a surface is drawn without its free edges
+CREASE_RAD = 0.5  # angle between the normals of two faces from which their common edge is a crease
 
 
 @dataclass(frozen=True)

@@ -22,28 +22,18 @@ from .plan.lines import rotation_2d
 
 LEAST_AGREEMENT = 0.5
 """Least agreement of a fit. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""
-CLEAR_LEAD = 0.03
-"""Least difference in agreement between the best pose and any other; with less, the pose is ambiguous."""
-LARGEST_RMS_M = 0.3
-"""Largest rms residual of pairs."""
-SPREAD = 0.05
-"""Least ratio of the second to the first extent of pairs; with less they lie on a line."""
-SMALLEST_EXTENT_M = 0.1
-"""Least extent of pairs; with less they determine no rotation."""
-SAME_M = 0.3
-"""Largest rms distance between the points in two poses that count as equal."""
-MOST_POINTS = 1500
-"""Points on walls are thinned to their number."""
-NEAR_M = 0.2
-"""Largest distance of a point that agrees with a wall: the blur of a robot's map."""
-SAMPLE_M = 0.1
-"""Distance of the points at which walls are compared."""
-CELL_M = 0.1
-"""Cells of the correlated pictures; in large scenes a hundredth of the radius."""
+CLEAR_LEAD = 0.03  # least difference in agreement between the best pose and any other; with less, the pose is ambiguous
+LARGEST_RMS_M = 0.3  # largest rms residual of pairs
+SPREAD = 0.05  # least ratio of the second to the first extent of pairs; with less they lie on a line
+SMALLEST_EXTENT_M = 0.1  # least extent of pairs; with less they determine no rotation
+SAME_M = 0.3  # largest rms distance between the points in two poses that count as equal
+MOST_POINTS = 1500  # points on walls are thinned to their number
+NEAR_M = 0.2  # largest distance of a point that agrees with a wall: the blur of a robot's map
+SAMPLE_M = 0.1  # distance of the points at which walls are compared
+CELL_M = 0.1  # cells of the correlated pictures; in large scenes a hundredth of the radius
 TURNS, PEAKS, STARTS = 72, 4, 12
 """Turns all around that are searched (every 5 degrees), shifts for each turn, and starts that are refined."""
-APART_CELLS, APART_RAD = 5, np.radians(12)
-"""Least difference between two starts; nearer starts lead to the same pose."""
+APART_CELLS, APART_RAD = 5, np.radians(12)  # least difference between two starts; nearer starts lead to the same pose
 
 
 def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:

@@ -27,21 +27,15 @@ from .paths.solve import FIRST_RAYS, Prepared, spread, trace_paths
 
 logger = logging.getLogger(__name__)
 
-Spectra = Callable[[Paths], NDArray[Any]]
-"""Observations [n_rx, n, height, width] of an instrument for paths."""
+Spectra = Callable[[Paths], NDArray[Any]]  # observations [n_rx, n, height, width] of an instrument for paths
 
-SAMPLE = 24
-"""Transmitters on which convergence is judged."""
-SAMPLED_KINDS = 6
-"""Transmitters for diffraction and scattering, where each transmitter takes a separate search."""
-CHOSEN_KINDS = ("diffraction", "scattering")
-"""Kinds of path that are switched on where they count."""
-PARTS = 5
-"""Depth, rays, diffraction, scattering, their rays: each takes an equal share of the error."""
+SAMPLE = 24  # transmitters on which convergence is judged
+SAMPLED_KINDS = 6  # transmitters for diffraction and scattering, where each transmitter takes a separate search
+CHOSEN_KINDS = ("diffraction", "scattering")  # kinds of path that are switched on where they count
+PARTS = 5  # depth, rays, diffraction, scattering, their rays: each takes an equal share of the error
 MOST_SAMPLED_RAYS = 1 << 19
 """Largest number of rays with diffraction or scattering, where time and memory of each search grow with the rays."""
-STEEPEST = 0.95
-"""Largest q that is extrapolated; a series with a larger one does not count as convergent."""
+STEEPEST = 0.95  # largest q that is extrapolated; a series with a larger one does not count as convergent
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from .paths.result import TraceResult
 
 logger = logging.getLogger(__name__)
 
-STATIONS, USERS = 0, 1
-"""Numbers of the sets of base stations and of users."""
+STATIONS, USERS = 0, 1  # numbers of the sets of base stations and of users
 CODES = {0: 0, 1: 1, 2: 3, 4: 4, 8: 2}
 """DeepMIMO's codes (1 reflection, 2 diffraction, 3 scattering, 4 transmission) of Sionna RT's kinds of interaction."""
 LOADED_PATHS = 25

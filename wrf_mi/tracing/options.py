@@ -12,8 +12,7 @@ from ..core import InputError
 
 MAX_DEPTH = 12
 MAX_RAYS = 1 << 24
-MAX_DEGREE = 8
-"""Largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`."""
+MAX_DEGREE = 8  # largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`
 FACTOR, DISC = "surface.factor", "surface.disc"
 """Parameters of Gaussians on surfaces (`wrf_mi.tracing.paths.surface_gaussians`): trained [2, g], logarithmic
 amplitudes and phases in rad, and constant [6, g], centres in metres and unit normals."""
@@ -113,8 +112,7 @@ class TraceOptions(SpecularOptions):
 
 DEFAULTS = TraceOptions()
 
-FURTHER = ("transmission", "diffraction", "scattering")
-"""Kinds of path that are traced only where they are asked for."""
+FURTHER = ("transmission", "diffraction", "scattering")  # kinds of path that are traced only where they are asked for
 
 KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
 """Kinds of path in the command's terms."""

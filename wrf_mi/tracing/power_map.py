@@ -35,13 +35,10 @@ from .search.devices import solid_around
 
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
-MOST_POINTS = 6000
-"""Most traced positions; the grid becomes wider for larger scenes."""
-LAYER_M = 0.5
-"""Greatest distance of the grid's layers over the transmitter's heights."""
+MOST_POINTS = 6000  # most traced positions; the grid becomes wider for larger scenes
+LAYER_M = 0.5  # greatest distance of the grid's layers over the transmitter's heights
 SAME_HEIGHT_M = 0.02
-LEAST_SHARE = 1e-3
-"""Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
+LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, the nearest point with more is used
 
 
 @dataclass(frozen=True)
@@ -123,8 +120,7 @@ class TracedPower:
         return TracedPower(local, self._trace, self._places[places], self._known, self._keeps)
 
 
-Traced = PowerMap | TracedPower
-"""Mean of signal strengths."""
+Traced = PowerMap | TracedPower  # mean of signal strengths
 
 
 def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:

@@ -28,8 +28,7 @@ logger = logging.getLogger(__name__)
 GAIN_DB = 10.0
 """Gain in median power by the other polarisation above which a link counts as cross-polarised. Reflections turn the
 polarisation of some paths, but a co-polarised link keeps most of its power."""
-SAMPLE = 256
-"""Transmitters on which the gain is judged."""
+SAMPLE = 256  # transmitters on which the gain is judged
 TRACED, ROUGH = 32, TraceOptions(transmission=True, depth=2, reflections=1, rays=1 << 12)
 """Transmitters and options of the trace for models that do not trace all transmitters at once."""
 

@@ -14,18 +14,13 @@ from ...core.angles import FloatArray
 from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
 from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, number_names
 
-FLAT_M = 0.01
-"""Largest distance of the vertices of a facet's triangles from its plane."""
+FLAT_M = 0.01  # largest distance of the vertices of a facet's triangles from its plane
 PARALLEL = np.cos(np.radians(2))
-SMALLEST_M2 = 0.05
-"""Least area of a facet that bounds a room."""
-MOST_FACETS = 400
-"""Facets of a body; the rest of a curved or measured surface stays as it is."""
+SMALLEST_M2 = 0.05  # least area of a facet that bounds a room
+MOST_FACETS = 400  # facets of a body; the rest of a curved or measured surface stays as it is
 INSIDE_M = 0.01
-REACHES = 0.95
-"""Least share of the room's height of a solid that is part of the building: a column, a partition."""
-LAYERS_M = 0.5
-"""Largest distance between both faces of a floor or roof."""
+REACHES = 0.95  # least share of the room's height of a solid that is part of the building: a column, a partition
+LAYERS_M = 0.5  # largest distance between both faces of a floor or roof
 
 
 @dataclass(frozen=True, eq=False)

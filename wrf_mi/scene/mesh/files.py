@@ -28,15 +28,12 @@ logger = logging.getLogger(__name__)
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
-SMALLEST_FACE_M2 = 1e-10
-"""Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
+SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
 STL_HEADER, STL_FACE = 84, 50
 """Bytes of the header of a binary STL file, whose last four are the number of triangles, and of a triangle."""
-FLAT_POLYGON = 1e-9
-"""Least ratio of a polygon's second extent to its first; below it has no area."""
-COLLINEAR = 1e-6
-"""Sine of the angle below which a corner lies in a straight side: rounding of float32."""
+FLAT_POLYGON = 1e-9  # least ratio of a polygon's second extent to its first; below it has no area
+COLLINEAR = 1e-6  # sine of the angle below which a corner lies in a straight side: rounding of float32
 GRID = 1e-5
 """Distance relative to a polygon's extent at which its corners and sides touch: that rounding some metres away."""
 

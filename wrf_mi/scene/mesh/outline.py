@@ -17,34 +17,28 @@ from .planes import Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)
-POINTS_PER_CELL = 8
-"""Number of points in the cells of the sparse fifth of the area, which sets the cells' size."""
+POINTS_PER_CELL = 8  # number of points in the cells of the sparse fifth of the area, which sets the cells' size
 SHARE = 0.2
 """Least number of points of an occupied cell, relative to those around it: half of the last cell is on the plane."""
 EDGE_SHARE = 0.3
 """Share of a cell by which an edge is found too far out: a last cell filled to a share x of `SHARE` to 1 counts, and
 the mean of 1 - x times its chance is 0.32."""
 AROUND_CELLS = 5
-CLOSED_CELLS = 1
-"""Gaps of up to twice this many cells are noise."""
+CLOSED_CELLS = 1  # gaps of up to twice this many cells are noise
 STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
 """A stray part of an area is smaller than this share of the whole and sparser than this share."""
 SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
-RECTANGLE_SHARE = 0.88
-"""Least share of its tightest rectangle that a rectangular area fills."""
+RECTANGLE_SHARE = 0.88  # least share of its tightest rectangle that a rectangular area fills
 SCAN_LINES = 31
 SHADOW_CELL_M = 0.1
 BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
 """Largest distance from a surface of what hides it: cupboards; tables and lamps."""
-HIDDEN_SHARE = 0.5
-"""Least share of a gap before which something stands, for the gap to be filled."""
+HIDDEN_SHARE = 0.5  # least share of a gap before which something stands, for the gap to be filled
 SMALLEST_GAP_M2 = 0.02
-STEEPEST = np.cos(np.radians(20))
-"""Planes that meet at a smaller angle have no reliable line in common."""
+STEEPEST = np.cos(np.radians(20))  # planes that meet at a smaller angle have no reliable line in common
 GRID_M = 1e-5
-PASSES = 2
-"""Number of passes over all pairs of planes; the second pass closes the corner of three planes."""
+PASSES = 2  # number of passes over all pairs of planes; the second pass closes the corner of three planes
 
 
 def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:

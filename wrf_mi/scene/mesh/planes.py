@@ -14,18 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.angles import FloatArray
 from .surfaces import Kind
 
-THICKEST_M = 0.3
-"""A thicker box holds more than a plane."""
-MARGIN_M = 0.15
-"""A plane may reach this far beyond the patch it was found as."""
-LEVEL = np.cos(np.radians(10))
-"""Cosine of the largest slope of a floor."""
-UPRIGHT = np.sin(np.radians(20))
-"""Sine of the largest lean of a wall."""
-STOREY_M = 1.8
-"""Least height of a room."""
-SLAB_M = 1.0
-"""Largest distance from a ceiling to the floor above it."""
+THICKEST_M = 0.3  # a thicker box holds more than a plane
+MARGIN_M = 0.15  # a plane may reach this far beyond the patch it was found as
+LEVEL = np.cos(np.radians(10))  # cosine of the largest slope of a floor
+UPRIGHT = np.sin(np.radians(20))  # sine of the largest lean of a wall
+STOREY_M = 1.8  # least height of a room
+SLAB_M = 1.0  # largest distance from a ceiling to the floor above it
 LARGE_SHARE, LARGE_M2 = 0.2, 6.0
 """Floors and ceilings have at least this share of the largest level plane's area, or this area."""
 WALL_SHARE, WALL_HEIGHT_M = 0.7, 2.0

@@ -25,12 +25,9 @@ PLY_TYPES = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-CORNERS = ("vertex_indices", "vertex_index")
-"""Names that writers of PLY give the list of a face's vertices."""
-FACES = ("face", "tristrips")
-"""Elements of PLY that make a mesh of points."""
-LONGEST_HEADER = 1 << 20
-"""Bytes in which a PLY file's header has to end."""
+CORNERS = ("vertex_indices", "vertex_index")  # names that writers of PLY give the list of a face's vertices
+FACES = ("face", "tristrips")  # elements of PLY that make a mesh of points
+LONGEST_HEADER = 1 << 20  # bytes in which a PLY file's header has to end
 
 
 @dataclass(frozen=True)

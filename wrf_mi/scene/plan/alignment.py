@@ -18,27 +18,19 @@ from ...core.angles import FloatArray
 from .lines import rotation_2d
 from .sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
 
-STANDING_S = 1.0
-"""Largest time between successive scans of a stop."""
-SAME_STOP = 0.6
-"""Least match of a scan with the stop before it; two scans from the same place match to 0.8 or more."""
-SAME_PLACE = 0.5
-"""Least match of a stop with the map; with less it keeps its pose."""
-STAYS = 0.2
-"""Least share of a stop's scans that see a cell: moving things and noise are seen once."""
+STANDING_S = 1.0  # largest time between successive scans of a stop
+SAME_STOP = 0.6  # least match of a scan with the stop before it; two scans from the same place match to 0.8 or more
+SAME_PLACE = 0.5  # least match of a stop with the map; with less it keeps its pose
+STAYS = 0.2  # least share of a stop's scans that see a cell: moving things and noise are seen once
 POSE_DEVIATION_M, POSE_DEVIATION_RAD = 0.4, np.radians(8)
 """Standard deviations of a robot's positioning; they penalise matches with the wrong wall."""
 POSE_WEIGHT = 0.05
-HIDDEN_SHARE = 0.15
-"""Largest share of a scan's returns that may lie behind others as seen from the sensor."""
+HIDDEN_SHARE = 0.15  # largest share of a scan's returns that may lie behind others as seen from the sensor
 BEHIND_M = 0.15
 """Least distance by which a return lies behind another in the same direction, more than the slope of an edge."""
-BEARINGS = 240
-"""Directions in which returns hide one another."""
-SECTORS = 36
-"""Sectors over which returns are spread evenly."""
-SEARCH_M = 0.1
-"""Step of the search for the sensor."""
+BEARINGS = 240  # directions in which returns hide one another
+SECTORS = 36  # sectors over which returns are spread evenly
+SEARCH_M = 0.1  # step of the search for the sensor
 ROUNDS = 3
 
 Step = tuple[float, float, float, float]

@@ -26,16 +26,12 @@ Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
-NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")
-"""Arrays of numbers in an NPZ file."""
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")  # arrays of numbers in an NPZ file
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
-FREE_PROBABILITY = 0.196
-"""A cell less likely than this is free (``free_thresh`` there)."""
-POINT_CELL_M = 0.05
-"""Side of the cells that points are counted in, as usual for maps of indoor robots."""
-LARGEST_GRID_CELLS = 4_000_000
-"""100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away."""
+FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
+POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
+LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 
 
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS

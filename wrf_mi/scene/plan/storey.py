@@ -18,10 +18,8 @@ from .walls import find_walls
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
-COVERED = 0.9
-"""Least share of the walls that stand on the floor or at its edge."""
-EDGE_M = 0.1
-"""A wall this near to the floor's edge stands at it."""
+COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
+EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
 
 

@@ -20,18 +20,15 @@ from .points import thin
 
 logger = logging.getLogger(__name__)
 
-REACH_M = 0.15
-"""Gaps and overlaps up to this are closed where walls, floor and ceiling meet."""
+REACH_M = 0.15  # gaps and overlaps up to this are closed where walls, floor and ceiling meet
 STRAIGHT_M = 1e-3
-SMALLEST_M2 = 0.05
-"""Least area of a surface."""
+SMALLEST_M2 = 0.05  # least area of a surface
 FEWEST_POINTS = 20
 LEAST_CONTRAST = 2.0
 """Least density of points in a plane relative to the density beside it; chance alignments have less."""
 TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 """Bounds of the angle by which planes are turned: a levelled scanner and its registration leave the lower."""
-ERRORS = 3.0
-"""Angle by which planes are turned, in standard errors of their direction."""
+ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
 
 
 @dataclass(frozen=True)

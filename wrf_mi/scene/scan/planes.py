@@ -26,44 +26,29 @@ from .points import Thinned, lidar_package
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
 """Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
 joins the walls of a sparse room around its corners, but finds narrow faces."""
-SEARCH_M = 0.10
-"""Half thickness of a patch in which parallel layers, such as both sides of a partition, are separated."""
-BAND = 3.0
-"""Points within this many standard deviations belong to a plane."""
-REPEAT = 5.0
-"""A later plane nearer than this to a parallel plane, in standard deviations, consists of its strays."""
-PLANAR_SHARE = 0.6
-"""A patch with fewer of its points in its layers is bent: a chair, a curtain."""
-NOISE_RANGE_M = (0.002, 0.04)
-"""Range of the noise: scanner on a tripod to phone."""
-LAYER_SHARE = 0.2
-"""Least density of a layer relative to the densest layer of its patch."""
-LAYER_CORE = (0.02, 0.98)
-"""Quantiles of a layer's points that bound it along each axis; the rest may be strays."""
-MERGE_GAP_M = 1.0
-"""Coplanar pieces nearer than this are one plane: wall on both sides of a door."""
+SEARCH_M = 0.10  # half thickness of a patch in which parallel layers, such as both sides of a partition, are separated
+BAND = 3.0  # points within this many standard deviations belong to a plane
+REPEAT = 5.0  # a later plane nearer than this to a parallel plane, in standard deviations, consists of its strays
+PLANAR_SHARE = 0.6  # a patch with fewer of its points in its layers is bent: a chair, a curtain
+NOISE_RANGE_M = (0.002, 0.04)  # range of the noise: scanner on a tripod to phone
+LAYER_SHARE = 0.2  # least density of a layer relative to the densest layer of its patch
+LAYER_CORE = (0.02, 0.98)  # quantiles of a layer's points that bound it along each axis; the rest may be strays
+MERGE_GAP_M = 1.0  # coplanar pieces nearer than this are one plane: wall on both sides of a door
 MERGE_ANGLE_RAD = float(np.radians(1.0))
 SHORTEST_EDGE_M = 0.2
 FEWEST_VOXELS = 60
-POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8
-"""Mean and least number of points of a cell."""
+POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8  # mean and least number of points of a cell
 CELL_RANGE_M = (0.1, 0.4)
-AROUND = 6.0
-"""Half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise."""
+AROUND = 6.0  # half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise
 LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
 """Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
-GROWN_ERRORS = 2.0
-"""The same of cells beside."""
-LAYER_M2, LAYER_CELLS = 0.3, 8
-"""Least size of a layer."""
+GROWN_ERRORS = 2.0  # the same of cells beside
+LAYER_M2, LAYER_CELLS = 0.3, 8  # least size of a layer
 FLATNESS = 2.0
 """Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
-MEDIAN_ERROR = 1.25
-"""Standard error of a median, in that of a mean."""
-TUKEY = 4.685
-"""Constant of the biweight."""
-NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution in its median absolute deviations."""
+MEDIAN_ERROR = 1.25  # standard error of a median, in that of a mean
+TUKEY = 4.685  # constant of the biweight
+NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median absolute deviations
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:

@@ -21,23 +21,17 @@ from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_CHUNK = 1 << 24
-"""Pairs of chain and position in a chunk: 64 MiB for each single-precision array."""
-RAYS_PER_CHUNK = 1 << 20
-"""Rays in a chunk."""
-MARGIN_M = 1e-3
-"""Slack of the bounds of planes."""
+PAIRS_PER_CHUNK = 1 << 24  # pairs of chain and position in a chunk: 64 MiB for each single-precision array
+RAYS_PER_CHUNK = 1 << 20  # rays in a chunk
+MARGIN_M = 1e-3  # slack of the bounds of planes
 BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
 displaced by `wrf_mi.tracing.search.images`."""
-MOST_KEPT = 1 << 27
-"""Bytes of chains that a process keeps."""
+MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
 SECONDS_PER_HIT = 1.2e-7
 """Of each surface that a ray meets, on two cores; finding duplicates takes most of it (docs/limits.md)."""
-WARN_S, MOST_S = 10.0, 3600.0
-"""Durations from which a search is announced, and refused."""
-Choices = list[tuple[int, ...]]
-"""Indices of the hits that reflect, for each time that the rays are shot."""
+WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
+Choices = list[tuple[int, ...]]  # indices of the hits that reflect, for each time that the rays are shot
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 

@@ -16,12 +16,9 @@ from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-BEHIND_M = 0.01
-"""Distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it."""
-BEFORE_M = 1e-4
-"""Least distance before a surface from which an antenna on it is traced."""
-CLEAR = 2.5e-5
-"""That distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
+BEHIND_M = 0.01  # distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it
+BEFORE_M = 1e-4  # least distance before a surface from which an antenna on it is traced
+CLEAR = 2.5e-5  # that distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
 ON_SHARE = 0.1

@@ -20,12 +20,9 @@ from .legs import SPECULAR, Legs, join
 from .surfaces import Surfaces
 from .visibility import reflect_on_faces, unobstructed
 
-CANDIDATES_PER_CHUNK = 1 << 20
-"""Candidates in a chunk, which take some 100 bytes for each interaction."""
-PARALLEL = 1e-9
-"""Difference of heights in metres below which a ray runs along a plane and keeps the point that it met."""
-COINCIDENT_M = 1e-6
-"""Distance below which two antennas are at one place, with no path straight from one to the other."""
+CANDIDATES_PER_CHUNK = 1 << 20  # candidates in a chunk, which take some 100 bytes for each interaction
+PARALLEL = 1e-9  # difference of heights in metres below which a ray runs along a plane and keeps the point that it met
+COINCIDENT_M = 1e-6  # distance below which two antennas are at one place, with no path straight from one to the other
 DISPLACED = 5e-6
 """Displacement of a pair's first antenna, as a share of `Surfaces.scale_m`: 0.05 mm at 10 m, eighty times the rounding
 of a coordinate in single precision."""

@@ -23,13 +23,11 @@ from ...core.digest import content_digest
 from ...core.types import IntArray
 from ...scene.mesh.surfaces import Body, bodies, bounds, shared_edges
 
-COPLANAR_M = 2e-5
-"""Largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m."""
+COPLANAR_M = 2e-5  # largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m
 COPLANAR_COS = 0.99
 """Smallest cosine between normals of a face and its plane, 8 degrees: more than a sliver's rounding, less than a thin
 object's rim."""
-MERGED_M2 = 0.01
-"""Smallest area of a plane that takes in other faces."""
+MERGED_M2 = 0.01  # smallest area of a plane that takes in other faces
 MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)
 """Mesh file in Mitsuba's description of a shape; there is no attribute."""
 MERGED_COUNT = 1000
@@ -46,8 +44,7 @@ by which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""
-FARTHEST = 25.0
-"""Largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors."""
+FARTHEST = 25.0  # largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors
 MOST_AT_CORNER = 8.0
 """Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
 infinity."""

@@ -28,22 +28,17 @@ the first then ends at whichever plane its ray meets."""
 WINDOW = 2 * CLUSTER
 """Distance from a point of reflection within which rays cannot tell sides, as a share of the same:
 `with_crossings` finds what is crossed there."""
-MOST_CLUSTERED = 3
-"""Reflections in a cluster: three planes meet in a corner."""
-NO_PLANE = 0xFFFFFFFF
-"""Plane of the end of the last leg, the target."""
-REFLECTS = 1 << 31
-"""Bit of a face's number that tells a reflection from a transmission."""
+MOST_CLUSTERED = 3  # reflections in a cluster: three planes meet in a corner
+NO_PLANE = 0xFFFFFFFF  # plane of the end of the last leg, the target
+REFLECTS = 1 << 31  # bit of a face's number that tells a reflection from a transmission
 NEAR = 1e-5
 """Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
 times that within which rays do not count them (`WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
 """Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
 leave which were modelled one by one, `wrf_mi.scene.mesh.surfaces.SAME_CORNER_M`."""
-PAIRS_TOGETHER = 1 << 20
-"""Pairs of points and planes, or faces, in a chunk."""
-UNKNOWN_FACE = (1 << 31) - 1
-"""Face of a reflection that rays cannot distinguish from another one at the same point."""
+PAIRS_TOGETHER = 1 << 20  # pairs of points and planes, or faces, in a chunk
+UNKNOWN_FACE = (1 << 31) - 1  # face of a reflection that rays cannot distinguish from another one at the same point
 
 
 class Met(NamedTuple):

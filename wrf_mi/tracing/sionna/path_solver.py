@@ -29,8 +29,7 @@ SLOTS_PER_CHUNK = 1 << 22
 for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
 WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 """Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
-PATHS_PER_CHUNK = 1 << 19
-"""Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
+PATHS_PER_CHUNK = 1 << 19  # paths in a chunk; the field calculator takes some 300 bytes per path and interaction
 AT_ANTENNA_M = 1e-9
 """Distance within which an interaction is at the antenna, or at its image, so that it tells no direction."""
 SHORT = 1e-4
@@ -57,8 +56,7 @@ class Devices:
         return np.broadcast_to(angles, (len(self.position_m), 3))
 
 
-Ends = tuple[Devices, Devices]
-"""Sources and targets of a search, or transmitters and receivers."""
+Ends = tuple[Devices, Devices]  # sources and targets of a search, or transmitters and receivers
 
 
 def sionna_orientation(to_world: ArrayLike) -> FloatArray:

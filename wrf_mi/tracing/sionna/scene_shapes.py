@@ -30,14 +30,11 @@ from .materials import CONSTANTS
 
 logger = logging.getLogger(__name__)
 
-MESHES = ("ply", "obj")
-"""Shapes that are files of vertices and faces."""
+MESHES = ("ply", "obj")  # shapes that are files of vertices and faces
 SEGMENTS = 32
 """Segments of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off."""
-CHECKED_FILES = 4096
-"""Files whose triangles are remembered: a scene is opened once for each carrier and fold."""
-REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)
-"""Errors of Mitsuba and Sionna RT about a scene file."""
+CHECKED_FILES = 4096  # files whose triangles are remembered: a scene is opened once for each carrier and fold
+REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)  # errors of Mitsuba and Sionna RT about a scene file
 PLACE = re.compile(r"^\[[\w.]+:\d+\] (((Error while|While) loading|At) string \(line \d+, col \d+\): )?")
 """Begin of Mitsuba's messages: its source line, and a place in a text that is not the file."""
 PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")

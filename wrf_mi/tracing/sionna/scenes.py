@@ -25,8 +25,7 @@ from .materials import perfect_reflector, set_frequency
 from .scene_shapes import check_materials, load_checked, plain_ply, replace_shapes
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
-HIGHEST_M = 500.0
-"""Height above which a scene counts as one in millimetres."""
+HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
 
 
 def open_scene(
