@@ -28,7 +28,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def powers(scene: Any, positions: FloatArray = POSITIONS, **changed: Any) -> FloatArray:
     given = {"receivers": [receiver(CENTRE)], "options": OPTIONS, "tx_antenna": Antenna(), **changed}
-    return power_map.traced_powers(scene, Prepared(scene), positions, **given)
+    return power_map.traced_powers(Prepared(scene), positions, **given)
 
 
 def test_kept_powers_are_those_traced(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -295,9 +295,16 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
     if not path.exists():
         record, instrument = problem.record, instrument_of(problem.record)
         spectra = instrument.observe if task_of(record).image else None
-        kinds = settings.target_kinds.split(",")
-        target = settings.target_error_db, settings.options, kinds, spectra, record.tx_antenna
-        choice = choose_options(problem.opened_scene, record.tx_pos_m, record.receivers, *target)
+        choice = choose_options(
+            problem.opened_scene,
+            record.tx_pos_m,
+            record.receivers,
+            settings.target_error_db,
+            settings.options,
+            kinds=settings.target_kinds.split(","),
+            spectra=spectra,
+            tx_antenna=record.tx_antenna,
+        )
         write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
     with readable(path, f"{path}: missing; trace anew", "trace anew"):
         chosen = settings_from(TraceOptions, json.loads(path.read_text())["options"], str(path))

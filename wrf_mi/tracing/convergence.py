@@ -181,6 +181,7 @@ def choose_options(
     receivers: Receiver | Sequence[Receiver],
     target_db: float,
     options: TraceOptions,
+    *,
     kinds: Sequence[str] = CHOSEN_KINDS,
     spectra: Spectra | None = None,
     tx_antenna: Antenna = ANTENNA,

@@ -126,14 +126,13 @@ Traced = PowerMap | TracedPower  # mean of signal strengths
 def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
     """Function of `TracedPower` that traces a scene for a record's receivers."""
     prepared = Prepared(scene)
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
 
     def trace(position_m: FloatArray, places: IntArray | None) -> FloatArray:
         receivers = record.receivers if places is None else [record.receivers[place] for place in places]
         power = np.full((len(receivers), len(position_m)), np.nan)
         outside = solid_around(prepared.surfaces, position_m) < 0
         if outside.any():
-            power[:, outside] = rssi_dbm(trace_paths(scene, position_m[outside], receivers, options, **how).paths)
+            power[:, outside] = _power_dbm(prepared, position_m[outside], receivers, options, record.tx_antenna)
         return power
 
     return trace
@@ -171,7 +170,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
     if not outside.any():
         raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
     traced = np.full((len(record.receivers), len(points)), np.nan)
-    traced[:, outside] = traced_powers(scene, prepared, points[outside], record.receivers, options, record.tx_antenna)
+    traced[:, outside] = traced_powers(prepared, points[outside], record.receivers, options, record.tx_antenna)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers, which lie further apart than the neighbourhood and may be on different floors.
@@ -195,8 +194,7 @@ def _means_outside(
     return np.asarray(mean[:, *nearest])
 
 
-def traced_powers(
-    scene: Any,
+def _power_dbm(
     prepared: Prepared,
     tx_pos_m: FloatArray,
     receivers: Sequence[Receiver],
@@ -204,7 +202,20 @@ def traced_powers(
     tx_antenna: Antenna,
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
+    return np.asarray(rssi_dbm(trace_paths(prepared.scene, tx_pos_m, receivers, options, **how).paths), float)
+
+
+def traced_powers(
+    prepared: Prepared,
+    tx_pos_m: FloatArray,
+    receivers: Sequence[Receiver],
+    options: TraceOptions,
+    tx_antenna: Antenna,
+) -> FloatArray:
+    """Received powers of `_power_dbm`, kept in the user's cache."""
     # The key holds all that determines the powers, code and versions included; a stale file is never read.
+    scene = prepared.scene
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
     if (slab_of_face >= 0).all():  # other materials have no digest
@@ -217,8 +228,7 @@ def traced_powers(
         path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
         if path.exists():
             return np.asarray(stored_arrays(path)[POWER], float)
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
-    power = np.asarray(rssi_dbm(trace_paths(scene, tx_pos_m, receivers, options, **how).paths), float)
+    power = _power_dbm(prepared, tx_pos_m, receivers, options, tx_antenna)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {POWER: power})

@@ -31,7 +31,6 @@ MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
 SECONDS_PER_HIT = 1.2e-7
 """Of each surface that a ray meets, on two cores; finding duplicates takes most of it (docs/limits.md)."""
 WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
-Choices = list[tuple[int, ...]]  # indices of the hits that reflect, for each time that the rays are shot
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
@@ -78,14 +77,13 @@ def shoot(
     surfaces, the rays are shot once for each choice of the hits that reflect: up to two to the power of the depth. The
     seed turns the rays' lattice.
     """
-    reach = options.surfaces_met, options.most_reflections, options.transmission
     # Models, folds and carriers trace the same rooms from the same receivers.
+    reach = options.surfaces_met, options.most_reflections, options.transmission
     key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
     else:
-        turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, options.surfaces_met, patterns(*reach))
+        _kept[key] = _chains(scene, surfaces, source_m, options, rays, seed)
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -93,24 +91,25 @@ def shoot(
 
 
 def _chains(
-    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, turn: FloatArray, depth: int, choices: Choices
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
-    reflections = len(choices[0])
+    reflections = options.most_reflections
     chains = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
         return chains[0]
-    for reflecting in choices:
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    for reflecting in patterns(options.surfaces_met, reflections, options.transmission):
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
             sequence = np.full((stop - start, reflections), -1, np.int64)
-            hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
-            for column, level in enumerate(reflecting):
-                sequence[:, column] = hits[level]
+            directions = turn @ lattice(start, stop, rays)
+            hits = _shoot(scene, surfaces, directions, source_m, options.surfaces_met, reflecting)
+            sequence[:, : len(reflecting)] = hits[list(reflecting)].T
             chains.append(unique_chains(sequence))  # chunk by chunk: most rays find the same few chains
     return unique_chains(np.concatenate(chains))
 
 
-def patterns(depth: int, reflections: int, passing: bool) -> Choices:
+def patterns(depth: int, reflections: int, passing: bool) -> list[tuple[int, ...]]:
     """Indices of the hits that reflect: all choices that are not a prefix of another one, see `shoot`."""
     if not passing:
         return [tuple(range(reflections))]
