@@ -84,11 +84,8 @@ def find_cuda() -> Path | None:
 
 
 def _llvm_files() -> Iterator[Path]:
-    for folder in _library_folders():
-        for name in glob.glob("libLLVM*", root_dir=folder):
-            if version_from_name(name) is not None:
-                yield folder / name
-    yield from (file for file in _linker_cache("libLLVM") if version_from_name(file.name) is not None)
+    files = [folder / name for folder in _library_folders() for name in glob.glob("libLLVM*", root_dir=folder)]
+    yield from (file for file in [*files, *_linker_cache("libLLVM")] if version_from_name(file.name) is not None)
 
 
 def _library_folders() -> list[Path]:
@@ -98,25 +95,13 @@ def _library_folders() -> list[Path]:
     patterns = [folder for entries in listed for folder in entries if folder]
     patterns += [f"{root}/lib" for root in roots if root]
     if sys.platform == "darwin":
-        patterns += [
-            "/opt/homebrew/opt/llvm*/lib",
-            "/usr/local/opt/llvm*/lib",
-            "/opt/local/libexec/llvm-*/lib",
-            "/usr/local/lib",
-        ]
+        patterns += ["/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib", "/opt/local/libexec/llvm-*/lib"]
+        patterns += ["/usr/local/lib"]
     else:
         multiarch = sysconfig.get_config_var("MULTIARCH") or f"{os.uname().machine}-linux-gnu"
-        patterns += [
-            f"/usr/lib/{multiarch}",
-            "/usr/lib64",
-            "/usr/lib",
-            "/usr/local/lib",
-            "/usr/lib/llvm*/lib",
-            "/usr/lib64/llvm*/lib",
-            "/usr/lib/llvm*/lib64",
-            "/opt/llvm*/lib",
-            "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
-        ]
+        patterns += [f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
+        patterns += ["/usr/lib/llvm*/lib", "/usr/lib64/llvm*/lib", "/usr/lib/llvm*/lib64", "/opt/llvm*/lib"]
+        patterns += ["/home/linuxbrew/.linuxbrew/opt/llvm*/lib"]
     folders = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
     return list(dict.fromkeys(folder for folder in folders if folder.is_dir()))
 

@@ -22,7 +22,7 @@ from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
 from ..tracing.search.devices import winding_number
 from .plans import placements
-from .repeats import named_rows
+from .rows import named_rows
 from .units import Found
 
 LAYOUT = "layout.csv"  # file of wall vertices in a data set's folder
@@ -130,11 +130,9 @@ def at_vertices(record: Record, building: Building) -> Found:
     if not len(building.walls_m):
         return
     vertices = building.walls_m.reshape(-1, 2)
-    named = []
-    for receiver in record.receivers:
-        x, y = receiver.position_m[:2]
-        if np.linalg.norm(vertices - [x, y], axis=1).min() <= AT_VERTEX_M:
-            named.append(f"{receiver.name} at ({x:g}, {y:g})")
+    places = [(receiver.name, *receiver.position_m[:2]) for receiver in record.receivers]
+    away = [np.linalg.norm(vertices - place, axis=1).min() for _, *place in places]
+    named = [f"{name} at ({x:g}, {y:g})" for (name, x, y), m in zip(places, away, strict=True) if m <= AT_VERTEX_M]
     if named:
         text = f"{len(named)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
         yield "wall-vertices", f"{text}: {', '.join(named)}; give the antenna's position, in front of the wall"

@@ -47,8 +47,6 @@ STANDARD_ERRORS = 4.0
 """Least mean of the groups' gains in its standard errors: with 15 degrees of freedom one in 1700 by chance, and some
 thirty readings are compared."""
 OTHERS = 6  # transmitters of other groups that a row's own is compared with
-
-
 REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at azimuth 0, counter-clockwise"
 
 

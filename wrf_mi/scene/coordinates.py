@@ -80,9 +80,10 @@ def looks_y_up(points_m: FloatArray) -> bool:
     return seen_along_y > BROAD * seen_along_z
 
 
-def warn_of_up(points_m: FloatArray, name: str | Path, up: Up) -> None:
-    """Log that points [n, 3], z up, of a file that was read with an axis up look as if it were the other one."""
-    if looks_y_up(points_m):
+def warn_of_up(points_m: FloatArray, name: str | Path, stated: Up | None = None) -> None:
+    """Log that points [n, 3], z up, of a file that states no axis look as if another than that of `up_of` were up."""
+    if stated is None and looks_y_up(points_m):
+        up = up_of(name, None)
         _, along_y, along_z = np.ptp(extent(points_m), axis=0)
         other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
         text = f"{name}: looks as if {other} were up ({sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file)"

@@ -179,14 +179,12 @@ def _params(traced: TraceResult, paths: Paths, carrier_hz: float) -> dict[str, A
         "raw_params": {"written_by": f"wrf-mi {__version__}", "phase": "with the carrier's exp(-j 2 pi f delay)"},
     }
     scene = {"num_scenes": 1, "n_objects": 0, "n_vertices": 0, "n_faces": 0, "n_triangular_faces": 0}
-    sets = (STATIONS, "base_stations", paths.n_rx, paths.rx), (USERS, "users", paths.n_tx, paths.tx)
-    return {
-        "version": VERSION,
-        "rt_params": rt_params,
-        "txrx_sets": {f"txrx_set_{key}": _set(key, name, count, reached) for key, name, count, reached in sets},
-        "materials": {},
-        "scene": {**scene, "representation": "hull"},
+    sets = {
+        "txrx_set_0": _set(STATIONS, "base_stations", paths.n_rx, paths.rx),
+        "txrx_set_1": _set(USERS, "users", paths.n_tx, paths.tx),
     }
+    scene_facts = {**scene, "representation": "hull"}
+    return {"version": VERSION, "rt_params": rt_params, "txrx_sets": sets, "materials": {}, "scene": scene_facts}
 
 
 def _set(number: int, name: str, count: int, reached: IntArray) -> dict[str, Any]:

@@ -148,9 +148,8 @@ class _Strips:
 
     def free_beside(self, run: Run) -> float:
         """Share of a run with free cells at its sides."""
-        return self.share(
-            self.grid.free, run.axis, (run.offset - BESIDE_M, run.offset + BESIDE_M), (run.start, run.end)
-        )
+        sides = run.offset - BESIDE_M, run.offset + BESIDE_M
+        return self.share(self.grid.free, run.axis, sides, (run.start, run.end))
 
     def free_between(self, a: Run, b: Run, along: tuple[float, float]) -> float:
         """Share of a stretch where free cells lie between two parallel runs, without their smears."""

@@ -31,12 +31,10 @@ TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """A plane, its area (shapely), the distance within which its corners are closed, and areas of recesses in it."""
+@dataclass(frozen=True, eq=False)
+class _Piece(Face):
+    """A face, the distance within which its corners are closed, and areas (shapely) of recesses in it."""
 
-    plane: Plane
-    area: Any
     reach_m: float
     recesses: Sequence[Any] = ()
 
@@ -65,11 +63,8 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
     planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
-    roles = kinds(list(map(Face, planes, areas)), float(np.median(cloud.points_m[:, 2])))
-    reach = [
-        piece.reach_m if kind == "other" else max(piece.reach_m, REACH_M)
-        for piece, kind in zip(pieces, roles, strict=True)
-    ]
+    roles = kinds(pieces, float(np.median(cloud.points_m[:, 2])))
+    reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
     areas = join(planes, areas, reach)
     # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
     things = np.ones(len(cloud.points_m), bool)

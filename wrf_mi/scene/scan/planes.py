@@ -52,7 +52,7 @@ NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
-    """The planes of a thinned cloud, that with the most points first, and the standard deviation of points from them,
+    """The planes of a thinned cloud, those of most points first, and the standard deviation of points from them,
     metres.
     """
     planes: list[Plane] = []
@@ -61,7 +61,7 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
     for spread_deg in NORMAL_SPREADS_DEG:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
-        candidates = [plane for box in boxes for plane in _layers(cloud, free, box, noise)]
+        candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
         candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
         if not candidates:
             break
@@ -198,7 +198,7 @@ def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
     return float(np.clip(np.quantile(widths, 0.5, weights=areas, method="inverted_cdf"), *NOISE_RANGE_M))
 
 
-def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
+def _patch_layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
     """The parallel planes within a patch, none where it is bent."""
     # The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
     # all points about it may run across two real layers. The sharper of both is used.
@@ -265,9 +265,8 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
     away, flat = plane.distance(points_m[rows]).astype(float), plane.flat(points_m[rows]).astype(float)
     low = flat.min(axis=0)
     # Density where there are points: the rectangle around them may be mostly empty.
-    density = len(rows) / max(
-        len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0)) * CELL_RANGE_M[0] ** 2, 1e-9
-    )
+    occupied = len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0))
+    density = len(rows) / (occupied * CELL_RANGE_M[0] ** 2)
     side = float(np.clip(np.sqrt(POINTS_PER_CELL / density), *CELL_RANGE_M))
     cell = np.floor((flat - low) / side).astype(int)
     shape = tuple(cell.max(axis=0) + 1)

@@ -14,7 +14,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 from ... import backend
 from ...core import InputError
 from ...core.yaml_files import read_yaml
-from ...scene.coordinates import require_near, up_of, warn_of_up
+from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import thicknesses
@@ -123,7 +123,7 @@ def _from_mesh(path: Path, material: str) -> Any:
     parts, scene = mesh_parts(path), rt.load_scene()
     if parts:
         triangles = np.concatenate([np.asarray(part.triangles) for part in parts])
-        warn_of_up(sampled(triangles), path, up_of(path, None))
+        warn_of_up(sampled(triangles), path)
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
