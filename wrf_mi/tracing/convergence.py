@@ -132,9 +132,10 @@ class _Search:
             self.reports[options, few] = rssi_dbm(paths), spectra
         return self.reports[options, few]
 
-    def change(self, part: str, options: TraceOptions, least_db: float = -1.0, **value: int | bool) -> float:
+    def change(self, part: str, value: int | bool, options: TraceOptions, least_db: float = -1.0) -> float:
         """Largest change in dB by another value of a setting, which is kept where the change is above a least one."""
-        other = replace(options, **value)  # type: ignore[arg-type]
+        setting: dict[str, Any] = {part: value}
+        other = replace(options, **setting)
         # Each transmitter takes a search of its own where paths are sampled, so fewer of them are compared.
         few = options.sampled or other.sampled
         (a, before), (b, after) = self._report(options, few), self._report(other, few)
@@ -143,14 +144,14 @@ class _Search:
         if (np.isnan(a) == np.isnan(b)).all():
             power = float(np.nanmax(np.abs(a - b), initial=0.0))
             change = max(power, float(20 * np.log10(1 + (spectrum or 0.0))))
-        self.trials.append(Trial(part, *value.values(), change, change > least_db, spectrum))
+        self.trials.append(Trial(part, value, change, change > least_db, spectrum))
         return change
 
     def depth(self, options: TraceOptions) -> tuple[TraceOptions, float]:
         """Options with the converged depth, and the remainder in dB."""
         now, changes = replace(options, depth=1, rays=FIRST_RAYS), list[float]()
         while now.depth < MAX_DEPTH:
-            changes.append(self.change("depth", now, depth=now.depth + 1))
+            changes.append(self.change("depth", now.depth + 1, now))
             now = replace(now, depth=now.depth + 1)
             # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
             if len(changes) > 1 and max(*changes[-2:], remainder(changes)) <= self.share_db:
@@ -162,7 +163,7 @@ class _Search:
         assert isinstance(options.rays, int)
         rays, calm, change = options.rays, 0, float("inf")
         while calm < 2 and rays < most:
-            change = self.change("rays", replace(options, rays=rays), rays=2 * rays)
+            change = self.change("rays", 2 * rays, replace(options, rays=rays))
             rays *= 2
             calm = calm + 1 if change <= self.share_db else 0  # once may be chance: each number has other rays
         return replace(options, rays=rays), change
@@ -215,7 +216,7 @@ def choose_options(
     error_db += depth_db
     now = replace(now, diffraction=options.diffraction, scattering=options.scattering)
     for kind in (kind for kind in CHOSEN_KINDS if kind in kinds and not getattr(options, kind)):
-        change_db = search.change(kind, now, search.share_db, **{kind: True})
+        change_db = search.change(kind, True, now, search.share_db)
         if change_db > search.share_db:
             now = replace(now, **{kind: True})
         else:
