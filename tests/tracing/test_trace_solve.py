@@ -272,7 +272,7 @@ def sionna_paths(scene: Any, tx: np.ndarray, rx: np.ndarray, **kinds: Any) -> tu
     scene.add(rt.Receiver("rx", mi.Point3f(rx.tolist())))
     try:
         paths = rt.PathSolver(deterministic=True)(
-            scene, depth=3, samples_per_src=30_000, max_num_paths_per_src=100_000, seed=1, **kinds
+            scene, max_depth=3, samples_per_src=30_000, max_num_paths_per_src=100_000, seed=1, **kinds
         )
     finally:
         scene.remove(["tx", "rx"])
