@@ -113,5 +113,5 @@ def record(truth: Path, task: str, rows: int = 15) -> Record:
     made = Record(
         "cad-room", task, positions(rows), (receiver,), empty, frequencies_hz=frequencies_hz, official=official
     )
-    observed = RayTracer(truth, instrument_of(made), TraceOptions(transmission=True, max_depth=3))(made.tx_pos_m)
+    observed = RayTracer(truth, instrument_of(made), TraceOptions(transmission=True, depth=3))(made.tx_pos_m)
     return replace(made, observation=observed.astype(empty.dtype))

@@ -65,7 +65,7 @@ def channels(scene: Path, count: int, snr_db: float = np.inf, seed: int = 0) -> 
     empty = np.zeros((1, count, 8), np.complex64)
     official = np.arange(count - 10), np.arange(count - 10, count)
     record = Record("made-up", "csi", positions, (receiver,), empty, frequencies_hz=hz, official=official)
-    tracer = RayTracer(scene, instrument_of(record), TraceOptions(transmission=True, max_depth=3))
+    tracer = RayTracer(scene, instrument_of(record), TraceOptions(transmission=True, depth=3))
     found = tracer(positions)
     noise = np.sqrt(np.square(np.abs(found)).mean() / 10 ** (snr_db / 10) / 2)
     found = found + noise * (rng.normal(size=found.shape) + 1j * rng.normal(size=found.shape))

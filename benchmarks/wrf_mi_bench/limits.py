@@ -20,8 +20,8 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 2.44e9
-DIFFRACTED = TraceOptions(line_of_sight=False, reflection=False, diffraction=True, max_depth=1)
-REFLECTED = TraceOptions(line_of_sight=False, max_depth=1)
+DIFFRACTED = TraceOptions(line_of_sight=False, reflection=False, diffraction=True, depth=1)
+REFLECTED = TraceOptions(line_of_sight=False, depth=1)
 BEFORE, BEHIND = (-3.0, 0.0, -1.5), (3.0, 0.0, -1.5)
 """Ends on both sides of a screen at x = 0 whose upper edge lies at z = 0."""
 CUBE = """<scene version="2.1.0">
@@ -157,7 +157,7 @@ def rows() -> Iterator[tuple[str, str]]:
     box = opened(trimesh.creation.box(bounds=[(0, 0, 0), (5, 4, 2.7)]))
     for depth, passing in ((10, False), (6, True), (8, True)):
         begun = time.perf_counter()
-        paths = traced(box, [(1.0, 1.5, 1.2)], (4.0, 3.0, 2.0), TraceOptions(max_depth=depth, transmission=passing))
+        paths = traced(box, [(1.0, 1.5, 1.2)], (4.0, 3.0, 2.0), TraceOptions(depth=depth, transmission=passing))
         text = f"{time.perf_counter() - begun:.1f} s, {len(paths)} paths"
         kinds = "with" if passing else "without"
         yield f"closed metal box of 5 x 4 x 2.7 m, one pair, depth {depth}, {kinds} transmission", text

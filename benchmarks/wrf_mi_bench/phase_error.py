@@ -40,9 +40,9 @@ ELEMENTS = 4
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 CEILING_M = 1.8
 """Height above which an array looks down, metres; one below looks up."""
-TRUTH = TraceOptions(transmission=True, diffraction=True, scattering=True, max_depth=3, rays=1 << 13)
+TRUTH = TraceOptions(transmission=True, diffraction=True, scattering=True, depth=3, rays=1 << 13)
 """Search for the true paths, with diffuse reflection and diffraction."""
-PREDICTION = TraceOptions(transmission=True, max_depth=3, rays=1 << 16)
+PREDICTION = TraceOptions(transmission=True, depth=3, rays=1 << 16)
 
 
 def array_at(station: Receiver, carrier_hz: float) -> Receiver:

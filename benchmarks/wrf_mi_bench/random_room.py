@@ -31,7 +31,7 @@ from wrf_mi.tracing.tracer import RayTracer
 
 CARRIER_HZ = 2.44e9
 SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
-OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 18, seed=1)
+OPTIONS = TraceOptions(transmission=True, depth=3, rays=1 << 18, seed=1)
 """Paths of the true channels."""
 
 

@@ -45,7 +45,7 @@ GAUSSIANS, ELEMENTS = 1000, 16
 """Numbers where another size grows."""
 SMALL = 90
 """Gaussians of the field that predicts for thousands of transmitters."""
-OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
+OPTIONS = TraceOptions(depth=2, rays=1 << 14)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Alone:
     settings: tuple[str, ...] = ()
 
 
-IN_A_FLAT = (*TRANSMISSION, "calibration=gain,patterns", "max_depth=6", "max_reflections=2")
+IN_A_FLAT = (*TRANSMISSION, "calibration=gain,patterns", "depth=6", "reflections=2")
 ALONE: Mapping[str, Alone] = {
     "kriging": Alone("kriging"),
     "idw": Alone("idw"),

@@ -73,7 +73,7 @@ NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 
-TWO_BOUNCES = TraceOptions(max_depth=2, rays=1 << 13)
+TWO_BOUNCES = TraceOptions(depth=2, rays=1 << 13)
 Parts = dict[str, tuple[str, Mesh]]
 
 
@@ -109,7 +109,7 @@ CASES: Mapping[str, Case] = {
             "partition": ("itu_chipboard", sheet(0, 3.1, (0.0, 2.6), (0.0, 2.0))),
             "layer": ("itu_plasterboard", sheet(0, 3.12, (0.0, 2.6), (0.0, 2.0))),
         },
-        options=TraceOptions(max_depth=3, max_reflections=2, transmission=True, rays=1 << 13),
+        options=TraceOptions(depth=3, reflections=2, transmission=True, rays=1 << 13),
     ),
     # Line of sight and reflection cancel to a thousandth.
     "grazing paths": Case(
@@ -130,7 +130,7 @@ CASES: Mapping[str, Case] = {
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
     """Values and derivatives of `CASES` and of ``many`` transmitters, the worst of the receiver models."""
     tx_pos_m = np.random.default_rng(5).uniform(0.15, 0.85, (many, 3)) * ROOM
-    cases = {**CASES, "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(max_depth=3, rays=1 << 15))}
+    cases = {**CASES, "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(depth=3, rays=1 << 15))}
     rows = []
     for name in cases if names is None else names:
         with tempfile.TemporaryDirectory() as work:

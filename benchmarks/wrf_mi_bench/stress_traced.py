@@ -50,7 +50,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     with tempfile.TemporaryDirectory() as work:
         parts = {name: ("itu_metal", wall) for name, wall in box_sheets(size_m).items()}
         scene = open_scene(write_scene(Path(work), parts, "Hall of metal"), frequency_hz)
-        options = TraceOptions(max_depth=2, rays=1 << 14)
+        options = TraceOptions(depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
         delays_s = _sionna_delays(scene, tx, rx)
     worst, single, delay = Worst(), Worst(), Worst()

@@ -77,7 +77,7 @@ def test_confirmation_rejects_moved_and_obstructed_paths(tmp_path: Path):
     partition = {"partition": ("itu_wood", sheet(0, 3.0, (0.0, 4.0), (0.0, 2.0)))}
     scene = room(tmp_path / "open", SHOEBOX)
     tx, rx = np.array([[1.3, 2, 1]]), np.array([4.4, 3.1, 1.7])
-    paths = trace_paths(scene, tx, receiver(rx), TraceOptions(max_depth=2)).paths
+    paths = trace_paths(scene, tx, receiver(rx), TraceOptions(depth=2)).paths
     triangles = scene_surfaces(scene).triangles
     assert confirm_paths(paths, tx, rx, triangles).all()
     moved = replace(paths, vertices_m=paths.vertices_m + np.array([0.01, 0.02, 0.01]))

@@ -27,7 +27,7 @@ def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path: Path) -> None
     positions = rng.uniform([0.3, 0.3, 0.3], [6.8, 3.7, 2.3], (20, 3))
     positions = positions[np.abs(positions[:, 0] - 4.06) > 0.2]
     end = Receiver("end", np.array([1.1, 1.3, 2.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    options = TraceOptions(max_depth=2, rays=1 << 15)
+    options = TraceOptions(depth=2, rays=1 << 15)
     truth, ours = (trace_paths(open_scene(xml, FREQUENCY_HZ), positions, end, options).paths for xml in (xml, made.xml))
     found, matched = match(truth, ours)
     power, power_ours = truth.length_m**-2, ours.length_m**-2

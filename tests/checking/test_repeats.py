@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from checked_records import channels, spectra, strengths
 
-from wrf_mi.checking.repeats import (
+from wrf_mi.checking.rows import (
     constant_observations,
     named_rows,
     repeated_observations,

@@ -14,7 +14,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.options import without_effect
 
-DIRECT = {"reflection": False, "max_depth": 0}
+DIRECT = {"reflection": False, "depth": 0}
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +29,15 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({}, set()),
         (DIRECT, set()),
         ({"reflection": False}, set()),
-        ({"reflection": False, "max_depth": 5}, {"max_depth"}),
-        ({"reflection": False, "transmission": True, "max_depth": 5}, set()),
-        ({"reflection": False, "transmission": True, "max_reflections": 1}, {"max_reflections"}),
+        ({"reflection": False, "depth": 5}, {"depth"}),
+        ({"reflection": False, "transmission": True, "depth": 5}, set()),
+        ({"reflection": False, "transmission": True, "reflections": 1}, {"reflections"}),
         ({"reflection": False, "diffraction": True, "rays": 1 << 12, "seed": 7}, set()),
         ({"reflection": False, "transmission": True, "rays": "auto", "seed": 7}, {"rays", "seed"}),
         (DIRECT | {"transmission": True, "scattering": True}, {"transmission", "scattering"}),
-        ({"max_reflections": 4}, {"max_reflections"}),
-        ({"max_reflections": 2, "max_depth": 6, "transmission": True}, set()),
-        ({"max_reflections": 0, "rays": 64}, {"rays"}),
+        ({"reflections": 4}, {"reflections"}),
+        ({"reflections": 2, "depth": 6, "transmission": True}, set()),
+        ({"reflections": 0, "rays": 64}, {"rays"}),
         ({"scattering_coefficient": 0.5}, {"scattering_coefficient"}),
         ({"scattering_coefficient": 0.5, "scattering": True}, set()),
         (DIRECT | {"phase_error": 1.0}, {"phase_error"}),
@@ -72,14 +72,14 @@ def test_options_of_trace_without_effect_are_refused(
         ({"settings": TracingSettings(**DIRECT, seed=3), "split": "random"}, 3, []),
         ({"settings": TracingSettings(target_kinds="")}, 0, ["target_kinds= has no effect: target_error_db"]),
         (
-            {"settings": TracingSettings(target_error_db=1.0, max_depth=5, rays=64)},
+            {"settings": TracingSettings(target_error_db=1.0, depth=5, rays=64)},
             0,
             [
-                "max_depth=5 has no effect: target_error_db chooses it",
+                "depth=5 has no effect: target_error_db chooses it",
                 "rays=64 has no effect: target_error_db chooses it",
             ],
         ),
-        ({"settings": TracingSettings(max_depth=5)}, 0, []),
+        ({"settings": TracingSettings(depth=5)}, 0, []),
     ],
 )
 def test_settings_of_ray_tracing_without_effect_are_named(

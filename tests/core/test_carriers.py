@@ -188,7 +188,7 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:
-    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(reflection=False, max_depth=0))
+    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(reflection=False, depth=0))
     rx = np.stack([receiver.position_m for receiver in flat.receivers])
     distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
     loss = 20 * np.log10(speed_of_light / flat.carriers_hz / (4 * np.pi * distance))
@@ -214,7 +214,7 @@ def test_reflections_equal_a_trace_at_the_rows_carrier(
     make: Callable[[Record], Record], flat: Record, room: Path, tmp_path: Path
 ) -> None:
     record = make(flat)
-    options, rows = TraceOptions(max_depth=2, transmission=True, rays=20000), np.arange(9)
+    options, rows = TraceOptions(depth=2, transmission=True, rays=20000), np.arange(9)
     assert record.carriers_hz is not None
     carriers, tx = record.carriers_hz[rows], record.tx_pos_m[rows]
     tracer = RayTracer(room, instrument_of(record.at_carrier(2.4e9)), options)
@@ -230,7 +230,7 @@ def test_reflections_equal_a_trace_at_the_rows_carrier(
 
 
 def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -> None:
-    tracer = RayTracer(room, instrument_of(flat.at_carrier(LOW)), TraceOptions(max_depth=2, rays=20000))
+    tracer = RayTracer(room, instrument_of(flat.at_carrier(LOW)), TraceOptions(depth=2, rays=20000))
     traced = tracer.trace(flat.tx_pos_m, carriers_hz=np.full(len(flat), 100 * LOW))
     here = recompute(traced, tracer.scene)
     assert here.carriers_hz is None
@@ -241,7 +241,7 @@ def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -
 
 
 def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
-    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["max_depth=1", "rays=20000"])
+    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["depth=1", "rays=20000"])
     stored = load_trace(run.folder / "paths.npz")
     np.testing.assert_array_equal(stored.carriers_hz, flat.carriers_hz)
     read, again = read_run(run.folder), open_run(run.folder, flat)

@@ -239,7 +239,7 @@ def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) ->
     test = record.official[1]
     score = {}
     for name in ("stated", "corrected"):
-        tracer = RayTracer(folder / name, instrument_of(record), TraceOptions(transmission=True, max_depth=3))
+        tracer = RayTracer(folder / name, instrument_of(record), TraceOptions(transmission=True, depth=3))
         score[name] = np.median(task_of(record).score(tracer(record.tx_pos_m[test])[0], record.observation[0, test]))
     assert score["corrected"] > score["stated"] + 20
     from sionna import rt
@@ -302,7 +302,7 @@ def test_new_receivers_decide_where_receivers_are_held_out(tmp_path: Path) -> No
     places = [[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0], [2.0, 3.9, 1.5]]
     places.append([4.5, 0.6, 2.3])
     receivers = tuple(replace(one.receivers[0], name=f"rx{k}", position_m=np.array(p)) for k, p in enumerate(places))
-    tracer = RayTracer(true, PowerInstrument(receivers, np.array([CARRIER_HZ])), TraceOptions(max_depth=2, rays=4096))
+    tracer = RayTracer(true, PowerInstrument(receivers, np.array([CARRIER_HZ])), TraceOptions(depth=2, rays=4096))
     observed = tracer(one.tx_pos_m) - 40.0
     record = replace(one, receivers=receivers, observation=observed.astype(np.float32))
     scene, split = stated_scene(tmp_path / "scene"), make_splits(record, "receiver:0")[0]

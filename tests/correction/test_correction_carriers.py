@@ -41,7 +41,7 @@ def strengths(scene: Path, count: int, seed: int = 0) -> Record:
             frequencies_hz=np.array([carrier_hz]),
             official=None,
         )
-        tracer = RayTracer(scene, instrument_of(here), TraceOptions(transmission=True, max_depth=2, rays=4096))
+        tracer = RayTracer(scene, instrument_of(here), TraceOptions(transmission=True, depth=2, rays=4096))
         parts.append(replace(here, observation=tracer(positions).astype(np.float32)))
         carriers += [carrier_hz] * each
     return Record(
@@ -116,7 +116,7 @@ def test_a_carrier_without_rows_is_predicted_better(corrected: Any) -> None:
     spread = {}
     for name in ("stated", "corrected"):
         at = replace(record, carriers_hz=None, frequencies_hz=np.array([CARRIERS_HZ[1]]))
-        tracer = RayTracer(folder / name, instrument_of(at), TraceOptions(transmission=True, max_depth=2, rays=4096))
+        tracer = RayTracer(folder / name, instrument_of(at), TraceOptions(transmission=True, depth=2, rays=4096))
         spread[name] = np.std(tracer(record.tx_pos_m[split.test])[0] - record.observation[0, split.test])
     # Of some twenty rows; with seeds 0 to 4 of the positions it is 0.10 to 0.40.
     assert spread["corrected"] < 0.5 * spread["stated"]

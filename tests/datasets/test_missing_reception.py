@@ -21,7 +21,7 @@ from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 
-DIRECT = TraceOptions(reflection=False, max_depth=0)
+DIRECT = TraceOptions(reflection=False, depth=0)
 ROWS, TRAINED = 12, 8
 GATEWAYS_M = {"near": (0.4, 0.5, 2.1), "far": (4.5, 3.4, 2.3)}
 
@@ -89,7 +89,7 @@ def test_data_without_any_received_training_row_are_refused_before_anything_is_d
 
 def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path, room: Path, tmp_path: Path) -> None:
     """It is known only from the paths."""
-    nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, max_depth=1)
+    nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, depth=1)
     (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match="no training row is both received and reached by a path"):
         train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=nothing)

@@ -31,7 +31,7 @@ SINGLE_M = 1e-5
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("traced")
     room = make_scene(flat_folder / "layout.csv", out / "room", height_m=2.7).folder
-    options = TraceOptions(max_depth=2)
+    options = TraceOptions(depth=2)
     return train(flat_folder, out / "run", "ray-tracing", scene=room, settings=options).folder
 
 

@@ -66,7 +66,7 @@ def both(
     rng = np.random.default_rng(5)
     scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
     own = receiver((30, 20, 10))
-    options = TraceOptions(max_depth=2, transmission=True, rays=4096)
+    options = TraceOptions(depth=2, transmission=True, rays=4096)
     how = TracedOptions(options, pattern_degree=2, materials=request.param, planes=True)
     traced = TracedField(scene, transmitters(BATCH), own, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}

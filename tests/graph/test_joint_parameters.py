@@ -32,7 +32,7 @@ import mitsuba as mi
 
 ARRAY_M = planar_array(4, 4, 0.16)
 BAND_HZ = FREQUENCY_HZ + np.linspace(-10e6, 10e6, 4)
-OPTIONS = TraceOptions(max_depth=1, rays=4096)
+OPTIONS = TraceOptions(depth=1, rays=4096)
 TRUE_PERMITTIVITY, START_PERMITTIVITY = BELOW_1_GHZ["concrete"][0], 4.5
 PERMITTIVITY = "material.itu_concrete.permittivity"
 ONE_REFLECTION = ("traced.depth=1", "traced.reflections=1", "traced.transmission=false", "traced.rays=4096")

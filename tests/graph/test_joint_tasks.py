@@ -68,7 +68,7 @@ def measured(task: str, scene: Path, antennas: int = 1, depth: int = 2) -> Recor
     empty = np.zeros((2, len(tx), *shape), np.complex64 if task == "csi" else np.float32)
     hz = BAND_HZ if task == "csi" else np.array([HZ])
     record = Record("room", task, tx, receivers, empty, frequencies_hz=hz)
-    paths = trace_paths(open_scene(scene, HZ), tx, receivers, TraceOptions(max_depth=depth, rays=1 << 12)).paths
+    paths = trace_paths(open_scene(scene, HZ), tx, receivers, TraceOptions(depth=depth, rays=1 << 12)).paths
     seen = instrument_of(record).observe(paths)
     if task == "rssi":
         seen = seen + np.array([[3.0], [-8.0]])  # the receivers' units differ

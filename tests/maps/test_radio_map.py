@@ -166,7 +166,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
 
 def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
-    given: dict[str, Any] = {"scene": scene, "settings": ["max_depth=0", "rays=1024"]}
+    given: dict[str, Any] = {"scene": scene, "settings": ["depth=0", "rays=1024"]}
     found = radio_map(wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given), step_m=0.4, height_m=1.3)
     reached = ~np.isnan(found["k_factor_db"][0].values)
     # The line of sight alone: no spread, an infinite K-factor.
@@ -183,7 +183,7 @@ def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
     room: tuple[Path, Record], law: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene, record = room
-    given: dict[str, Any] = {"scene": scene, "settings": ["max_depth=0"]}
+    given: dict[str, Any] = {"scene": scene, "settings": ["depth=0"]}
     run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
     low, high = (
         float(end.z)
@@ -217,7 +217,7 @@ def test_map_above_a_scene_without_a_ceiling_is_told(
     parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
     assert len(parts) < len(SHOEBOX)
     (tmp_path / "open").mkdir()
-    given: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["max_depth=0"]}
+    given: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
     run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
     radio_map(run, step_m=2.0, height_m=20.0)
     assert "height 20 m: outside of the scene" in caplog.text

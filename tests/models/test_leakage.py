@@ -29,7 +29,7 @@ SETTINGS = {
     "fire": (*STEPS, "width=8"),
     "optml": (*STEPS, "max_paths=2"),
     "r2f2": ("max_paths=2",),
-    "ray-tracing": ("rays=1000", "max_depth=1"),
+    "ray-tracing": ("rays=1000", "depth=1"),
 }
 """Settings of short fits; the others have none that matter."""
 TASK = {"ray-tracing": "rssi", "hybrid": "rssi", "nerf2": "rssi", "wrf-gs+": "spectrum"}

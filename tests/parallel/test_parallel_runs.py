@@ -106,7 +106,7 @@ def test_parallel_prediction_of_a_field_equals_serial(
 
 def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """The number of rays is chosen by the search, which uses all positions."""
-    options = TraceOptions(max_depth=1, rays="auto")
+    options = TraceOptions(depth=1, rays="auto")
     serial = train(flat, tmp_path / "serial", "ray-tracing", scene=room, settings=options).folder
     lossy = Lossy(two, tmp_path)
     parallel = train(flat, tmp_path / "parallel", "ray-tracing", scene=room, settings=options, scheduler=lossy).folder
@@ -123,7 +123,7 @@ def test_parallel_trace_of_random_paths_equals_serial(
     """Diffuse reflections are searched from receivers, diffraction from transmitters."""
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind in ({"scattering": True}, {"diffraction": True}):
-        options = TraceOptions(max_depth=1, rays=1 << 8, **kind)
+        options = TraceOptions(depth=1, rays=1 << 8, **kind)
         name = next(iter(kind))
         serial = train(flat, tmp_path / f"{name}-serial", "ray-tracing", scene=room, settings=options).folder
         parallel = train(
@@ -152,7 +152,7 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     box = trimesh.creation.box((0.3, 0.3, 0.3))
     box.apply_translation((50.0, 50.0, 1.0))
     box.export(tmp_path / "box.ply")
-    direct = TraceOptions(reflection=False, max_depth=0)
+    direct = TraceOptions(reflection=False, depth=0)
     run = train(
         flat, tmp_path / "run", "ray-tracing", scene=tmp_path / "box.ply", settings=direct, material="concrete"
     ).folder

@@ -155,7 +155,7 @@ def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any
         (flat_folder, {"model": "hybrid", "scene": flat_folder / "room", "antennas": antennas}),
         (
             flat_folder,
-            {"model": "ray-tracing", "scene": flat_folder / "room", "settings": ["max_depth=1", "rays=4096"]},
+            {"model": "ray-tracing", "scene": flat_folder / "room", "settings": ["depth=1", "rays=4096"]},
         ),
         (flat_folder, {"model": "wrf-gs+", "scene": flat_folder / "room", "settings": ["traced.depth=1"]}),
     ]

@@ -181,7 +181,7 @@ def hall(tmp_path: Path) -> str:
 
 
 def test_calibrated_strengths_take_the_mean_gain(law: Record, hall: str, tmp_path: Path) -> None:
-    settings = ["max_depth=1", "calibration=gain", "steps=40", "validate_every=20"]
+    settings = ["depth=1", "calibration=gain", "steps=40", "validate_every=20"]
     run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=settings)
     gain = {k: np.load(run.folder / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)}
     np.testing.assert_allclose(gain[2], np.mean([gain[0], gain[1], gain[3]], axis=0), rtol=1e-6)
@@ -208,7 +208,7 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Reco
 
 
 def test_traced_strengths_take_the_mean_offset(law: Record, hall: str, tmp_path: Path) -> None:
-    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=["max_depth=1"])
+    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=["depth=1"])
     offset_db = np.load(run.folder / "model.npz")["offset_db"]
     assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
 

@@ -71,7 +71,7 @@ def data(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
     rows = np.arange(len(tx))
     split = rows[12:], rows[:12]
     record = Record("room", "spectrum", tx, (ARRAY,), empty, official=split, frequencies_hz=np.array([HZ]))
-    paths = trace_paths(open_scene(rooms["whole"], HZ), tx, ARRAY, TraceOptions(max_depth=2, rays=1 << 13)).paths
+    paths = trace_paths(open_scene(rooms["whole"], HZ), tx, ARRAY, TraceOptions(depth=2, rays=1 << 13)).paths
     spectra = instrument_of(record).observe(paths)
     return write_spectrum_folder(tmp_path_factory.mktemp("data") / "room", replace(record, observation=spectra))
 

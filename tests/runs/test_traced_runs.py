@@ -31,8 +31,8 @@ from wrf_mi.tracing.paths import solve
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer, fit_offsets
 
-DIRECT = TraceOptions(reflection=False, max_depth=0)
-CALIBRATED = TracingSettings(reflection=False, max_depth=0, calibration="gain,patterns", steps=60)
+DIRECT = TraceOptions(reflection=False, depth=0)
+CALIBRATED = TracingSettings(reflection=False, depth=0, calibration="gain,patterns", steps=60)
 FLOAT32_DB = 1e-4
 """Predictions are stored as float32; gains come from float32 amplitudes."""
 
@@ -88,7 +88,7 @@ def test_stored_paths_belong_to_the_record(flat_folder: Path, run: Path) -> None
     record = load(flat_folder)
     np.testing.assert_array_equal(stored.tx_pos_m, record.tx_pos_m)
     assert stored.paths.n_rx == len(record.receivers)
-    assert stored.options == TraceOptions(reflection=False, max_depth=0)
+    assert stored.options == TraceOptions(reflection=False, depth=0)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def test_number_of_rays_is_searched_once_for_a_run(
 
     monkeypatch.setattr(solve, "converged_rays", counted)
     out = train(
-        flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(max_depth=1, rays="auto")
+        flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(depth=1, rays="auto")
     ).folder
     assert len(calls) == 1
     before = read_run(out).metrics
@@ -302,7 +302,7 @@ def test_refused_trace_writes_nothing(
         (["trace", room, flat_folder, "--material", "brick"], "has radio materials of its own"),
         (["trace", room, flat_folder, "--paths", "echo"], "kind of path 'echo': unknown"),
         (["trace", room, flat_folder, "--rays", "many"], "give a whole number"),
-        (["trace", room, flat_folder, "--depth", "99"], "max_depth 99"),
+        (["trace", room, flat_folder, "--depth", "99"], "depth 99"),
     ]:
         status, _, err = call([*arguments, "--out", out], capsys)
         assert status == 2, err
@@ -336,8 +336,8 @@ def test_receiver_that_no_path_reaches_is_named() -> None:
 def test_kinds_of_path_are_switched_one_by_one() -> None:
     options = TraceOptions(**stated_kinds("transmission, diffraction"))
     assert options == TraceOptions(line_of_sight=False, reflection=False, transmission=True, diffraction=True)
-    with pytest.raises(InputError, match="max_reflections -1"):
-        TraceOptions(max_reflections=-1)
+    with pytest.raises(InputError, match="reflections -1"):
+        TraceOptions(reflections=-1)
 
 
 def test_reflections_bound_the_paths_of_the_command(
@@ -350,7 +350,7 @@ def test_reflections_bound_the_paths_of_the_command(
         assert (load_trace(tmp_path / str(bound) / "paths.npz").paths.interactions == 1).sum(axis=1).max() == bound
     status, _, err = call([*asked[:5], "--reflections", "-3", "--out", tmp_path / "out"], capsys)
     assert status == 2
-    assert "max_reflections -3" in err
+    assert "reflections -3" in err
 
 
 def test_tracer_predicts_free_space_loss(flat_folder: Path, room: Path) -> None:
@@ -366,7 +366,7 @@ def test_walls_that_nothing_passes_are_suspected(
     walls = "x,y\n0,0\n2.5,0\n2.5,4\n2.5,0\n5,0\n5,4\n0,4\n0,0\n"
     (tmp_path / "walls.csv").write_text(walls)
     divided = make_scene(tmp_path / "walls.csv", tmp_path / "divided", height_m=2.7).folder
-    passed = replace(DIRECT, transmission=True, max_depth=1)
+    passed = replace(DIRECT, transmission=True, depth=1)
     for name, scene, options in (("off", divided, DIRECT), ("on", divided, passed), ("open", room, DIRECT)):
         caplog.clear()
         train(flat_folder, tmp_path / name, "ray-tracing", scene=scene, settings=options)

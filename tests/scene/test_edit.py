@@ -61,7 +61,7 @@ def test_moved_part_gives_the_channels_of_the_room_measured_anew(scene: Path, tm
     edited = edit_scene(scene, tmp_path / "edited", [Move((CABINET,), SHIFT_M, TURN_DEG)])
     receiver = Receiver("station", np.array(random_room(103).station_m), np.array(UPRIGHT))
     instrument = ChannelInstrument((receiver,), np.array([2.44e9]))
-    options = TraceOptions(transmission=True, max_depth=2, rays=1 << 14)
+    options = TraceOptions(transmission=True, depth=2, rays=1 << 14)
     positions = np.array([[1.1, 0.5, 0.9], [2.9, 3.0, 1.1], [5.0, 1.5, 0.7], [0.4, 1.8, 1.3]])
     before, after, new = (RayTracer(folder, instrument, options)(positions) for folder in (scene, edited, true))
     scale = np.abs(new).max()

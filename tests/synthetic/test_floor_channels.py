@@ -111,7 +111,7 @@ def ends_of(users: np.ndarray) -> list[Receiver]:
     return [Receiver(str(row), place, np.array([0.0, 0, 0, 1])) for row, place in enumerate(users)]
 
 
-OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
+OPTIONS = TraceOptions(depth=2, rays=1 << 14)
 
 
 def test_specular_channels_are_reciprocal(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_channels_are_those_traced_to_each_element(tmp_path: Path) -> None:
 def test_ray_tracing_of_the_same_floor_explains_most_of_the_channel(record: Record, tmp_path: Path) -> None:
     """By another way: rays from the other side, waves by their arrival; what it lacks is diffuse reflection."""
     write_scene(tmp_path, PLACES["flat"]().parts, "test")
-    options = TraceOptions(transmission=True, max_depth=SMALL.depth, max_reflections=SMALL.reflections, rays=SMALL.rays)
+    options = TraceOptions(transmission=True, depth=SMALL.depth, reflections=SMALL.reflections, rays=SMALL.rays)
     tracer = RayTracer(tmp_path, instrument_of(record), options)
     reported = tracer(record.tx_pos_m)
     assert reported.shape == record.observation.shape

@@ -121,7 +121,7 @@ def test_strengths_below_the_sensitivity_are_not_received(traced: TraceResult) -
 
 
 def test_specular_paths_are_those_of_a_search_without_scattering(traced: TraceResult, scene_folder: Path) -> None:
-    options = TraceOptions(transmission=True, max_depth=3, max_reflections=1, rays=SMALL.rays, seed=SMALL.seed)
+    options = TraceOptions(transmission=True, depth=3, reflections=1, rays=SMALL.rays, seed=SMALL.seed)
     alone = trace_paths(open_scene(scene_folder, CARRIER_HZ), traced.tx_pos_m, traced.receivers, options).paths
     specular = traced.paths.select(~(traced.paths.interactions == 2).any(axis=1))
     np.testing.assert_array_equal(specular.length_m, alone.length_m)

@@ -73,10 +73,10 @@ def test_specular_signals_are_reciprocal(tmp_path: Path) -> None:
     scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
     tx = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7]])
     ends = [Receiver(str(i), place, np.array([0.0, 0.0, 0.0, 1.0])) for i, place in enumerate(tx)]
-    options = TraceOptions(max_depth=2, rays=1 << 14)
+    options = TraceOptions(depth=2, rays=1 << 14)
     # The array's antennas are polarised along its y axis, which is up to a thousandth.
     there = trace_paths(scene, tx, RECEIVER, options).paths
-    back = trace_paths(scene, RECEIVER.position_m, ends, TraceOptions(max_depth=2, rays=1 << 14)).paths
+    back = trace_paths(scene, RECEIVER.position_m, ends, TraceOptions(depth=2, rays=1 << 14)).paths
     expected = antenna_csi(there, RECEIVER, array_m, FREQUENCY_HZ)[0, ..., 0]
     found = array_channels(back, RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
@@ -86,7 +86,7 @@ def test_scattered_waves_come_from_their_last_point(tmp_path: Path) -> None:
     write_scene(tmp_path, measured_parts(0.0, 0), "test")
     scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
     ends = [Receiver("0", np.array([2.0, 3.0, 1.2]), np.array([0.0, 0.0, 0.0, 1.0]))]
-    options = TraceOptions(scattering=True, max_depth=1, rays=1 << 8)
+    options = TraceOptions(scattering=True, depth=1, rays=1 << 8)
     paths = trace_paths(scene, RECEIVER.position_m, ends, options).paths
     one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
     found = array_channels(one, RECEIVER, array_m, FREQUENCY_HZ)[0, :, 0]

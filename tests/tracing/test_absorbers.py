@@ -22,7 +22,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 BRICK = '<bsdf type="diffuse" id="mat-itu_brick"/>'
 SOAK = '<bsdf type="absorber-radio-material" id="mat-soak"><rgb name="color" value="0.1 0.2 0.3"/></bsdf>'
-OPTIONS = TraceOptions(max_depth=2, transmission=True)
+OPTIONS = TraceOptions(depth=2, transmission=True)
 
 
 def absorbing(path: Path) -> Path:

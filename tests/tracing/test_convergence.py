@@ -24,7 +24,7 @@ from wrf_mi.tracing.convergence import choose_options, remainder
 
 RX = receiver([3.1, 2.2, 1.5])
 PLAIN = TraceOptions()
-FINE = replace(PLAIN, max_depth=6, rays=1 << 16)
+FINE = replace(PLAIN, depth=6, rays=1 << 16)
 """Three interactions more than for a target of 1.5 dB; each adds a third of the previous change."""
 
 
@@ -44,7 +44,7 @@ def test_error_is_within_the_target(target_db: float, shoebox: Any, fine: np.nda
     """Compared with a much finer trace, also at positions outside the sample."""
     choice = choose_options(shoebox, inside(10)[:5], RX, target_db, PLAIN, kinds=())
     assert choice.reached
-    assert choice.options.max_depth < FINE.max_depth
+    assert choice.options.depth < FINE.depth
     coarse = rssi_dbm(trace_paths(shoebox, inside(10), RX, choice.options).paths)
     assert np.abs(coarse - fine).max() <= target_db
 
@@ -52,7 +52,7 @@ def test_error_is_within_the_target(target_db: float, shoebox: Any, fine: np.nda
 def test_smaller_error_takes_more_depth(shoebox: Any) -> None:
     # Two positions as in other tests: kernels of a single one are others, and compiling them takes seconds.
     rough, good = (choose_options(shoebox, inside(2), RX, db, PLAIN, kinds=()) for db in (8.0, 0.5))
-    assert rough.options.max_depth < good.options.max_depth
+    assert rough.options.depth < good.options.depth
     assert good.error_db < rough.error_db
 
 
@@ -125,8 +125,8 @@ def test_error_of_spectra_is_within_the_target(shoebox: Any) -> None:
     assert by_power.spectrum_error is None
     assert all(trial.spectrum is None for trial in by_power.trials)
     assert choice.reached
-    assert choice.options.max_depth >= by_power.options.max_depth
-    fine = replace(FINE, max_depth=choice.options.max_depth + 1)
+    assert choice.options.depth >= by_power.options.depth
+    fine = replace(FINE, depth=choice.options.depth + 1)
     coarse, true = (instrument.observe(trace_paths(shoebox, here, RX, o).paths)[0] for o in (choice.options, fine))
     error = np.linalg.norm(coarse - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
     assert error.max() <= 10 ** (target_db / 20) - 1

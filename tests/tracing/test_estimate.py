@@ -26,10 +26,10 @@ def closed(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.mark.parametrize(
     "options",
     [
-        TraceOptions(max_depth=3, rays=64),
-        TraceOptions(max_depth=4, max_reflections=2, transmission=True, rays=64),
-        TraceOptions(max_depth=4, max_reflections=0, transmission=True, rays=64),
-        TraceOptions(max_depth=2, reflection=False, rays=64),
+        TraceOptions(depth=3, rays=64),
+        TraceOptions(depth=4, reflections=2, transmission=True, rays=64),
+        TraceOptions(depth=4, reflections=0, transmission=True, rays=64),
+        TraceOptions(depth=2, reflection=False, rays=64),
     ],
 )
 def test_estimate_counts_the_hits_of_the_search(
@@ -48,8 +48,8 @@ def test_estimate_counts_the_hits_of_the_search(
 
 
 def test_search_of_hours_is_refused_before_it_begins(closed: Any) -> None:
-    begun, options = time.perf_counter(), TraceOptions(max_depth=12, rays=1 << 24, transmission=True)
-    with pytest.raises(InputError, match=r"12 reflections: about \d+\.\d hours; give a smaller --depth .max_depth, 12"):
+    begun, options = time.perf_counter(), TraceOptions(depth=12, rays=1 << 24, transmission=True)
+    with pytest.raises(InputError, match=r"12 reflections: about \d+\.\d hours; give a smaller --depth .12"):
         solve.trace_paths(closed, inside(3), receiver([4.0, 3.0, 2.0]), options)
     assert time.perf_counter() - begun < IMMEDIATE_S
 
@@ -57,7 +57,7 @@ def test_search_of_hours_is_refused_before_it_begins(closed: Any) -> None:
 def test_search_of_seconds_is_announced_once(
     closed: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    options, prepared = TraceOptions(max_depth=2, rays=64), solve.Prepared(closed)
+    options, prepared = TraceOptions(depth=2, rays=64), solve.Prepared(closed)
     monkeypatch.setattr(search, "SECONDS_PER_HIT", 20.0 / search.hits(options, 64))
     for seed in range(2):
         solve.trace_paths(closed, inside(3, seed), receiver([4.0, 3.0, 2.0]), options, prepared=prepared)

@@ -16,7 +16,7 @@ from wrf_mi.receivers import rssi_dbm
 from wrf_mi.tracing import TraceOptions, power_map, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 
-OPTIONS = TraceOptions(transmission=True, max_depth=1)
+OPTIONS = TraceOptions(transmission=True, depth=1)
 POSITIONS, CENTRE = inside(5), (3.0, 2.0, 1.5)
 
 
@@ -28,7 +28,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def powers(scene: Any, positions: FloatArray = POSITIONS, **changed: Any) -> FloatArray:
     given = {"receivers": [receiver(CENTRE)], "options": OPTIONS, "tx_antenna": Antenna(), **changed}
-    return power_map.traced_powers(scene, Prepared(scene), positions, **given)
+    return power_map.traced_powers(Prepared(scene), positions, **given)
 
 
 def test_kept_powers_are_those_traced(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,7 +45,7 @@ def test_another_scene_position_antenna_or_depth_is_traced(tmp_path: Path, cache
     powers(scene)
     powers(scene, POSITIONS[:4])
     powers(scene, tx_antenna=Antenna("dipole"))
-    powers(scene, options=replace(OPTIONS, max_reflections=0))
+    powers(scene, options=replace(OPTIONS, reflections=0))
     powers(scene, receivers=[receiver(CENTRE, "other")])
     higher = {name: (kind, mesh.copy().apply_translation([0, 0, 1e-3])) for name, (kind, mesh) in SHOEBOX.items()}
     powers(room(tmp_path / "two", higher))

@@ -16,7 +16,7 @@ from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
 
 RECEIVER = Receiver("anchor", np.array([1.0, 1.1, 2.2]), np.array([0, 0, 0, 1.0]))
-OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 15)
+OPTIONS = TraceOptions(transmission=True, depth=3, rays=1 << 15)
 POSITIONS = np.random.default_rng(0).uniform([0.4, 0.4, 0.4], [LENGTH - 0.4, WIDTH - 0.4, HEIGHT - 0.4], (40, 3))
 AT_EDGES = 0.005
 """Share of paths that meet a surface within the rounding of its single-precision corners from an edge."""

@@ -34,7 +34,7 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
 
-OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
+OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 FILE_M = 1e-6
 """Corners of mesh files are float32: 5e-7 m at 6 m, and as much again after a reflection."""
 GAIN = 3e-6
@@ -91,7 +91,7 @@ def strongest(traced: TracedField, parameters: dict[str, Any]) -> tuple[np.ndarr
 @pytest.mark.parametrize(("shift_m", "tilted"), [(SHIFT_M, False), (0.0, True), (-SHIFT_M, True)])
 def test_paths_at_moved_planes_are_those_of_a_moved_mesh(tmp_path: Path, shift_m: float, tilted: bool) -> None:
     """Lengths and gains of reflections at a shifted and tilted ceiling, from a mesh of it and from parameters."""
-    options, array = TracedOptions(replace(OPTIONS, max_depth=1)), receiver((30, 20, 10))
+    options, array = TracedOptions(replace(OPTIONS, depth=1)), receiver((30, 20, 10))
     stated = TracedField(room(tmp_path / "stated", CEILING), transmitters(4), array, options)
     there = TracedField(room(tmp_path / "there", ceiling(shift_m, tilted)), transmitters(4), array, options)
     length, gain = strongest(stated, moved_values(stated.scene, shift_m, tilted))
@@ -146,7 +146,7 @@ def test_fixed_planes_take_no_kernels(scene: Any) -> None:
 
 def test_each_surface_has_a_material(scene: Any) -> None:
     """A surface's material changes only the paths that meet the surface."""
-    options = TracedOptions(replace(OPTIONS, max_depth=1), materials="surface")
+    options = TracedOptions(replace(OPTIONS, depth=1), materials="surface")
     traced = TracedField(scene, transmitters(2), receiver(), options)
     names = [name.partition("/")[0] for name in traced.slabs.names]
     assert sorted(names) == sorted({**WALLS, **CEILING, **PARTITION})
@@ -193,7 +193,7 @@ def trainer_of(record: Record, scene: Any, parts: str, *settings: str) -> Traine
 
 def test_training_finds_a_lowered_and_tilted_ceiling(scene: Any, tmp_path: Path) -> None:
     tx, model = transmitters(12, seed=3), CsiReceiver(2, 4, (FREQUENCY_HZ, 1.02 * FREQUENCY_HZ))
-    options = TracedOptions(replace(OPTIONS, max_depth=1), planes=True)
+    options = TracedOptions(replace(OPTIONS, depth=1), planes=True)
     true = TracedField(room(tmp_path, {**WALLS, **ceiling(-0.02, True), **PARTITION}), tx, receiver(), options)
     observed = model(true({}), None).numpy().reshape(len(tx), -1, 2).astype(float) @ [1, 1j]
     record = record_of((receiver(),), tx, observed[None].astype(np.complex64), "csi")
@@ -262,7 +262,7 @@ def test_planes_have_no_learning_rate_by_default(scene: Any) -> None:
 
 def test_corrected_scene_has_moved_planes_and_stays_closed(scene: Any, tmp_path: Path) -> None:
     """Its paths are those of the parameters; the corners of the room stay shared."""
-    rng, options = np.random.default_rng(2), TracedOptions(replace(OPTIONS, max_depth=1))
+    rng, options = np.random.default_rng(2), TracedOptions(replace(OPTIONS, depth=1))
     traced = TracedField(scene, transmitters(3), receiver((30, 20, 10)), replace(options, planes=True))
     count = len(traced.surfaces.normal)
     values = {SHIFT: rng.normal(0, 0.02, count), TILT: rng.normal(0, 0.01, (count, 2))}

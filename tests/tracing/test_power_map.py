@@ -10,7 +10,7 @@ import trimesh
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import Receiver, Record
-from wrf_mi.tracing import open_scene
+from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.power_map import PowerMap, TracedPower, trace_map
 
 FREQUENCY_HZ = 2.44e9
@@ -59,7 +59,7 @@ def test_map_excludes_points_inside_closed_solids(tmp_path: Path, caplog: pytest
     position = np.array([[0.5, 0.5, 1.3], [5.5, 5.5, 1.3], [0.5, 5.5, 1.3]])
     record = Record("made", "rssi", position, receivers, np.zeros((3, 3), np.float32))
     for smooth_m in (0.0, 0.3):
-        traced = trace_map(scene, record, 0.25, smooth_m, 1, 1)
+        traced = trace_map(scene, record, 0.25, smooth_m, TraceOptions(transmission=True, depth=1))
         x, y = np.meshgrid(traced.x_m, traced.y_m, indexing="ij")
         within = (np.abs(x - 3.05) < 0.45) & (np.abs(y - 2.85) < 0.45)
         around = (np.abs(x - 3.05) < 0.9) & (np.abs(y - 2.85) < 0.9) & ~within

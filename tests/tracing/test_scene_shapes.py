@@ -112,7 +112,7 @@ def test_rectangle_is_traced_like_its_mesh(tmp_path: Path) -> None:
     for path in (as_mesh, as_shape):
         scene = open_scene(path, FREQUENCY_HZ, THICKNESS_M)
         assert list(scene.objects) == [*SHOEBOX, "plate"]
-        traced.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions(max_depth=2)).paths)
+        traced.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions(depth=2)).paths)
     np.testing.assert_allclose(traced[1].length_m, traced[0].length_m, atol=1e-9)
     np.testing.assert_allclose(traced[1].gain, traced[0].gain, atol=1e-6 * np.abs(traced[0].gain).max())
 

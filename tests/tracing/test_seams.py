@@ -68,7 +68,7 @@ def heard(scene: Any, sources: Any, targets: Any, depth: int, turned_rad: float 
     """Paths from transmitters [n, 3] to receivers [m, 3] of the rooms before they were turned."""
     matrix = turn(turned_rad)[:3, :3].T
     devices = [receiver(np.asarray(p) @ matrix, f"rx{k}") for k, p in enumerate(targets)]
-    options = TraceOptions(max_depth=depth, rays=1 << 15)
+    options = TraceOptions(depth=depth, rays=1 << 15)
     return trace_paths(scene, np.asarray(sources) @ matrix, devices, options, gains=False, check=False).paths
 
 
@@ -138,7 +138,7 @@ def test_no_path_over_a_floor_leads_under_the_wall_on_it(tmp_path: Path):
     scene = room(tmp_path, parts)
     places = np.array([*product((0.5, 1.0, 1.5), (0.5, 1.0, 1.7), (0.5, 1.0))])
     targets = [receiver(p, f"rx{k}") for k, p in enumerate(places * [-1, 1, 1] + [4, 0, 0])]
-    assert not len(trace_paths(scene, places, targets, TraceOptions(max_depth=2), check=False).paths)
+    assert not len(trace_paths(scene, places, targets, TraceOptions(depth=2), check=False).paths)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ PAIRS = (
 @pytest.mark.parametrize(("source", "target"), PAIRS)
 def test_reflections_in_an_edge_count_once(shoebox: Any, source: list[float], target: list[float]):
     """With the gains of positions nearby, and in both directions the same paths."""
-    options = TraceOptions(max_depth=3)
+    options = TraceOptions(depth=3)
     paths = trace_paths(shoebox, [source], receiver(target), options).paths
     np.testing.assert_allclose(paths.length_m, image_lengths(np.array(source), np.array(target), 3), atol=EXACT_M)
     near = trace_paths(shoebox, [np.add(source, [7e-4, 1e-3, 4e-4])], receiver(target), options).paths
@@ -181,7 +181,7 @@ def test_reflections_on_the_diagonal_of_a_rectangle_are_not_lost(shoebox: Any):
         source = np.hstack([at, np.full((24, 1), 1.0)])
         for target in (np.add(source, [0, 0, 1.0]), np.add(source[::-1], [0, 0, 0.5])):
             for row in range(0, 24, 5):
-                paths = trace_paths(shoebox, source[[row]], receiver(target[row]), TraceOptions(max_depth=1)).paths
+                paths = trace_paths(shoebox, source[[row]], receiver(target[row]), TraceOptions(depth=1)).paths
                 assert len(paths) == 7 - (np.abs(source[row] - target[row]) < 1e-9).all()
 
 
@@ -200,7 +200,7 @@ def test_places_on_a_grid_hear_what_their_neighbours_hear(tmp_path: Path):
     x, y = np.meshgrid(np.arange(0.5, LONG, 0.5), np.arange(0.5, WIDE, 1.0))
     grid = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
     grid = grid[grid[:, 0] != WALL]
-    options = TraceOptions(max_depth=3, transmission=True, rays=1 << 15)
+    options = TraceOptions(depth=3, transmission=True, rays=1 << 15)
     rng = np.random.default_rng(1)
 
     def power_db(places: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -221,7 +221,7 @@ def test_paths_of_a_pair_are_the_same_alone_in_a_batch_and_in_any_order(tmp_path
     parts: Parts = {**SHOEBOX, "board": ("itu_brick", sheet(1, 2.6, (0.4, 1.1), (0.6, 1.2)))}
     scene, rng = room(tmp_path, parts), np.random.default_rng(4)
     places = rng.uniform([0.3, 0.3, 0.3], [LENGTH - 0.3, WIDTH - 0.3, HEIGHT - 0.3], (7, 3))
-    options = TraceOptions(max_depth=4, transmission=True, rays=500)
+    options = TraceOptions(depth=4, transmission=True, rays=500)
     tx, rx = places[:2], [receiver(p, f"rx{k}") for k, p in enumerate(places[2:])]
     batch = trace_paths(scene, tx, rx, options).paths
     turned = trace_paths(scene, tx[::-1], rx[::-1], options).paths
@@ -237,7 +237,7 @@ def test_paths_of_a_pair_are_the_same_alone_in_a_batch_and_in_any_order(tmp_path
 
 
 def test_direct_path_is_traced_at_any_distance_but_none(shoebox: Any):
-    options = TraceOptions(max_depth=1)
+    options = TraceOptions(depth=1)
     for distance in (9e-3, 1e-3, 1e-5):
         paths = trace_paths(shoebox, [[2.0, 2, 1]], receiver([2.0 + distance, 2, 1]), options).paths
         assert len(paths) == 7
@@ -340,7 +340,7 @@ JUNCTIONS: Mapping[str, tuple[Parts, list[float], list[float], int]] = {
 def test_paths_at_junctions_are_those_of_the_other_direction(tmp_path: Path, name: str):
     parts, a, b, least = JUNCTIONS[name]
     scene = room(tmp_path, parts)
-    options = TraceOptions(max_depth=3, max_reflections=1, transmission=True)
+    options = TraceOptions(depth=3, reflections=1, transmission=True)
     there, back = (trace_paths(scene, [x], receiver(y), options).paths for x, y in ((a, b), (b, a)))
     assert len(there) == len(back) >= least
     for unit in (there.departure, there.arrival):
@@ -362,7 +362,7 @@ def test_halls_of_round_sizes_do_not_leak(tmp_path: Path):
         hall = trimesh.creation.box(bounds=[(0, 0, 0), size])
         scene = room(tmp_path / str(number), {"hall": ("itu_metal", hall), "wall": ("itu_metal", wall)})
         for a, b in ((source, target), (target, source)):
-            paths = trace_paths(scene, [a], receiver(b), TraceOptions(max_depth=3), gains=False, check=False).paths
+            paths = trace_paths(scene, [a], receiver(b), TraceOptions(depth=3), gains=False, check=False).paths
             assert not len(paths)
 
 
@@ -382,5 +382,5 @@ def test_reflections_in_edges_of_turned_rooms_count_once(tmp_path: Path):
     scene = room(tmp_path, {"room": ("itu_metal", box.apply_transform(matrix))})
     for source, target in (([1, 1, 0.75], [3, 1, 0.75]), ([1, 1, 0.75], [2, 2, 1.5]), ([2, 1, 1.5], [3, 2, 1.5])):
         ends = trimesh.transform_points(np.array([source, target], float), matrix)
-        options = TraceOptions(max_depth=3)
+        options = TraceOptions(depth=3)
         assert len(trace_paths(scene, ends[:1], receiver(ends[1]), options, gains=False).paths) == 63

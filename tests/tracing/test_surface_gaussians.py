@@ -42,7 +42,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def traced(scene: Any, depth: int = 2) -> TracedField:
-    return TracedField(scene, transmitters(6), receiver(), TracedOptions(TraceOptions(max_depth=depth, rays=4096)))
+    return TracedField(scene, transmitters(6), receiver(), TracedOptions(TraceOptions(depth=depth, rays=4096)))
 
 
 def gain(side: TracedField, parameters: dict[str, Any], rows: Any | None = None) -> np.ndarray:
@@ -166,14 +166,14 @@ def test_calibration_learns_a_patch_that_no_surface_has(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     tx = np.column_stack([rng.uniform(0.5, 5.5, 120), rng.uniform(0.5, 4.5, 120), rng.uniform(0.8, 1.2, 120)])
     one, hz = (Receiver("rx", np.array([3.0, 2.4, 0.5]), upright),), FREQUENCY_HZ * np.array([1, 1.02, 1.05])
-    options = TraceOptions(max_depth=1, rays=4096)
+    options = TraceOptions(depth=1, rays=4096)
     channel = RayTracer(write_xml(tmp_path / "true", patched), ChannelInstrument(one, hz), options)(tx)[0]
     official = np.arange(90), np.arange(90, 120)
     record = Record("room", "csi", tx, one, channel[None].astype(np.complex64), official=official, frequencies_hz=hz)
     scene = write_xml(tmp_path / "stated", {**WALLS, **CEILING})
     found = {}
     for parts in ("gain,materials", "gain,materials,surface"):
-        settings = [f"calibration={parts}", "max_depth=1", "rays=4096", "transmission=false", "steps=300"]
+        settings = [f"calibration={parts}", "depth=1", "rays=4096", "transmission=false", "steps=300"]
         run = wrf_mi.train(record, tmp_path / parts, "ray-tracing", scene=scene, settings=settings)
         report = run.predict(tx[90:], 0).mean
         found[parts] = float(np.median(task_of(record).score(report, record.observation[0, 90:])))

@@ -26,7 +26,7 @@ from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.trainer import Trainer
 
 HZ = 920e6
-OPTIONS = TraceOptions(max_depth=1, rays=1 << 12)
+OPTIONS = TraceOptions(depth=1, rays=1 << 12)
 ARRAY_M = planar_array(4, 4, 0.16)
 STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # boresight -x, the array's y axis up
 
@@ -125,7 +125,7 @@ def test_cross_polarised_data_warn_and_name_the_option(
 def test_only_cross_polarised_receivers_are_found(scene: Any) -> None:
     tx = places()
     good, bad = array(0, Antenna()), replace(array(0, Antenna(polarization="H")), name="gateway2")
-    traced = trace_paths(scene, tx, [good, bad], TraceOptions(max_depth=0))
+    traced = trace_paths(scene, tx, [good, bad], TraceOptions(depth=0))
     found = cross_polarized(traced, scene)
     assert list(found) == ["gateway2"]
     assert found["gateway2"] > GAIN_DB
@@ -144,7 +144,7 @@ def test_each_receiver_is_traced_with_its_antenna(scene: Any) -> None:
 def test_transmitters_are_traced_with_their_antenna(scene: Any) -> None:
     """Along a horizontal line of sight a horizontal transmitter reaches a horizontal antenna only."""
     tx = np.array([[2.0, 2.4, 1.1]])
-    direct = TraceOptions(max_depth=0)
+    direct = TraceOptions(depth=0)
     gains = {
         (sent, taken): abs(
             trace_paths(scene, tx, array(0, Antenna("iso", taken)), direct, tx_antenna=Antenna("iso", sent)).paths.gain[

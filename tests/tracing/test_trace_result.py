@@ -9,7 +9,13 @@ import pytest
 from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room, write_xml
 
 from wrf_mi.core import Antenna, InputError, Paths, load_paths, save_paths
+from wrf_mi.core.settings import settings_from, with_settings
+from wrf_mi.correction.options import CorrectionOptions
+from wrf_mi.graph.settings import TracedConfig
+from wrf_mi.models.ray_tracing import TracingSettings
+from wrf_mi.models.uplink.r2f2 import PathSettings
 from wrf_mi.tracing import TraceOptions, TraceResult, load_trace, open_scene, recompute, save_trace, trace_paths
+from wrf_mi.tracing.options import SpecularOptions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
@@ -53,6 +59,22 @@ def test_stored_traces_are_read_back(traced: TraceResult, tmp_path: Path):
     assert [r.name for r in read.receivers] == ["rx0", "rx1"]
     np.testing.assert_array_equal(load_paths(tmp_path / "paths.npz").length_m, traced.paths.length_m)
     assert {path.name for path in tmp_path.iterdir()} == {"paths.npz"}
+
+
+@pytest.mark.parametrize("kind", [TracedConfig, CorrectionOptions, PathSettings, TracingSettings])
+def test_settings_of_every_model_with_a_scene_state_the_same_search(kind: type[SpecularOptions]) -> None:
+    """One name and one meaning of depth, reflections, transmission and rays."""
+    for transmission in (True, False):
+        stated = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
+        assert kind(**stated).options == TraceOptions(**stated)
+
+
+def test_former_names_of_depth_and_reflections_are_read() -> None:
+    """Traces and runs of earlier versions state them, and so do scripts."""
+    stated = {"max_depth": 6, "max_reflections": 2, "transmission": True}
+    expected = TraceOptions(depth=6, reflections=2, transmission=True)
+    assert settings_from(TraceOptions, stated, "paths.npz") == expected
+    assert with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()]) == expected
 
 
 def test_selected_transmitters_have_the_paths_of_their_own_trace(traced: TraceResult, scene: Any):

@@ -65,7 +65,7 @@ def test_bare_mesh_needs_a_material(tmp_path: Path, ending: str):
         open_scene(file, FREQUENCY_HZ, material="perfect"),
         [[1.0, 2, 1]],
         receiver([4, 3, 1]),
-        TraceOptions(max_depth=1),
+        TraceOptions(depth=1),
     ).paths
     assert len(paths) == 7
     refused("a mesh has no radio material", file)
@@ -132,7 +132,7 @@ def test_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog
     """Mounted on a wall that the mesh has too far inside."""
     surfaces = in_a_room(tmp_path, sheet(2, 0.7, (2.0, 3.0), (2.0, 3.0)))
     scene = open_scene(tmp_path / "scene.xml", FREQUENCY_HZ)
-    tx, options = [[1.0, 2, 1]], TraceOptions(max_depth=2)
+    tx, options = [[1.0, 2, 1]], TraceOptions(depth=2)
     on, behind, far = (
         trace_paths(scene, tx, receiver([x, 2.5, 1.3]), options).paths.length_m.tolist() for x in (0.0, -2e-3, -0.02)
     )
@@ -166,7 +166,7 @@ def test_antenna_on_a_cabinet_is_traced_from_before_it(tmp_path: Path):
 def test_number_of_rays_for_an_antenna_behind_its_wall_converges_before_it(tmp_path: Path):
     """From behind the wall no ray finds a path, and the smallest number would converge."""
     write_xml(tmp_path, SHOEBOX)
-    tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(max_depth=2, rays="auto")
+    tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
     before, behind = (PowerInstrument((receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
     wanted, found = (RayTracer(tmp_path / "scene.xml", side, options).rays(tx) for side in (before, behind))

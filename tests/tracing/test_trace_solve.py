@@ -149,7 +149,7 @@ def test_gains_at_a_slab_at_normal_incidence(tmp_path: Path):
     scene = room(tmp_path, {"wall": ("itu_brick", sheet(0, 0.0, (-50.0, 50.0), (-50.0, 50.0)))})
     brick = scene.radio_materials["itu_brick"]
     expected = slab(0.1, float(brick.relative_permittivity[0]), float(brick.conductivity[0]))
-    options = replace(UPRIGHT, transmission=True, max_depth=1)
+    options = replace(UPRIGHT, transmission=True, depth=1)
     beside, behind = (trace_paths(scene, [[x, 0.0, 0.0]], receiver([2.0, 0, 0]), options).paths for x in (4.0, -4.0))
     assert beside.interactions.tolist() == [[0], [1]]
     assert behind.interactions.tolist() == [[4]]
@@ -162,15 +162,15 @@ def test_gains_at_a_slab_at_normal_incidence(tmp_path: Path):
 
 def test_paths_pass_walls_with_transmission_only(divided: Any):
     tx, rx = [[1.0, 1.0, 1.0]], receiver([5.0, 1.0, 1.0])
-    closed = trace_paths(divided, tx, rx, replace(UPRIGHT, max_depth=1)).paths
-    opened = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, max_depth=2)).paths
+    closed = trace_paths(divided, tx, rx, replace(UPRIGHT, depth=1)).paths
+    opened = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, depth=2)).paths
     assert (closed.interactions == 1).all()  # over the partition and round it
     straight = opened.length_m == opened.length_m.min()
     assert opened.interactions[straight].tolist() == [[4, 0]]
     np.testing.assert_allclose(opened.vertices_m[straight][0, 0], [3, 1, 1], atol=EXACT_M)
     through = opened.select((opened.interactions == 4).any(axis=1))
     assert {tuple(types) for types in through.interactions} == {(4, 0), (1, 4), (4, 1)}
-    few = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, max_depth=3, max_reflections=1)).paths
+    few = trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=True, depth=3, reflections=1)).paths
     assert (few.interactions == 1).sum(axis=1).max() == 1
 
 
@@ -193,7 +193,7 @@ def test_paths_are_reciprocal(divided: Any, transmission: bool):
 
 def test_paths_of_a_seed_do_not_depend_on_chunks(divided: Any, monkeypatch: pytest.MonkeyPatch):
     tx, rx = inside(6, 5), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 6))]
-    options = replace(UPRIGHT, transmission=True, max_depth=2, rays=1 << 12)
+    options = replace(UPRIGHT, transmission=True, depth=2, rays=1 << 12)
     whole = trace_paths(divided, tx, rx, options).paths
     equal(trace_paths(divided, tx, rx, options).paths, whole)
     monkeypatch.setattr(solve_module, "PAIRS_TOGETHER", 4)
@@ -223,7 +223,7 @@ def test_kinds_that_are_off_are_not_searched(shoebox: Any, empty: Any, monkeypat
     monkeypatch.setattr(solve_module, "sampled_paths", refuse)
     tx, rx = inside(2), receiver([1.0, 1.0, 1.0])
     assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, reflection=False)).paths) == 2
-    assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, max_depth=0)).paths) == 2
+    assert len(trace_paths(shoebox, tx, rx, replace(UPRIGHT, depth=0)).paths) == 2
     assert len(trace_paths(empty, tx, rx, replace(UPRIGHT, scattering=True, rays="auto")).paths) == 2
     with pytest.raises(AssertionError, match="searched"):
         trace_paths(shoebox, tx, receiver([1.2, 0.9, 1.1]), UPRIGHT)  # whose chains are not kept
@@ -256,10 +256,10 @@ def test_rays_are_shot_once_for_a_geometry(shoebox: Any, divided: Any, monkeypat
 
 def test_number_of_rays_converges(shoebox: Any, divided: Any):
     tx, rx = inside(5), receiver([1.0, 1.0, 1.0])
-    found = trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays="auto", max_depth=2))
+    found = trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays="auto", depth=2))
     assert found.rays == solve_module.FIRST_RAYS  # a shoebox is easy
     assert found.options.rays == "auto"
-    equal(found.paths, trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays=found.rays, max_depth=2)).paths)
+    equal(found.paths, trace_paths(shoebox, tx, rx, replace(UPRIGHT, rays=found.rays, depth=2)).paths)
 
 
 def sionna_paths(scene: Any, tx: np.ndarray, rx: np.ndarray, **kinds: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -311,14 +311,14 @@ def test_diffraction_is_that_of_sionna_rt(divided: Any):
     again = recompute(traced, divided).paths.gain
     np.testing.assert_allclose(again, traced.paths.gain, rtol=1e-6)
     # The bent wave reaches where nothing else does.
-    dark = trace_paths(divided, [[2.9, 1.0, 0.5]], receiver([3.1, 1.0, 0.5]), replace(options, max_depth=1)).paths
+    dark = trace_paths(divided, [[2.9, 1.0, 0.5]], receiver([3.1, 1.0, 0.5]), replace(options, depth=1)).paths
     assert (dark.interactions == 8).any()
 
 
 def test_scattering_takes_power_from_reflections(shoebox: Any):
     tx, rx = inside(3), receiver([1.0, 1.0, 1.0])
-    plain = trace_paths(shoebox, tx, rx, replace(UPRIGHT, max_depth=1)).paths
-    options = replace(UPRIGHT, max_depth=1, scattering=True, scattering_coefficient=0.6, rays=10_000)
+    plain = trace_paths(shoebox, tx, rx, replace(UPRIGHT, depth=1)).paths
+    options = replace(UPRIGHT, depth=1, scattering=True, scattering_coefficient=0.6, rays=10_000)
     traced = trace_paths(shoebox, tx, rx, options)
     diffuse = (traced.paths.interactions == 2).any(axis=1)
     mirrored = traced.paths.select(~diffuse)
@@ -342,9 +342,9 @@ def test_wrong_arguments_are_refused(empty: Any):
         with pytest.raises(InputError, match="give one at least"):
             trace_paths(empty, tx, rx)
     for setting in (
-        {"max_depth": -1},
-        {"max_depth": 99},
-        {"max_reflections": -1},
+        {"depth": -1},
+        {"depth": 99},
+        {"reflections": -1},
         {"rays": 0},
         {"rays": "many"},
         {"seed": -1},

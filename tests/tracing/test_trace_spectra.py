@@ -104,7 +104,7 @@ def test_signals_over_a_metal_floor_are_those_of_two_paths(ground: Any):
     """The reflected wave comes from the image below the floor; a vertical field keeps its sign."""
     receiver = upright(10, (0.0, 0.0, 1.5))
     source = np.array([[6.0, 1.0, 1.1]])
-    paths = trace_paths(ground, source, receiver, TraceOptions(max_depth=2)).paths
+    paths = trace_paths(ground, source, receiver, TraceOptions(depth=2)).paths
     assert paths.bounces.tolist() == [0, 1]
     elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
     expected = np.zeros(16, complex)
@@ -250,7 +250,7 @@ def test_laboratory_is_cached_and_reproducible(
     assert load_record(folder).name == "laboratory"
     recipe = folder / "traced.yml"
     kept = recipe.read_text()
-    recipe.write_text(kept.replace("max_depth: 3", "max_depth: 2"))
+    recipe.write_text(kept.replace("depth: 3", "depth: 2"))
     with pytest.raises(AssertionError, match="traced although"):
         laboratory_record(folder)
     recipe.write_text(kept)

@@ -25,7 +25,7 @@ Tensor64 = dr.tensor_t(Float64)
 LOW_HZ, MIDDLE_HZ, HIGH_HZ = CARRIERS_HZ = 1.2e9, 2.4e9, 5.8e9
 SINGLE = 2e-6
 """Of the strongest path: constants of materials and gains of the search in single precision."""
-OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
+OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 PLACE = {LOW_HZ: [0, 1, 2, 3], MIDDLE_HZ: [5, 1, 1], HIGH_HZ: [4, 3, 1, 0, 6]}
 """Transmitters of each carrier: some at several, one of them twice."""
 POSITION = "receiver.array.position"

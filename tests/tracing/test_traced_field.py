@@ -41,7 +41,7 @@ DOUBLE = 1e-12
 SLOPE = 1e-4
 """Relative: Sionna RT's derivatives in single precision, sums of some hundred terms of both signs."""
 
-OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
+OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +310,7 @@ def test_transmitter_without_a_path_has_no_gain_and_finite_derivatives(tmp_path:
     """A transmitter behind metal."""
     scene = room(tmp_path, {"ceiling": CEILING["ceiling"]})
     above = np.array([[2.0, 2.0, 5.0]])
-    traced = TracedField(scene, above, receiver(), TracedOptions(TraceOptions(max_depth=1, rays=1024)))
+    traced = TracedField(scene, above, receiver(), TracedOptions(TraceOptions(depth=1, rays=1024)))
     parameters = tensors(traced)
     for p in parameters.values():
         dr.enable_grad(p)

@@ -92,7 +92,7 @@ def paths_of(
 def test_paths_are_those_of_all_sequences_of_planes(sheets: Any, seed: int, passes: bool):
     """Among them reflections at the second sheet of a wall, with a transmission through the first before and after."""
     tx, rx = inside(4, seed), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, seed + 10))]
-    options = TraceOptions(transmission=passes, max_depth=5, max_reflections=2, rays=1 << 16)
+    options = TraceOptions(transmission=passes, depth=5, reflections=2, rays=1 << 16)
     prepared = Prepared(sheets)
     traced = trace_paths(sheets, tx, rx, options, prepared=prepared, gains=False)
     surfaces, paths, found = prepared.surfaces, traced.paths, set[tuple[Any, ...]]()

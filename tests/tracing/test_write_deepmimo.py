@@ -36,7 +36,7 @@ CODES = {1: "1", 2: "3", 4: "4", 8: "2"}
 @pytest.fixture(scope="module")
 def traced(tmp_path_factory: pytest.TempPathFactory) -> TraceResult:
     """All kinds of path from five users to two base stations."""
-    options = TraceOptions(transmission=True, diffraction=True, scattering=True, max_depth=3, rays=1 << 9)
+    options = TraceOptions(transmission=True, diffraction=True, scattering=True, depth=3, rays=1 << 9)
     stations = [receiver(p, f"roof{k}") for k, p in enumerate(inside(2, 2))]
     found = trace_paths(room(tmp_path_factory.mktemp("room"), {**SHOEBOX, **PARTITION}), inside(5), stations, options)
     assert set(np.unique(found.paths.interactions)) == {0, 1, 2, 4, 8}

@@ -25,7 +25,7 @@ from wrf_mi.training.initial import gaussians_from_mesh, gaussians_from_paths, i
 @pytest.fixture(scope="module")
 def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]:
     scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
-    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(max_depth=1, rays=1 << 12)).paths, tx
+    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(depth=1, rays=1 << 12)).paths, tx
 
 
 def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -> None:

@@ -28,7 +28,7 @@ from wrf_mi.training.trainer import Trainer
 
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
 BETWEEN_HZ = 3.5e9
-OPTIONS = TraceOptions(max_depth=2, transmission=True, rays=4096)
+OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 CONFIG = TracedConfig(depth=2, reflections=2, rays=4096, faint=0.0)
 SIZE = (9, 24)
 SINGLE, SINGLE_DB = 1e-6, 2e-5
@@ -178,7 +178,7 @@ def test_paths_are_calibrated_at_several_carriers(xml: Path, tmp_path: Path) -> 
     record = spectra(xml, 16)
     wrong = {name: ("itu_wood", mesh) for name, (_, mesh) in {**WALLS, **CEILING, **PARTITION}.items()}
     stated = write_xml(tmp_path / "stated", wrong)
-    common = ("max_depth=2", "rays=4096", "transmission=true")
+    common = ("depth=2", "rays=4096", "transmission=true")
     given: dict[str, Any] = {"scene": str(stated), "split": "frequency:1"}
     plain = wrf_mi.train(record, tmp_path / "plain", "ray-tracing", settings=common, **given)
     calibration = (*common, "calibration=gain,materials", "steps=120")

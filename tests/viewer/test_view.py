@@ -38,7 +38,7 @@ def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def traced(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, settings = tmp_path_factory.mktemp("runs") / "traced", TracingSettings(max_depth=2, rays=4096)
+    folder, settings = tmp_path_factory.mktemp("runs") / "traced", TracingSettings(depth=2, rays=4096)
     return wrf_mi.train(flat_folder, folder, "ray-tracing", scene=room, settings=settings).folder
 
 

@@ -209,9 +209,8 @@ def _judge_loaded(backend: str) -> Backend:
         usable, reason = verdict.usable, f"which {verdict.reason}"
     text = ".".join(map(str, version))
     if not usable:
-        raise BackendError(
-            f"{_TOO_EARLY} loaded LLVM {text} ({path or 'its file is not known'}), {reason}: {_other_llvm()}"
-        )
+        library = f"LLVM {text} ({path or 'its file is not known'})"
+        raise BackendError(f"{_TOO_EARLY} loaded {library}, {reason}: {_other_llvm()}")
     return _llvm(path, text)
 
 

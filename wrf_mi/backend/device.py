@@ -19,10 +19,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-PACKET = 64
-"""Readable numbers after the end of an array that Dr.Jit wraps: no packet of LLVM is longer."""
-ALIGNED_BYTES = 64
-"""Packets begin at multiples of their size: Dr.Jit copies unaligned columns by other kernels."""
+PACKET = 64  # readable numbers after the end of an array that Dr.Jit wraps: no packet of LLVM is longer
+ALIGNED_BYTES = 64  # packets begin at multiples of their size: Dr.Jit copies unaligned columns by other kernels
 HOST: dict[Any, type[np.generic]] = {
     dr.VarType.Float32: np.float32,
     dr.VarType.Float64: np.float64,

@@ -19,11 +19,9 @@ from itertools import starmap
 from pathlib import Path
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
-CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"
-"""Environment variables that name the libraries for Dr.Jit to load."""
+CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"  # environment variables that name the libraries for Dr.Jit to load
 
-READ_TIMEOUT_S = 60
-"""Reading the linker's cache takes milliseconds; a cold network disk may need much longer."""
+READ_TIMEOUT_S = 60  # reading the linker's cache takes milliseconds; a cold network disk may need much longer
 
 _LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
 
@@ -57,13 +55,9 @@ def version_from_name(name: str) -> tuple[int, ...] | None:
 
 
 def find_llvm(*, ignore_variable: bool = False) -> list[LlvmLibrary]:
-    """All LLVM libraries of this machine, newest first, those without a version in their names last.
+    """All LLVM libraries of this machine, newest first, those without a version in their names last; none is loaded.
 
-    If ``DRJIT_LIBLLVM_PATH`` is set only that file is returned (or none, if it is not a file). Neither Dr.Jit nor an
-    LLVM is loaded.
-
-    Args:
-        ignore_variable: ignore ``DRJIT_LIBLLVM_PATH``.
+    If ``DRJIT_LIBLLVM_PATH`` is set, and not to be ignored, only that file is returned (or none, if it is not a file).
     """
     asked = None if ignore_variable else os.environ.get(LLVM_VARIABLE)
     files = [file for file in [Path(asked)] if file.is_file()] if asked else list(_llvm_files())
@@ -90,11 +84,8 @@ def find_cuda() -> Path | None:
 
 
 def _llvm_files() -> Iterator[Path]:
-    for folder in _library_folders():
-        for name in glob.glob("libLLVM*", root_dir=folder):
-            if version_from_name(name) is not None:
-                yield folder / name
-    yield from (file for file in _linker_cache("libLLVM") if version_from_name(file.name) is not None)
+    files = [folder / name for folder in _library_folders() for name in glob.glob("libLLVM*", root_dir=folder)]
+    yield from (file for file in [*files, *_linker_cache("libLLVM")] if version_from_name(file.name) is not None)
 
 
 def _library_folders() -> list[Path]:
@@ -104,25 +95,13 @@ def _library_folders() -> list[Path]:
     patterns = [folder for entries in listed for folder in entries if folder]
     patterns += [f"{root}/lib" for root in roots if root]
     if sys.platform == "darwin":
-        patterns += [
-            "/opt/homebrew/opt/llvm*/lib",
-            "/usr/local/opt/llvm*/lib",
-            "/opt/local/libexec/llvm-*/lib",
-            "/usr/local/lib",
-        ]
+        patterns += ["/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib", "/opt/local/libexec/llvm-*/lib"]
+        patterns += ["/usr/local/lib"]
     else:
         multiarch = sysconfig.get_config_var("MULTIARCH") or f"{os.uname().machine}-linux-gnu"
-        patterns += [
-            f"/usr/lib/{multiarch}",
-            "/usr/lib64",
-            "/usr/lib",
-            "/usr/local/lib",
-            "/usr/lib/llvm*/lib",
-            "/usr/lib64/llvm*/lib",
-            "/usr/lib/llvm*/lib64",
-            "/opt/llvm*/lib",
-            "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
-        ]
+        patterns += [f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
+        patterns += ["/usr/lib/llvm*/lib", "/usr/lib64/llvm*/lib", "/usr/lib/llvm*/lib64", "/opt/llvm*/lib"]
+        patterns += ["/home/linuxbrew/.linuxbrew/opt/llvm*/lib"]
     folders = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
     return list(dict.fromkeys(folder for folder in folders if folder.is_dir()))
 

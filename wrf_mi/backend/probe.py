@@ -33,8 +33,7 @@ VARIANTS = {"llvm": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 OLDEST_TRIED = 17
 """LLVM 14 is refused by Dr.Jit 1.5; 15 and 16 have no instruction for a minimum or maximum and end the process."""
 
-TRIAL_TIMEOUT_S = 180
-"""A trial takes about a second, with the first start of a CUDA driver up to a minute."""
+TRIAL_TIMEOUT_S = 180  # a trial takes about a second, with the first start of a CUDA driver up to a minute
 
 FAILURE_KEPT_S = 24 * 3600
 """A failed library is tried again after a day: the GPU may have been busy. `wrf-mi doctor` tries at once."""

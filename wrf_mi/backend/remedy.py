@@ -8,8 +8,7 @@ import shutil
 import subprocess
 import sys
 
-GOOD_FROM = 19
-"""Oldest LLVM that works with Dr.Jit 1.5 in our tests."""
+GOOD_FROM = 19  # oldest LLVM that works with Dr.Jit 1.5 in our tests
 
 
 def package_manager() -> str | None:
@@ -37,9 +36,8 @@ def install_commands() -> list[list[str]]:
     if manager == "apt-get":
         names = apt_packages() or [f"libllvm{GOOD_FROM}"]
         return [["apt-get", "install", "-y", "--no-install-recommends", name, "libatomic1"] for name in names]
-    return {"dnf": [["dnf", "install", "-y", "llvm-libs", "libatomic"]], "brew": [["brew", "install", "llvm"]]}.get(
-        manager or "", []
-    )
+    others = {"dnf": [["dnf", "install", "-y", "llvm-libs", "libatomic"]], "brew": [["brew", "install", "llvm"]]}
+    return others.get(manager or "", [])
 
 
 def install_line() -> str:

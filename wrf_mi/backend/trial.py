@@ -12,11 +12,9 @@ import math
 import sys
 from typing import Any
 
-N = 100
-"""Not a multiple of any vector width, so that the tail is compiled too."""
+N = 100  # not a multiple of any vector width, so that the tail is compiled too
 
-RELATIVE_TOLERANCE = 1e-5
-"""Single precision with approximate reciprocals and square roots."""
+RELATIVE_TOLERANCE = 1e-5  # single precision with approximate reciprocals and square roots
 
 
 def check_arithmetic(dr: Any, number: Any) -> None:

@@ -22,22 +22,18 @@ from ..scene.plan.storey import plan_surfaces
 from ..scene.positions import LARGEST_SHARE, TOLERATED, TOLERATED_SHARE, conflicts, distinct
 from ..tracing.search.devices import winding_number
 from .plans import placements
-from .repeats import named_rows
+from .rows import named_rows
 from .units import Found
 
-LAYOUT = "layout.csv"
-"""File of wall vertices in a data set's folder."""
-HEIGHT_M = 2.7
-"""Height of the walls of a plan, at which positions are not compared."""
-THICKEST_WALL_M = 0.4
-"""Largest distance of the two sides of a wall in a plan."""
+LAYOUT = "layout.csv"  # file of wall vertices in a data set's folder
+HEIGHT_M = 2.7  # height of the walls of a plan, at which positions are not compared
+THICKEST_WALL_M = 0.4  # largest distance of the two sides of a wall in a plan
 PARALLEL = np.cos(np.radians(5))
 DEEP_M = 0.03
 """Least depth within a wall or a solid: what hangs on a surface is at it, with the error of a tape measure."""
 AT_VERTEX_M = 1e-3
 """Largest distance from a vertex of a plan that is no coincidence: positions are measured to a centimetre."""
-THICKEST_SOLID_M = 1.0
-"""Bodies with all sides longer than this are rooms or buildings, whose inside is air."""
+THICKEST_SOLID_M = 1.0  # bodies with all sides longer than this are rooms or buildings, whose inside is air
 
 
 @dataclass(frozen=True)
@@ -74,11 +70,7 @@ def building_file(source: str | Path) -> Path | None:
 
 
 def read_building(path: Path) -> Building:
-    """Read a plan, a mesh or a scene folder.
-
-    Raises:
-        InputError: it is not readable.
-    """
+    """Read a plan, a mesh or a scene folder; `InputError` for one that is not readable."""
     if path.name == LAYOUT:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
@@ -92,8 +84,8 @@ def read_building(path: Path) -> Building:
     else:
         raw = read_mesh(path)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
-    closed_bodies = [corners[faces] for faces, closed, volume in bodies(corners) if closed and volume]
-    solids = [body for body in closed_bodies if np.ptp(body.reshape(-1, 3), axis=0).min() <= THICKEST_SOLID_M]
+    closed = [body for body in bodies(corners) if body.closed and body.volume_m3]
+    solids = [body.corners_m for body in closed if np.ptp(body.bounds_m, axis=0).min() <= THICKEST_SOLID_M]
     return Building(path, planes_of_mesh(raw), solids, np.empty((0, 2, 2)))
 
 
@@ -138,11 +130,9 @@ def at_vertices(record: Record, building: Building) -> Found:
     if not len(building.walls_m):
         return
     vertices = building.walls_m.reshape(-1, 2)
-    named = []
-    for receiver in record.receivers:
-        x, y = receiver.position_m[:2]
-        if np.linalg.norm(vertices - [x, y], axis=1).min() <= AT_VERTEX_M:
-            named.append(f"{receiver.name} at ({x:g}, {y:g})")
+    places = [(receiver.name, *receiver.position_m[:2]) for receiver in record.receivers]
+    away = [np.linalg.norm(vertices - place, axis=1).min() for _, *place in places]
+    named = [f"{name} at ({x:g}, {y:g})" for (name, x, y), m in zip(places, away, strict=True) if m <= AT_VERTEX_M]
     if named:
         text = f"{len(named)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
         yield "wall-vertices", f"{text}: {', '.join(named)}; give the antenna's position, in front of the wall"

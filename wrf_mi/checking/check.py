@@ -16,8 +16,14 @@ from ..synthetic import load_record
 from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
 from .plans import distance_law
-from .reception import few_rows, not_heard
-from .repeats import constant_observations, repeated_observations, repeated_rows, single_position
+from .rows import (
+    constant_observations,
+    few_rows,
+    not_heard,
+    repeated_observations,
+    repeated_rows,
+    single_position,
+)
 from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
 logger = logging.getLogger(__name__)
@@ -46,23 +52,15 @@ SUSPICIONS = {
 """Names of the suspicions, and what the data are instead."""
 Check = Callable[[Record], Found]
 OF_VALUES: tuple[Check, ...] = (
-    heading_unit,
-    not_heard,
-    few_rows,
-    strength_scale,
-    channel_phase,
-    repeated_rows,
-    repeated_observations,
-    constant_observations,
-    single_position,
+    *(heading_unit, not_heard, few_rows, strength_scale, channel_phase),
+    *(repeated_rows, repeated_observations, constant_observations, single_position),
 )
 """Suspicions about the values of a record."""
 WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
 OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
 """Suspicions about directions and distances, which need the unit of positions."""
-MOST_LINES = 10
-"""Faults of one kind in one file that are printed; the others are counted."""
+MOST_LINES = 10  # faults of one kind in one file that are printed; the others are counted
 
 
 @dataclass(frozen=True)
@@ -104,11 +102,7 @@ class DataReport:
         return not self.faults
 
     def lines(self, most: int = MOST_LINES) -> list[str]:
-        """A line for each fault, suspicion and note, and a summary.
-
-        Args:
-            most: largest number of lines for faults of one kind in one file.
-        """
+        """A line for each fault (at most some of one kind in one file), suspicion and note, and a summary."""
         lines = list(self._fault_lines(most))
         lines += [f"suspicion {suspicion.name}: {suspicion.text}" for suspicion in self.suspicions]
         lines += [f"note: {text}" for text in self.notes]
@@ -138,13 +132,21 @@ class DataReport:
             kinds.setdefault(fault.kind if isinstance(fault, DataFault) else fault, []).append(fault)
         source = Path(self.source)
         base = source if source.is_dir() else source.parent  # files are named in the folder of the data
+
+        def relative(file: Path) -> str:
+            return str(file.relative_to(base)) if base in file.parents else str(file)
+
         for faults in kinds.values():
             for fault in faults[:most]:
-                yield f"fault: {_line(fault, base)}"
+                text = str(fault)
+                if isinstance(fault, DataFault):
+                    place = f", {fault.place}" if fault.place else ""
+                    text = f"{relative(fault.file)}{place}: {fault.text}"
+                yield f"fault: {text}"
             if len(faults) > most and isinstance(last := faults[-1], DataFault):
-                file, remedy = Path(last.kind[0]), last.kind[1]
+                file, remedy = last.kind
                 where = f", up to {last.place}" if last.place else ""
-                yield f"fault: {_relative(file, base)}: {len(faults) - most} more of this kind{where}; {remedy}"
+                yield f"fault: {relative(Path(file))}: {len(faults) - most} more of this kind{where}; {remedy}"
 
 
 def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progress: bool = False) -> DataReport:
@@ -187,8 +189,8 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
         suspected += [suspicion for check in OF_PLACES for suspicion in check(record)]
         suspected += _of_building(record)
     suspicions = tuple(Suspicion(name, text) for name, text in suspected if name not in ignore)
-    notes = tuple(note for note in (far_from_origin(record),) if note)
-    return DataReport(name, record.source, record, (), suspicions, notes)
+    note = far_from_origin(record)
+    return DataReport(name, record.source, record, (), suspicions, () if note is None else (note,))
 
 
 def warn_of_suspicions(record: Record) -> None:
@@ -199,10 +201,8 @@ def warn_of_suspicions(record: Record) -> None:
 
 
 def _path(dataset: str | Path) -> Path | None:
-    """The data's folder or file; None if it has yet to be made on this machine.
-
-    Raises:
-        InputError: there is no such data set.
+    """The data's folder or file; None if it has yet to be made on this machine; `InputError`: there is no such data
+    set.
     """
     is_name = isinstance(dataset, str) and Path(dataset).name == dataset and not Path(dataset).exists()
     if is_name and known(str(dataset)).base_url is None:
@@ -228,22 +228,10 @@ def _of_building(record: Record) -> Found:
     yield from at_vertices(record, building)
 
 
-def _line(fault: InputError, base: Path) -> str:
-    """A fault as ``FILE, row N: what; remedy``."""
-    if not isinstance(fault, DataFault):
-        return str(fault)
-    file = _relative(fault.file, base)
-    return f"{file}, {fault.place}: {fault.text}" if fault.place else f"{file}: {fault.text}"
-
-
 def _plain(fault: InputError) -> dict[str, Any]:
     if not isinstance(fault, DataFault):
         return {"file": None, "place": "", "row": None, "text": str(fault)}
     return {"file": str(fault.file), "place": fault.place, "row": fault.row, "text": fault.text}
-
-
-def _relative(file: Path, base: Path) -> str:
-    return str(file.relative_to(base)) if base in file.parents else str(file)
 
 
 def _count(number: int, what: str) -> str:

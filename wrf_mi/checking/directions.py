@@ -20,8 +20,7 @@ from ..core.types import IntArray
 from .plans import other_plans
 from .units import Found
 
-Images = Any
-"""Spectra [n_rx, n, height, width], float32."""
+Images = Any  # spectra [n_rx, n, height, width], float32
 
 POLE, EDGE = 0.5, 0.75
 """Largest ratio of a row's spread along the azimuth at the zenith, and least ratio at the horizon, to that of a row
@@ -32,8 +31,7 @@ INWARDS, FEWEST_HEIGHT = 1 / 16, 16
 """Share of the image's rows between the rows that are compared, and least number of rows."""
 MOST = 0.5
 """Least share of the spectra that show another order of rows; those of the known data sets show the stated one."""
-FEWEST_ROWS, MOST_ROWS = 40, 400
-"""Rows that are needed, and rows that are used: near rows have similar spectra."""
+FEWEST_ROWS, MOST_ROWS = 40, 400  # rows that are needed, and rows that are used: near rows have similar spectra
 GROUPS = 16
 """Groups of near positions, a power of two: the rows of a group count once, and as many positions have to differ."""
 MOST_PIXELS = 10_000
@@ -44,15 +42,11 @@ array's plane, which spectra do not show."""
 BRIGHT, BRIGHTEST = 0.8, 0.95
 """Least mean brightness of the other reading, and largest one of the stated reading: as far as arrays resolve, a
 reading is right if transmitters are in the brightest twentieth of the hemisphere, a cap 18 degrees wide."""
-DARKER = 1.5
-"""Least factor by which more of the hemisphere is brighter than the transmitter in the stated reading."""
+DARKER = 1.5  # least factor by which more of the hemisphere is brighter than the transmitter in the stated reading
 STANDARD_ERRORS = 4.0
 """Least mean of the groups' gains in its standard errors: with 15 degrees of freedom one in 1700 by chance, and some
 thirty readings are compared."""
-OTHERS = 6
-"""Transmitters of other groups that a row's own is compared with."""
-
-
+OTHERS = 6  # transmitters of other groups that a row's own is compared with
 REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at azimuth 0, counter-clockwise"
 
 

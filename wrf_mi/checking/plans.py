@@ -19,8 +19,7 @@ motions. Shading by walls has no law, but fits one plan better than the others: 
 as much in one case of 25. The shading of several receivers differs: the gain falls with the root of their number."""
 EXPONENTS = (1.0, 6.0)
 """Exponents of distance laws in buildings (ITU-R P.1238: 1.5 to 5), from waveguides to thick walls."""
-NEAREST_M = 0.1
-"""Shorter distances count as this one: the far field begins there or later."""
+NEAREST_M = 0.1  # shorter distances count as this one: the far field begins there or later
 _MOTIONS = {
     "y is mirrored": ((1, 0), (0, -1)),
     "x is mirrored": ((-1, 0), (0, 1)),
@@ -31,8 +30,7 @@ _MOTIONS = {
     "x and y are swapped and both are mirrored": ((0, -1), (-1, 0)),
 }
 """What is wrong in words, and the matrix that corrects it."""
-SMALLEST_OFFSET_M = 0.005
-"""Smaller offsets are rounding."""
+SMALLEST_OFFSET_M = 0.005  # smaller offsets are rounding
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ def placements(positions_m: FloatArray, *centres_m: FloatArray) -> Iterator[Plac
     """The seven other orientations of positions [n, 3], by right angles and mirror images, seen from above.
 
     Each one is taken about the origin, as where a sign was changed, and about points [2], such as the middle of a
-    picture that was turned over.
+    picture.
     """
     for about in (*centres_m, np.zeros(2)):
         for motion, rows in _MOTIONS.items():

@@ -12,8 +12,7 @@ from scipy.constants import speed_of_light
 from ..core import Record
 from ..core.angles import FloatArray
 
-Found = Iterator[tuple[str, str]]
-"""Name and text of suspicions."""
+Found = Iterator[tuple[str, str]]  # name and text of suspicions
 
 WIDEST_RAD = 80.0
 """Range of headings that is degrees rather than radians: a quarter turn of 90 degrees, or 13 turns in radians."""
@@ -26,29 +25,21 @@ FEWEST_COURSES = 50
 AGREEMENT = 0.5
 """Least resultant length of headings relative to courses (1: a constant angle between them, 0: any angle)."""
 
-ROOM_M = 100.0
-"""Median distance from transmitter to receiver above which positions are not those of a building."""
+ROOM_M = 100.0  # median distance from transmitter to receiver above which positions are not those of a building
 ALLOWED_DBM = 36.0
 """Largest radiated power without a licence (4 W, FCC 15.247). More would be needed over the stated distances."""
-STRONGEST = 90
-"""Percentile of the radiated powers: those of the direct path, without a few exceptional rows."""
+STRONGEST = 90  # percentile of the radiated powers: those of the direct path, without a few exceptional rows
 
 LONGITUDE, LATITUDE = 180.0, 90.0
-WIDEST_DEG = 1.0
-"""Largest extent of a place in degrees, 111 km of latitude."""
+WIDEST_DEG = 1.0  # largest extent of a place in degrees, 111 km of latitude
 AWAY = 20.0
 """Least distance from the origin in extents of the place: 1 km at 0.2 degrees. A room of metres whose origin is twenty
 of its lengths away is not less than a metre wide."""
-MILLIMETRES = 1e3
-"""Degrees of a place have five decimals or more, metres of a survey three at most."""
-FINE_SHARE = 0.5
-"""Least share of coordinates with a fraction of a millimetre."""
-ROUNDING = 1e-6
-"""Of a coordinate in millimetres, which a file states in decimals."""
-APART_M = 20.0
-"""Least distance between receivers and transmitters where the ones are in degrees and the others are not."""
-RESOLUTION_M = 1e-3
-"""Resolution of single precision from which positions are said to be far from the origin."""
+MILLIMETRES = 1e3  # degrees of a place have five decimals or more, metres of a survey three at most
+FINE_SHARE = 0.5  # least share of coordinates with a fraction of a millimetre
+ROUNDING = 1e-6  # of a coordinate in millimetres, which a file states in decimals
+APART_M = 20.0  # least distance between receivers and transmitters where the ones are in degrees and the others are not
+RESOLUTION_M = 1e-3  # resolution of single precision from which positions are said to be far from the origin
 METRES_PER_DEGREE = 111e3
 
 LINEAR_RANGE = 30.0

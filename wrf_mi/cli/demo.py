@@ -83,7 +83,7 @@ def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) ->
     elif (data := find_data(FLAT)) is not None:
         print(f"tracing {FLAT} in the walls of its plan", file=sys.stderr)
         scene = make_scene(data / FLAT_PLAN, folder / "scene", height_m=FLAT_HEIGHT_M)
-        dataset, settings = FLAT, ("transmission=true", "max_depth=6", "max_reflections=2")
+        dataset, settings = FLAT, ("transmission=true", "depth=6", "reflections=2")
     else:
         return run, compare([folder], folder / "compare")
     options: dict[str, Any] = {"scene": scene.folder, "settings": settings, "progress": sys.stderr.isatty()}

@@ -152,7 +152,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
             raise InputError(f"trace: --target-error chooses what --{name} states; give one of them")
     # Trained paths are searched with the default seed; --seed is that of training and split.
     seed = None if a.calibrate is not None else a.seed
-    numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": seed}
+    numbers = {"depth": a.depth, "reflections": a.reflections, "rays": a.rays, "seed": seed}
     numbers["phase_error"] = a.phase_error
     stated: dict[str, Any] = {key: given for key, given in numbers.items() if given is not None}
     if a.rays is not None and a.rays != "auto":

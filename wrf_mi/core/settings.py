@@ -29,6 +29,9 @@ Finite = Annotated[float, Field(description="a finite number")]
 NOT_NEGATIVE = Field(ge=0, description="0 or more")
 """Range of numbers for which a class of settings states no other."""
 
+FORMER_NAMES = {"max_depth": "depth", "max_reflections": "reflections"}
+"""Names that settings had, which stored runs and scripts still state."""
+
 Settings = TypeVar("Settings")
 """A frozen dataclass of plain values or of such dataclasses."""
 
@@ -104,6 +107,7 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     hints = typing.get_type_hints(kind)
     arguments = {}
     for key, value in values.items():
+        key = key if key in hints else FORMER_NAMES.get(key, key)
         name = f"{prefix}{key}"
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
@@ -161,12 +165,14 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: expected key=value, e.g. --set steps=2000")
-        if key.strip() not in known:
-            close = get_close_matches(key.strip(), known, n=3)
+        key = key.strip()
+        key = key if key in known else FORMER_NAMES.get(key, key)
+        if key not in known:
+            close = get_close_matches(key, known, n=3)
             meant = f"did you mean {' or '.join(close)}? " if close else ""
             remedy = f"{meant}All are listed by `wrf-mi train --help-settings`"
-            raise InputError(f"--set {setting}: unknown setting {key.strip()}; {remedy}")
-        *parents, last = key.strip().split(".")
+            raise InputError(f"--set {setting}: unknown setting {key}; {remedy}")
+        *parents, last = key.split(".")
         node = values
         for parent in parents:
             node = node[parent]

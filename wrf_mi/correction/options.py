@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
-from ..tracing.options import MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
+from ..tracing.options import MAX_DEGREE, MAX_DEPTH, SpecularOptions
 from ..tracing.paths.instrument_parameters import TX_PATTERN
 from ..tracing.paths.material_parameters import EXPONENT, PREFIX, QUANTITIES
 from ..tracing.paths.plane_parameters import SHIFT, TILT
@@ -44,16 +44,13 @@ OnStage = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class CorrectionOptions(CheckedSettings):
+class CorrectionOptions(SpecularOptions, CheckedSettings):
     """Options of a correction.
 
     Attributes:
         parts: parts that may change, of `PARTS`.
-        depth: largest number of interactions of a path, transmissions included.
-        reflections: largest number of reflections among them.
         rows: most training rows that are compared, of images over all receivers; of more, a random subset, seeded by
             the split.
-        rays: number of rays that search from each receiver.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
         steps: largest number of least-squares steps.
         pattern_degree: degree of the antennas' patterns, where they are changed.
@@ -61,10 +58,8 @@ class CorrectionOptions(CheckedSettings):
     """
 
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
-    depth: Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")] = 3
-    reflections: Annotated[int, NOT_NEGATIVE] = 3
+    depth: Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")] = field(default=3, kw_only=True)
     rows: Annotated[int, Field(ge=1, description="1 or more")] = 600
-    rays: Annotated[int, Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
     faint: ShareBelow1 = 1e-3
     steps: Annotated[int, NOT_NEGATIVE] = 8
     pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 2
@@ -87,9 +82,10 @@ class CorrectionOptions(CheckedSettings):
     @property
     def traced(self) -> TracedOptions:
         """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
-        trace = TraceOptions(transmission=True, max_depth=self.depth, max_reflections=self.reflections, rays=self.rays)
         degree = self.pattern_degree if PATTERNS in self.parts else 0
-        return TracedOptions(trace, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES)
+        return TracedOptions(
+            self.options, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES
+        )
 
     def changes(self, name: str) -> bool:
         """Whether a parameter of `wrf_mi.tracing.paths.traced_field.TracedField` is changed."""

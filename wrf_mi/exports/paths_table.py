@@ -69,10 +69,10 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
         lacking = ", ".join(name for name, value in given.items() if value is None)
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
-    chosen |= {} if options.depth is None else {"max_depth": options.depth}
+    chosen |= {} if options.depth is None else {"depth": options.depth}
     trace_options = TraceOptions(**chosen)
     for name, reason in without_effect(trace_options).items():
-        option = "--depth" if name == "max_depth" else f"--paths {name}"
+        option = "--depth" if name == "depth" else f"--paths {name}"
         logger.warning("%s has no effect: %s", option, reason)
     scene = open_scene(source.name, options.frequency_hz, material=options.material)
     receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ..core.settings import Positive, ShareBelow1
-from ..tracing.options import DISC, MAX_DEGREE, MAX_DEPTH, MAX_RAYS, TraceOptions
+from ..tracing.options import DISC, MAX_DEGREE, SpecularOptions
 
 EvaluationName = Literal["splatted", "traced"]
 """Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
@@ -19,16 +19,12 @@ TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.", "surface.")
 
 
 @dataclass(frozen=True)
-class TracedConfig:
+class TracedConfig(SpecularOptions):
     """Paths of a scene that are trained together with the Gaussians: options of tracing, and learning rates.
 
     A parameter of rate 0 stays at its stated value and costs nothing.
 
     Attributes:
-        depth: largest number of interactions of a path, transmissions included.
-        reflections: largest number of reflections among them.
-        transmission: whether paths pass through surfaces.
-        rays: number of rays that search from each receiver.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share of
             those of all paths, with the scene's stated materials; 0: none.
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
@@ -47,10 +43,6 @@ class TracedConfig:
         surface_spacing: distance of neighbouring Gaussians on a surface, metres.
     """
 
-    depth: Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")] = 3
-    reflections: int = 3
-    transmission: bool = True
-    rays: Annotated[int, Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
     faint: ShareBelow1 = 1e-3
     pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 0
     materials: Literal["named", "surface"] = "named"
@@ -72,14 +64,6 @@ class TracedConfig:
         first, last = name.partition(".")[0], name.rpartition(".")[2]
         rate: float = getattr(self, first if first in ("material", "pattern", "surface") else last)
         return rate
-
-    @property
-    def options(self) -> TraceOptions:
-        """Options of the search for paths."""
-        depth, reflections = self.depth, self.reflections
-        return TraceOptions(
-            transmission=self.transmission, max_depth=depth, max_reflections=reflections, rays=self.rays
-        )
 
     @property
     def moves_planes(self) -> bool:

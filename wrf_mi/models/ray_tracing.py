@@ -15,7 +15,7 @@ import json
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
 from ..core.files import readable, write_atomically
-from ..core.settings import with_settings
+from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..datasets.observations import place_of
 from ..graph.receivers import GAPS
@@ -88,11 +88,6 @@ class TracingSettings(LoopOptions, TraceOptions):
                 raise InputError("target_error_db chooses what is traced without calibration; omit one of the two")
         if unknown := [kind for kind in self.target_kinds.split(",") if kind and kind not in CHOSEN_KINDS]:
             raise InputError(f"target_kinds {unknown[0]!r}: choose from {', '.join(CHOSEN_KINDS)}")
-
-    @property
-    def options(self) -> TraceOptions:
-        """Options of the tracer."""
-        return TraceOptions(**{option.name: getattr(self, option.name) for option in fields(TraceOptions)})
 
 
 class FittedTracing(Fitted):
@@ -186,10 +181,10 @@ def _graph_problem(problem: Problem) -> Problem:
         raise InputError(f"calibration: {what} cannot be chosen there; omit it")
     if options.phase_error:
         raise InputError(f"calibration: phase_error={options.phase_error:g} belongs to a trace; omit it")
-    reflections = options.max_depth if options.max_reflections is None else options.max_reflections
+    reflections = options.depth if options.reflections is None else options.reflections
     given = [
         f"seed={problem.seed}",
-        f"traced.depth={options.max_depth}",
+        f"traced.depth={options.depth}",
         f"traced.reflections={reflections if options.reflection else 0}",
         f"traced.transmission={str(options.transmission).lower()}",
         *([] if options.rays == "auto" else [f"traced.rays={options.rays}"]),
@@ -300,12 +295,20 @@ def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> Trac
     if not path.exists():
         record, instrument = problem.record, instrument_of(problem.record)
         spectra = instrument.observe if task_of(record).image else None
-        kinds = settings.target_kinds.split(",")
-        target = settings.target_error_db, settings.options, kinds, spectra, record.tx_antenna
-        choice = choose_options(problem.opened_scene, record.tx_pos_m, record.receivers, *target)
+        choice = choose_options(
+            problem.opened_scene,
+            record.tx_pos_m,
+            record.receivers,
+            settings.target_error_db,
+            settings.options,
+            kinds=settings.target_kinds.split(","),
+            spectra=spectra,
+            tx_antenna=record.tx_antenna,
+        )
         write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
     with readable(path, f"{path}: missing; trace anew", "trace anew"):
-        return replace(settings, **json.loads(path.read_text())["options"])
+        chosen = settings_from(TraceOptions, json.loads(path.read_text())["options"], str(path))
+        return replace(settings, **vars(chosen))
 
 
 def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
@@ -323,7 +326,7 @@ def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
     if settings.target_error_db is None:
         target = {"target_kinds": "target_error_db is not set"}
     else:
-        target = {name: "target_error_db chooses it" for name in ("max_depth", "rays")}
+        target = {name: "target_error_db chooses it" for name in ("depth", "rays")}
         idle.pop("scattering_coefficient", None)
     idle |= {name: why for name, why in target.items() if getattr(settings, name) != getattr(default, name)}
     for name, reason in idle.items():

@@ -14,40 +14,29 @@ from ..core.angles import FloatArray
 logger = logging.getLogger(__name__)
 
 Up = Literal["y", "z"]
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
-"""Length of each unit that a scan or mesh may be in."""
-FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"
-"""Files that points are read from."""
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit that a scan or mesh may be in
+FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"  # files that points are read from
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
-Y_UP_SUFFIXES = (".glb", ".gltf")
-"""Files whose specification has y up (glTF 2.0, section 3.4)."""
+Y_UP_SUFFIXES = (".glb", ".gltf")  # files whose specification has y up (glTF 2.0, section 3.4)
 FARTHEST_M = 2.0**14
 """Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
-LOST_M = 0.005
-"""Steps of single precision in a file from which it is refused: nothing brings back what it has rounded."""
+LOST_M = 0.005  # steps of single precision in a file from which it is refused: nothing brings back what it has rounded
 COARSE_M, COARSEST_M = 0.03, 0.06
 """Steps of a scan's coordinates that blur its planes, and that hide them: one and two of the cells it is thinned to."""
 STEP_TOLERANCE = 0.01
 """Largest deviation from a multiple of a step, in steps: rounding of single precision near the origin."""
-MOST_POINTS = 100_000
-"""Points of a scan by which its axes and steps are judged."""
-ROOM_HEIGHT_M = 1.9, 3.5
-"""Usual heights of rooms."""
-CORRIDOR, CORRIDOR_M = 4.0, 4.5
-"""Least length of a corridor in its widths, and the largest height of one."""
+MOST_POINTS = 100_000  # points of a scan by which its axes and steps are judged
+ROOM_HEIGHT_M = 1.9, 3.5  # usual heights of rooms
+CORRIDOR, CORRIDOR_M = 4.0, 4.5  # least length of a corridor in its widths, and the largest height of one
 SHAFT, SHAFT_HEIGHT = 2.0, 2.0
 """Largest length of a shaft or stairwell in its widths, and its least height in its lengths."""
-TALL = 1.4
-"""Least ratio of the extents along z and y of data that look as if y were up."""
-BROAD = 1.2
-"""Least ratio of the areas seen along y and z of such data; corridors with a tall end have less."""
-FLOOR_M = 0.05
-"""Largest height of a floor that counts as zero."""
-CELLS = 40
-"""Cells along the longest side, in which areas are seen."""
+TALL = 1.4  # least ratio of the extents along z and y of data that look as if y were up
+BROAD = 1.2  # least ratio of the areas seen along y and z of such data; corridors with a tall end have less
+FLOOR_M = 0.05  # largest height of a floor that counts as zero
+CELLS = 40  # cells along the longest side, in which areas are seen
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
 
@@ -70,9 +59,9 @@ def extent(points_m: FloatArray) -> FloatArray:
 def looks_y_up(points_m: FloatArray) -> bool:
     """Whether points [n, 3] on the surfaces of a room or building look as if y were up and not z.
 
-    They do if they are a room's height along y, and more than that along z, where more area is seen along y than along
-    z; or if they begin at zero along y and end at zero along z, as after a change of axes. Corridors and shafts, whose
-    walls are larger than their floor, are no such rooms.
+    They do if they are a room's height along y and higher along z, where more area is seen along y than along z; or if
+    they begin at zero along y and end at zero along z. Corridors and shafts have walls larger than their floor, and do
+    not.
     """
     points_m = points_m[:: len(points_m) // MOST_POINTS + 1]
     low, high = extent(points_m)
@@ -91,9 +80,10 @@ def looks_y_up(points_m: FloatArray) -> bool:
     return seen_along_y > BROAD * seen_along_z
 
 
-def warn_of_up(points_m: FloatArray, name: str | Path, up: Up) -> None:
-    """Log that points [n, 3], z up, of a file that was read with an axis up look as if it were the other one."""
-    if looks_y_up(points_m):
+def warn_of_up(points_m: FloatArray, name: str | Path, stated: Up | None = None) -> None:
+    """Log that points [n, 3], z up, of a file that states no axis look as if another than that of `up_of` were up."""
+    if stated is None and looks_y_up(points_m):
+        up = up_of(name, None)
         _, along_y, along_z = np.ptp(extent(points_m), axis=0)
         other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
         text = f"{name}: looks as if {other} were up ({sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file)"
@@ -113,11 +103,7 @@ def check_extent(points_m: FloatArray, name: str | Path) -> None:
 
 
 def require_near(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse points [n, 3] so far from the origin that single precision would move them by a millimetre.
-
-    Raises:
-        InputError: with an origin to subtract.
-    """
+    """Refuse (`InputError`) points [n, 3] so far away that single precision would move them by a millimetre."""
     if not len(points_m) or (far := float(np.abs(points_m).max())) < FARTHEST_M:
         return
     low = points_m.min(axis=0)
@@ -129,11 +115,7 @@ def require_near(points_m: FloatArray, name: str | Path) -> None:
 
 
 def require_precise(points: FloatArray, unit_m: float, name: str | Path) -> None:
-    """Refuse points [n, 3] of a file, in its unit, that were rounded to single precision far from the origin.
-
-    Raises:
-        InputError: with the steps that are left.
-    """
+    """Refuse (`InputError`) points [n, 3] of a file, in its unit, that single precision rounded far from the origin."""
     if not len(points):
         return
     farthest = np.abs(points).max(axis=0)
@@ -155,11 +137,7 @@ def _on_grid(values: FloatArray, spacing: float) -> bool:
 
 
 def require_fine(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse a scan [n, 3] whose coordinates are stored in coarse steps; log steps that blur its planes.
-
-    Raises:
-        InputError: with the steps.
-    """
+    """Refuse (`InputError`) a scan [n, 3] stored in coarse steps, and log steps that blur its planes."""
     # Steps are those of two axes: on a third all points may lie on floor and ceiling.
     step = sorted(_step(values) for values in points_m[:: len(points_m) // MOST_POINTS + 1].T)[1]
     text = f"{name}: coordinates are in steps of {step:.2g} m (the scale of a LAS, or digits of a text)"

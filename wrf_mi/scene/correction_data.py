@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ..core.files import readable
 from ..core.types import IntArray
 
-FILE, KEY = "correction.json", "data"
-"""File of a corrected scene, and the key there."""
+FILE, KEY = "correction.json", "data"  # file of a corrected scene, and the key there
 
 
 @dataclass(frozen=True)

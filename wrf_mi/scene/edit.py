@@ -18,14 +18,12 @@ from ..core.angles import FloatArray
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
 from .mesh.files import mesh_parts
-from .mesh.surfaces import KINDS, Kind, Surface, box_of, moved
+from .mesh.surfaces import KINDS, Kind, Surface, bounds, box_of, moved
 
 logger = logging.getLogger(__name__)
 
-TOUCH_M = 0.01
-"""Depth up to which parts touch: surfaces of scans stand up to a centimetre in each other."""
-PAIRS_PER_CHUNK = 1 << 18
-"""Pairs of edge and triangle that are tried together: some 50 MB."""
+TOUCH_M = 0.01  # depth up to which parts touch: surfaces of scans stand up to a centimetre in each other
+PAIRS_PER_CHUNK = 1 << 18  # pairs of edge and triangle that are tried together: some 50 MB
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,7 @@ class Move:
     turn_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are not finite.
-
-        Raises:
-            InputError: naming the parts.
-        """
+        """Refuse (`InputError`) numbers that are not finite."""
         if len(self.shift_m) != 3 or not np.isfinite([*self.shift_m, self.turn_deg]).all():
             raise InputError(f"move {','.join(self.parts)}: give three finite numbers of metres, and of degrees")
 
@@ -77,15 +71,8 @@ def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
 
 
 def parts_within(folder: str | Path, low_m: ArrayLike, high_m: ArrayLike) -> tuple[str, ...]:
-    """Names of the surfaces of a scene folder that lie in a box, such as the sides of a cabinet.
-
-    Args:
-        folder: scene folder.
-        low_m: lower corner of the box [3], metres.
-        high_m: upper corner, likewise.
-
-    Raises:
-        InputError: not a scene folder.
+    """Names of the surfaces of a scene folder that lie in a box of two corners [3], metres, such as the sides of a
+    cabinet.
     """
     low, high = np.asarray(low_m, float), np.asarray(high_m, float)
     surfaces, _ = read_surfaces(folder)
@@ -184,12 +171,10 @@ def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set
 
 
 def _crossing_depth(part: Surface, other: Surface) -> float:
-    """How far a surface reaches through another one, metres; 0: it does not, or the two touch.
-
-    Of an edge that is cut, the shorter piece counts; of all such edges of a surface, the longest.
-    """
+    """How far a surface reaches through another one, metres; 0: it does not, or the two touch."""
+    # Of an edge that is cut, the shorter piece counts; of all such edges of a surface, the longest.
     triangles, cut = part.vertices_m[part.faces], other.vertices_m[other.faces]
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low, high = bounds(triangles)
     # Where surfaces touch, edges lie in faces and rounding decides what is cut: a smaller part touches nothing.
     smaller = np.clip(triangles, np.minimum(low + TOUCH_M, high), np.maximum(high - TOUCH_M, low))
     cut = cut[((cut.max(axis=1) >= low) & (cut.min(axis=1) <= high)).all(axis=1)]  # others are out of reach

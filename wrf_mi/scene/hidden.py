@@ -24,22 +24,14 @@ from .folder import write_scene
 from .materials import FILE
 from .mesh.surfaces import Surface, bodies
 
-PREFIX = "hidden_"
-"""Names of supposed faces begin with it."""
-FLAT_M = 0.03
-"""Largest distance of a face's corners from its plane."""
-UPRIGHT = np.sin(np.radians(10))
-"""Sine of the largest lean of a side, and of the largest deviation from a right angle."""
-TOUCH_M = 0.15
-"""Largest gap where two faces of a box meet: an edge is seen to the point spacing of the scan."""
-SAME_M = 0.1
-"""Distance within which parallel faces are one: a cabinet's back at a wall is the wall."""
-COVERED = 0.3
-"""Share of a face, seen along its normal, from which on another one in its place stands for it."""
-GRID_M = 1e-4
-"""Grid of outlines that are compared."""
-LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0
-"""Sides of boxes."""
+PREFIX = "hidden_"  # names of supposed faces begin with it
+FLAT_M = 0.03  # largest distance of a face's corners from its plane
+UPRIGHT = np.sin(np.radians(10))  # sine of the largest lean of a side, and of the largest deviation from a right angle
+TOUCH_M = 0.15  # largest gap where two faces of a box meet: an edge is seen to the point spacing of the scan
+SAME_M = 0.1  # distance within which parallel faces are one: a cabinet's back at a wall is the wall
+COVERED = 0.3  # share of a face, seen along its normal, from which on another one in its place stands for it
+GRID_M = 1e-4  # grid of outlines that are compared
+LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0  # sides of boxes
 
 
 @dataclass(frozen=True)
@@ -87,12 +79,7 @@ class Rectangle:
 
 
 class Boxes(NamedTuple):
-    """Boxes of furniture.
-
-    Attributes:
-        hidden: faces that complete them, as surfaces.
-        members: names of the surfaces of each box, those of ``hidden`` included.
-    """
+    """Boxes of furniture: faces that complete them, and names of the surfaces of each box, those faces included."""
 
     hidden: list[Surface]
     members: list[frozenset[str]]
@@ -102,10 +89,8 @@ class Boxes(NamedTuple):
 def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
     """A scene folder with the hidden faces of its `boxes` for as long as the context lasts, and these.
 
-    They are of the material that its rules give furniture. The scene itself where it has none.
-
-    Args:
-        scene: see `wrf_mi.tracing.open_scene`.
+    They are of the material that its rules give furniture. The scene (see `wrf_mi.tracing.open_scene`) itself where it
+    has none.
     """
     supposed = Boxes([], [])
     if (Path(scene) / FILE).is_file():
@@ -128,12 +113,9 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
 
 
 def boxes(surfaces: Sequence[Surface]) -> Boxes:
-    """Boxes of furniture, with faces that complete them where no other surfaces lie.
+    """Boxes of surfaces of the kind ``other``, with faces that complete them where no other surfaces lie.
 
     Faces are named ``hidden_01`` and so on, less the names that surfaces have.
-
-    Args:
-        surfaces: surfaces of a scene; boxes are made of those of the kind ``other``.
     """
     furniture, around = (
         list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))
@@ -173,9 +155,8 @@ def _faces_of_box(base: FloatArray, low: float, high: float) -> Iterator[Rectang
 def _faces(surfaces: Sequence[Surface]) -> Iterator[Rectangle]:
     """Upright and level faces of surfaces."""
     for surface in surfaces:
-        triangles = surface.vertices_m[surface.faces]
-        for members, _, _ in bodies(triangles):
-            corners = triangles[members].reshape(-1, 3)
+        for body in bodies(surface.vertices_m[surface.faces]):
+            corners = body.corners_m.reshape(-1, 3)
             centre = corners.mean(axis=0)
             # The direction in which the corners spread least.
             normal = np.linalg.svd(corners - centre, full_matrices=False)[2][2]

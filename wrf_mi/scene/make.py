@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import Up, check_extent, require_fine, require_near, up_of, warn_of_up
+from .coordinates import Up, check_extent, require_fine, require_near, warn_of_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
@@ -30,8 +30,7 @@ from .scan.points import read_points
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
-RIGID = 1e-6
-"""Largest deviation of a registration's rotation from orthonormal."""
+RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
 def make_scene(
@@ -128,9 +127,7 @@ def make_scene(
     write_scene(
         out,
         placed,
-        frame=f"that of {file.name}, z upwards"
-        + ("" if origin_m is None else f", less the origin {', '.join(f'{value:.12g}' for value in origin_m)}")
-        + ("" if matrix is None else ", moved by the registration"),
+        frame=_frame(file, origin_m, matrix),
         origin_m=origin_m,
         source=str(file),
         materials=materials,
@@ -150,6 +147,17 @@ def _shift(file: Path, origin_m: Sequence[float] | None) -> FloatArray:
     return np.asarray(trimesh.transformations.translation_matrix(-origin))
 
 
+def _frame(file: Path, origin_m: Sequence[float] | None, matrix: FloatArray | None) -> str:
+    """Axes and origin of the scene in words."""
+    origin = "" if origin_m is None else f", less the origin {', '.join(f'{value:.12g}' for value in origin_m)}"
+    return f"that of {file.name}, z upwards{origin}{'' if matrix is None else ', moved by the registration'}"
+
+
+def _sample(points_m: FloatArray) -> FloatArray:
+    """Points of a scan for the preview, at random: every k-th point would show the scanner's pattern."""
+    return points_m[np.random.default_rng(1).integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
+
+
 def _rigid(registration: ArrayLike) -> FloatArray:
     """A rigid motion [4, 4]; `InputError` for another matrix."""
     matrix = np.asarray(registration, float)
@@ -159,11 +167,6 @@ def _rigid(registration: ArrayLike) -> FloatArray:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         raise InputError("registration: not rigid (its rotation scales, shears or mirrors); give a rigid motion")
     return matrix
-
-
-def _sample(points_m: FloatArray) -> FloatArray:
-    """Points of a scan for the preview; every k-th point would show the scanner's pattern."""
-    return points_m[np.random.default_rng(1).integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
 
 
 def _read_plan(
@@ -192,9 +195,7 @@ def _read_plan(
 
 def _read_faces(file: Path, units: str, up: Up | None) -> list[Surface]:
     surfaces = read_mesh(file, units, up)
-    if up is None:
-        triangles_m = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
-        warn_of_up(sampled(triangles_m), file, up_of(file, up))
+    warn_of_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])), file, up)
     return planes_of_mesh(surfaces)
 
 
@@ -203,8 +204,7 @@ def _read_scan(file: Path, units: str, up: Up | None, motion: FloatArray | None)
     points = read_points(file, units, up)
     check_extent(points, file)
     require_fine(points, file)
-    if up is None:
-        warn_of_up(points, file, up_of(file, up))
+    warn_of_up(points, file, up)
     if motion is not None:
         require_near(trimesh.transform_points(points, motion), file)  # before minutes are spent on its planes
     return points

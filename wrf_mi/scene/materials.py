@@ -36,15 +36,13 @@ FILE = "materials.yml"
 KEYS = ("rules", "surfaces", "thickness_m", "constants")
 EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 """Optional numbers of a material with constants; both or neither."""
-STEEPEST = 5.0
-"""Largest exponent; ITU-R P.2040 has 0 to 2.4."""
+STEEPEST = 5.0  # largest exponent; ITU-R P.2040 has 0 to 2.4
 NAME = re.compile(r"\w+", re.ASCII)
 SURFACE_NAME = re.compile(r"[\w.-]+")
 THICKEST_M = 1e3
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
 """Default slab thickness of every slab, metres."""
-KNOWN = (*THICKNESS_M, ABSORBER)
-"""Materials without constants of the scene's own."""
+KNOWN = (*THICKNESS_M, ABSORBER)  # materials without constants of the scene's own
 RULES: Mapping[str, str] = {
     "floor": "itu_concrete",
     "ceiling": "itu_ceiling_board",
@@ -87,8 +85,7 @@ class Materials:
     def complete(self, kinds: Mapping[str, str]) -> Materials:
         """Materials with every rule, every surface and the thickness of every used material stated.
 
-        Args:
-            kinds: kind of every surface in the scene by its name; an entry in ``surfaces`` overrides it.
+        Surfaces have the kinds by name that are given, unless ``surfaces`` states otherwise.
         """
         entries = {name: self.surfaces.get(name, kind) for name, kind in kinds.items()}
         full = replace(self, rules={**RULES, **self.rules}, surfaces=entries)

@@ -27,30 +27,22 @@ from .register import best_motion, wall_points
 
 logger = logging.getLogger(__name__)
 
-CELL_M = 0.1
-"""Side of the squares of which a single position is used: a robot that stands still adds nothing."""
-REACH_M = 1.0
-"""Longest line between two positions."""
-NEIGHBOURS = 8
-"""Number of nearest positions that lines may lead to."""
-OUTSIDE_M = 0.2
-"""Least distance beyond the floor's edge of a position outside: the blur of a robot's map."""
+CELL_M = 0.1  # side of the squares of which a single position is used: a robot that stands still adds nothing
+REACH_M = 1.0  # longest line between two positions
+NEIGHBOURS = 8  # number of nearest positions that lines may lead to
+OUTSIDE_M = 0.2  # least distance beyond the floor's edge of a position outside: the blur of a robot's map
 WALKING_HEIGHT_M = 1.0
 """Height above the lowest floor at which walls are cut if the positions have no height; doors are open there."""
-EDGE_SHARE = 0.1
-"""Share of the walls' height, from below and above, within which they are not cut."""
+EDGE_SHARE = 0.1  # share of the walls' height, from below and above, within which they are not cut
 TOLERATED, TOLERATED_SHARE = 1, 0.005
 """Tolerated conflicts, and share of positions in conflict: a cupboard taken for a wall, a wrong position. Walls found
 from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
-LARGEST_SHARE = 0.1
-"""Largest share of positions in conflict where no reflection fits better."""
+LARGEST_SHARE = 0.1  # largest share of positions in conflict where no reflection fits better
 
 
 def read_positions(path: str | Path) -> FloatArray:
-    """Measured positions from a CSV file with the columns x, y and perhaps z in metres; others are ignored.
-
-    Returns:
-        Shape [n, 3], z NaN where the file has none.
+    """Measured positions [n, 3] from a CSV file with the columns x, y and perhaps z in metres, else NaN; others are
+    ignored.
 
     Raises:
         InputError: missing, no such column, or a field that is not a finite number.
@@ -67,12 +59,8 @@ def read_positions(path: str | Path) -> FloatArray:
 def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int, int]:
     """Number of lines between neighbouring positions that cross a wall, and of positions outside all floors.
 
-    Args:
-        positions_m: shape [n, 3]; z NaN where it is not known.
-        surfaces: surfaces of the scene, in the same frame.
-
-    Raises:
-        InputError: there is no wall.
+    Of positions [n, 3], z NaN where it is not known, and the surfaces of a scene, which must have a wall
+    (`InputError`).
     """
     walls = [surface for surface in surfaces if surface.kind == "wall"]
     if not walls:
@@ -132,11 +120,10 @@ def reflections(
     motion: FloatArray,
     known_walls_m: FloatArray | None,
 ) -> list[tuple[str, list[Surface]]]:
-    """The scenes of a source with its y or its x reversed.
+    """Remedies and surfaces of the scenes of a source with its y or its x reversed.
 
     ``grid`` are the cells of an occupancy grid, ``motion`` moves the source to the scene's frame [4, 4], and each
-    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any. Returns the remedy and the surfaces of each
-    reflection.
+    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any.
     """
     if grid is not None:
         # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.

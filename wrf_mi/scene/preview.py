@@ -31,24 +31,17 @@ KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "ot
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
 """Points are thinned to their number; of the others the strongest or largest are drawn."""
 OUTLINE_POINTS = 20
-SPAN_DB = 40.0
-"""Range of the colours below the strongest."""
+SPAN_DB = 40.0  # range of the colours below the strongest
 ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
 """Name, marker and colour of each end of paths."""
-ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0
-"""Direction of the viewer of the slanted view."""
-EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))
-"""Unit vector from the scene to the viewer."""
+ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0  # direction of the viewer of the slanted view
+EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))  # unit vector from the scene to the viewer
 LIGHT = np.array([0.35, -0.5, 0.79])
-CUT = 0.45
-"""Share of the height at which the plan is cut."""
-TOP = 0.8
-"""Level faces above this share of the height are taken off like a ceiling."""
+CUT = 0.45  # share of the height at which the plan is cut
+TOP = 0.8  # level faces above this share of the height are taken off like a ceiling
 WHOLE_FACES = 50
-MOST_OUTLINED = 500
-"""Number of faces above which a surface is drawn without its free edges."""
-CREASE_RAD = 0.5
-"""Angle between the normals of two faces from which their common edge is a crease."""
+MOST_OUTLINED = 500  # number of faces above which a surface is drawn without its free edges
+CREASE_RAD = 0.5  # angle between the normals of two faces from which their common edge is a crease
 
 
 @dataclass(frozen=True)
@@ -180,12 +173,8 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
 
 
 def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
-    """Faces [f] that hide the inside of a scene from above: ceilings, and level faces near the top.
-
-    Args:
-        surface: a surface of the scene.
-        low: lower corner of the scene [3], metres.
-        high: upper corner of the scene [3], metres.
+    """Faces [f] of a surface that hide the inside of a scene between two corners [3] from above: ceilings, level faces
+    near the top.
     """
     if surface.kind in ("floor", "ceiling"):
         return np.full(len(surface.faces), surface.kind == "ceiling")
@@ -195,12 +184,7 @@ def ceiling_faces(surface: Surface, low: FloatArray, high: FloatArray) -> NDArra
 
 
 def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
-    """Edges [n, 2, 3] of a surface of few faces that bound one face; none of a larger surface.
-
-    Args:
-        surface: a surface of the scene whose faces share their vertices.
-        creases: with edges where two faces meet at more than `CREASE_RAD`.
-    """
+    """Edges [n, 2, 3] of a surface that bound one face, and perhaps its creases; none of a surface of many faces."""
     if len(surface.faces) > MOST_OUTLINED:
         return np.empty((0, 2, 3))
     edges = np.sort(trimesh.geometry.faces_to_edges(surface.faces), axis=1)

@@ -22,38 +22,25 @@ from .plan.lines import rotation_2d
 
 LEAST_AGREEMENT = 0.5
 """Least agreement of a fit. Furnished flats seen by a robot reach 0.53 to 0.58, rooms of a wrong size 0.4 to 0.5."""
-CLEAR_LEAD = 0.03
-"""Least difference in agreement between the best pose and any other; with less, the pose is ambiguous."""
-LARGEST_RMS_M = 0.3
-"""Largest rms residual of pairs."""
-SPREAD = 0.05
-"""Least ratio of the second to the first extent of pairs; with less they lie on a line."""
-SMALLEST_EXTENT_M = 0.1
-"""Least extent of pairs; with less they determine no rotation."""
-SAME_M = 0.3
-"""Largest rms distance between the points in two poses that count as equal."""
-MOST_POINTS = 1500
-"""Points on walls are thinned to their number."""
-NEAR_M = 0.2
-"""Largest distance of a point that agrees with a wall: the blur of a robot's map."""
-SAMPLE_M = 0.1
-"""Distance of the points at which walls are compared."""
-CELL_M = 0.1
-"""Cells of the correlated pictures; in large scenes a hundredth of the radius."""
+CLEAR_LEAD = 0.03  # least difference in agreement between the best pose and any other; with less, the pose is ambiguous
+LARGEST_RMS_M = 0.3  # largest rms residual of pairs
+SPREAD = 0.05  # least ratio of the second to the first extent of pairs; with less they lie on a line
+SMALLEST_EXTENT_M = 0.1  # least extent of pairs; with less they determine no rotation
+SAME_M = 0.3  # largest rms distance between the points in two poses that count as equal
+MOST_POINTS = 1500  # points on walls are thinned to their number
+NEAR_M = 0.2  # largest distance of a point that agrees with a wall: the blur of a robot's map
+SAMPLE_M = 0.1  # distance of the points at which walls are compared
+CELL_M = 0.1  # cells of the correlated pictures; in large scenes a hundredth of the radius
 TURNS, PEAKS, STARTS = 72, 4, 12
 """Turns all around that are searched (every 5 degrees), shifts for each turn, and starts that are refined."""
-APART_CELLS, APART_RAD = 5, np.radians(12)
-"""Least difference between two starts; nearer starts lead to the same pose."""
+APART_CELLS, APART_RAD = 5, np.radians(12)  # least difference between two starts; nearer starts lead to the same pose
 
 
 def read_pairs(path: str | Path) -> tuple[FloatArray, FloatArray]:
-    """Pairs of points from a CSV file: ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y`` in metres.
+    """Pairs of points, [n, 2] or [n, 3] in the scene's frame and in the target's, metres, from a CSV file.
 
-    Returns:
-        Points in the scene's frame and in the target's, shapes [n, 2] or [n, 3].
-
-    Raises:
-        InputError: wrong header or a row without as many numbers.
+    Its header is ``x,y,z,to_x,to_y,to_z`` or ``x,y,to_x,to_y``; `InputError` for another one, or a row without as many
+    numbers.
     """
     table = read_columns(Path(path), "x,y,z,to_x,to_y,to_z", "x,y,to_x,to_y")
     n = table.shape[1] // 2
@@ -103,11 +90,7 @@ def _motion(pose: FloatArray) -> FloatArray:
 
 
 def wall_points(surfaces: Sequence[Surface]) -> FloatArray:
-    """Points [n, 2] along the walls of surfaces seen from above, in equal steps.
-
-    Raises:
-        InputError: there is no wall.
-    """
+    """Points [n, 2] along the walls of surfaces seen from above, in equal steps; `InputError`: there is no wall."""
     walls = []
     for surface in surfaces:
         if surface.kind == "wall":
@@ -213,8 +196,8 @@ def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray,
 
 
 def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> float:
-    """Mean of the share of the scene that lies at walls and the share of the walls that the scene shows, each point
-    weighted by exp(-(d / 0.1 m)^2 / 2).
+    """Mean of the shares of the scene at walls, and of the walls in the scene, where distances d count exp(-(d / 0.1
+    m)^2 / 2).
     """
     to_walls, to_points = distance_to_walls(placed, walls), cKDTree(placed).query(targets)[0]
     near, shown = (np.exp(-0.5 * (away / (NEAR_M / 2)) ** 2) for away in (to_walls, to_points))

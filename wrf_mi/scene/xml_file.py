@@ -34,10 +34,8 @@ VALUES = (
     *("transform", "translate", "rotate", "scale", "matrix", "lookat"),
 )
 """Elements without a plugin. ``include``, ``path`` and ``alias`` are not among them: they reach other files."""
-FILES = ("filename",)
-"""Names of texts that are files."""
-DEEPEST = 64
-"""Most levels of elements: Mitsuba's reader calls itself for each."""
+FILES = ("filename",)  # names of texts that are files
+DEEPEST = 64  # most levels of elements: Mitsuba's reader calls itself for each
 
 
 def parsed_xml(path: Path) -> Element:

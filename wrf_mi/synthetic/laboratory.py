@@ -26,7 +26,7 @@ NAME = "laboratory"
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
 POSITIONS = 200
-OPTIONS = TraceOptions(max_depth=3, seed=1)
+OPTIONS = TraceOptions(depth=3, seed=1)
 SCANNER_M = ((2.0, 2.5, 1.5), (3.0, 5.0, 1.5), (5.5, 3.5, 1.5), (7.0, 1.8, 1.5), (7.6, 6.0, 1.6), (5.8, 1.0, 1.2))
 """Positions of the LiDAR, metres: five in the room and one in the inner room."""
 FORMAT = 5  # version of the files, to be raised when they change for equal parameters
@@ -71,7 +71,7 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
         "positions": POSITIONS,
         "scanner": [list(place) for place in SCANNER_M],
         "scanned_rays": SCANNED_RAYS,
-        "max_depth": OPTIONS.max_depth,
+        "max_depth": OPTIONS.depth,
         "rays_per_source": OPTIONS.rays,
         "seed": OPTIONS.seed,
     }

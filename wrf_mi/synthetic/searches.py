@@ -54,9 +54,9 @@ class Searches:
         """Options of the search for specular, and perhaps diffracted, paths, and of that for scattered ones."""
         shared: dict[str, Any] = {"transmission": True, "seed": self.seed, "scattering_coefficient": self.scattering}
         exact = TraceOptions(
-            diffraction=diffraction, max_depth=self.depth, max_reflections=self.reflections, rays=self.rays, **shared
+            diffraction=diffraction, depth=self.depth, reflections=self.reflections, rays=self.rays, **shared
         )
-        shared["max_depth"] = self.scattered_depth or self.depth
+        shared["depth"] = self.scattered_depth or self.depth
         return exact, TraceOptions(scattering=True, rays=self.scattered_rays, **shared)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -27,21 +27,15 @@ from .paths.solve import FIRST_RAYS, Prepared, spread, trace_paths
 
 logger = logging.getLogger(__name__)
 
-Spectra = Callable[[Paths], NDArray[Any]]
-"""Observations [n_rx, n, height, width] of an instrument for paths."""
+Spectra = Callable[[Paths], NDArray[Any]]  # observations [n_rx, n, height, width] of an instrument for paths
 
-SAMPLE = 24
-"""Transmitters on which convergence is judged."""
-SAMPLED_KINDS = 6
-"""Transmitters for diffraction and scattering, where each transmitter takes a separate search."""
-CHOSEN_KINDS = ("diffraction", "scattering")
-"""Kinds of path that are switched on where they count."""
-PARTS = 5
-"""Depth, rays, diffraction, scattering, their rays: each takes an equal share of the error."""
+SAMPLE = 24  # transmitters on which convergence is judged
+SAMPLED_KINDS = 6  # transmitters for diffraction and scattering, where each transmitter takes a separate search
+CHOSEN_KINDS = ("diffraction", "scattering")  # kinds of path that are switched on where they count
+PARTS = 5  # depth, rays, diffraction, scattering, their rays: each takes an equal share of the error
 MOST_SAMPLED_RAYS = 1 << 19
 """Largest number of rays with diffraction or scattering, where time and memory of each search grow with the rays."""
-STEEPEST = 0.95
-"""Largest q that is extrapolated; a series with a larger one does not count as convergent."""
+STEEPEST = 0.95  # largest q that is extrapolated; a series with a larger one does not count as convergent
 
 
 @dataclass(frozen=True)
@@ -99,7 +93,7 @@ class Choice:
                 return {key: finite(part) for key, part in value.items()}
             if isinstance(value, list | tuple):
                 return [finite(part) for part in value]
-            return "infinite" if isinstance(value, float) and np.isinf(value) else value
+            return "infinite" if value == float("inf") else value
 
         return finite(asdict(self) | {"spectrum_error": self.spectrum_error})
 
@@ -115,37 +109,64 @@ def remainder(changes: Sequence[float]) -> float:
     return float(last * q / (1 - q)) if q <= STEEPEST else float("inf")
 
 
-class _Sampled:
-    """Received power, and spectra, of sampled transmitters under several settings; ``trials`` lists what was tried."""
+@dataclass
+class _Search:
+    """Reports of sampled transmitters [n, 3] under several settings, and the settings that were tried.
 
-    def __init__(self, trace: Callable[..., TraceResult], positions: FloatArray, spectra: Spectra | None) -> None:
-        self._trace, self._spectra = trace, spectra
-        self._known: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = {}
-        self._positions = positions[spread(len(positions), SAMPLE)]
-        self.trials = [Trial("depth", 1, None, True)]
+    ``share_db`` is the largest change of a part that counts as converged.
+    """
 
-    def _reports(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
+    trace: Callable[..., TraceResult]
+    positions_m: FloatArray
+    spectra: Spectra | None
+    share_db: float
+    trials: list[Trial] = field(default_factory=lambda: [Trial("depth", 1, None, True)])
+    reports: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = field(default_factory=dict)
+
+    def _report(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
-        if (options, few) not in self._known:
-            sample = self._positions[spread(len(self._positions), SAMPLED_KINDS)] if few else self._positions
-            paths = self._trace(tx_pos_m=sample, options=options).paths
-            spectra = None if self._spectra is None else np.asarray(self._spectra(paths))
-            self._known[options, few] = rssi_dbm(paths), spectra
-        return self._known[options, few]
+        if (options, few) not in self.reports:
+            sample = self.positions_m[spread(len(self.positions_m), SAMPLED_KINDS)] if few else self.positions_m
+            paths = self.trace(tx_pos_m=sample, options=options).paths
+            spectra = None if self.spectra is None else np.asarray(self.spectra(paths))
+            self.reports[options, few] = rssi_dbm(paths), spectra
+        return self.reports[options, few]
 
-    def change(
-        self, part: str, value: int | bool, options: TraceOptions, other: TraceOptions, share: float = -1.0
-    ) -> float:
-        """Largest change in dB from some settings to others, kept where it is above a share, on the smaller sample."""
+    def change(self, part: str, value: int | bool, options: TraceOptions, least_db: float = -1.0) -> float:
+        """Largest change in dB by another value of a setting, which is kept where the change is above a least one."""
+        setting: dict[str, Any] = {part: value}
+        other = replace(options, **setting)
+        # Each transmitter takes a search of its own where paths are sampled, so fewer of them are compared.
         few = options.sampled or other.sampled
-        (a, before), (b, after) = self._reports(options, few), self._reports(other, few)
+        (a, before), (b, after) = self._report(options, few), self._report(other, few)
         spectrum = None if before is None or after is None else _relative(before, after)
-        change = float("inf")
+        change = float("inf")  # a pair of devices that gains or loses its only path
         if (np.isnan(a) == np.isnan(b)).all():
             power = float(np.nanmax(np.abs(a - b), initial=0.0))
             change = max(power, float(20 * np.log10(1 + (spectrum or 0.0))))
-        self.trials.append(Trial(part, value, change, change > share, spectrum))
+        self.trials.append(Trial(part, value, change, change > least_db, spectrum))
         return change
+
+    def depth(self, options: TraceOptions) -> tuple[TraceOptions, float]:
+        """Options with the converged depth, and the remainder in dB."""
+        now, changes = replace(options, depth=1, rays=FIRST_RAYS), list[float]()
+        while now.depth < MAX_DEPTH:
+            changes.append(self.change("depth", now.depth + 1, now))
+            now = replace(now, depth=now.depth + 1)
+            # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
+            if len(changes) > 1 and max(*changes[-2:], remainder(changes)) <= self.share_db:
+                break
+        return now, remainder(changes)
+
+    def rays(self, options: TraceOptions, most: int = MAX_RAYS) -> tuple[TraceOptions, float]:
+        """Options with the converged number of rays, and the last change in dB."""
+        assert isinstance(options.rays, int)
+        rays, calm, change = options.rays, 0, float("inf")
+        while calm < 2 and rays < most:
+            change = self.change("rays", 2 * rays, replace(options, rays=rays))
+            rays *= 2
+            calm = calm + 1 if change <= self.share_db else 0  # once may be chance: each number has other rays
+        return replace(options, rays=rays), change
 
 
 def _relative(a: FloatArray, b: FloatArray) -> float:
@@ -161,6 +182,7 @@ def choose_options(
     receivers: Receiver | Sequence[Receiver],
     target_db: float,
     options: TraceOptions,
+    *,
     kinds: Sequence[str] = CHOSEN_KINDS,
     spectra: Spectra | None = None,
     tx_antenna: Antenna = ANTENNA,
@@ -187,53 +209,25 @@ def choose_options(
     if not (np.isfinite(target_db) and target_db > 0):
         raise InputError(f"target-error {target_db}: give a number of dB above 0")
     trace = partial(trace_paths, scene, receivers=receivers, tx_antenna=tx_antenna, prepared=Prepared(scene))
-    sample = _Sampled(trace, np.atleast_2d(np.asarray(tx_pos_m, float)), spectra)
-    share = target_db / PARTS
-    now, error = _depth(sample, replace(options, diffraction=False, scattering=False), share)
-    now, more = _rays(sample, now, share)
-    error += more
+    positions = np.atleast_2d(np.asarray(tx_pos_m, float))
+    search = _Search(trace, positions[spread(len(positions), SAMPLE)], spectra, target_db / PARTS)
+    now, depth_db = search.depth(replace(options, diffraction=False, scattering=False))
+    now, error_db = search.rays(now)
+    error_db += depth_db
     now = replace(now, diffraction=options.diffraction, scattering=options.scattering)
-    for kind in CHOSEN_KINDS:
-        if kind not in kinds or getattr(options, kind):
-            continue
-        switched = replace(now, **{kind: True})
-        change = sample.change(kind, True, now, switched, share)
-        if change > share:
-            now = switched
+    for kind in (kind for kind in CHOSEN_KINDS if kind in kinds and not getattr(options, kind)):
+        change_db = search.change(kind, True, now, search.share_db)
+        if change_db > search.share_db:
+            now = replace(now, **{kind: True})
         else:
-            error += change
+            error_db += change_db
     if now.sampled:
         # Paths that are drawn at random, or along edges, need more rays.
-        now, more = _rays(sample, now, share, MOST_SAMPLED_RAYS)
-        error += more
+        now, change_db = search.rays(now, MOST_SAMPLED_RAYS)
+        error_db += change_db
     judged = ("power",) if spectra is None else ("power", "spectrum")
-    choice = Choice(now, target_db, error, tuple(sample.trials), judged)
+    choice = Choice(now, target_db, error_db, tuple(search.trials), judged)
     if not choice.reached:
         what = "received power is" if spectra is None else "power and spectra are"
-        logger.warning("%s converged to %.2g dB, not to the %.2g dB asked for", what, error, target_db)
+        logger.warning("%s converged to %.2g dB, not to the %.2g dB asked for", what, error_db, target_db)
     return choice
-
-
-def _depth(sample: _Sampled, options: TraceOptions, share: float) -> tuple[TraceOptions, float]:
-    """Options with the converged depth, and the remainder in dB."""
-    now, changes = replace(options, max_depth=1, rays=FIRST_RAYS), list[float]()
-    while now.max_depth < MAX_DEPTH:
-        deeper = replace(now, max_depth=now.max_depth + 1)
-        changes.append(sample.change("depth", deeper.max_depth, now, deeper))
-        now = deeper
-        # Twice: one more bounce may change nothing at the sampled positions, and the next one may.
-        if len(changes) > 1 and max(changes[-2:]) <= share and remainder(changes) <= share:
-            break
-    return now, remainder(changes)
-
-
-def _rays(sample: _Sampled, options: TraceOptions, share: float, most: int = MAX_RAYS) -> tuple[TraceOptions, float]:
-    """Options with the converged number of rays, and the last change in dB."""
-    assert isinstance(options.rays, int)
-    now, rays, calm, change = options, options.rays, 0, float("inf")
-    while calm < 2 and rays < most:
-        rays *= 2
-        change = sample.change("rays", rays, now, replace(now, rays=rays))
-        now = replace(now, rays=rays)
-        calm = calm + 1 if change <= share else 0  # once may be chance: each number has other rays
-    return now, change

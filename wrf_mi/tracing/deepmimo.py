@@ -29,8 +29,7 @@ from .paths.result import TraceResult
 
 logger = logging.getLogger(__name__)
 
-STATIONS, USERS = 0, 1
-"""Numbers of the sets of base stations and of users."""
+STATIONS, USERS = 0, 1  # numbers of the sets of base stations and of users
 CODES = {0: 0, 1: 1, 2: 3, 4: 4, 8: 2}
 """DeepMIMO's codes (1 reflection, 2 diffraction, 3 scattering, 4 transmission) of Sionna RT's kinds of interaction."""
 LOADED_PATHS = 25
@@ -38,11 +37,8 @@ LOADED_PATHS = 25
 
 
 def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
-    """Refuse a folder that cannot be written, or whose name ``deepmimo.load`` does not find.
-
-    Raises:
-        InputError: the folder exists and may not be replaced, or its name has capital letters or characters that
-            DeepMIMO refuses.
+    """Refuse (`InputError`) a folder that exists and may not be replaced, or that ``deepmimo.load`` does not find by
+    its name.
     """
     folder = Path(path)
     name = folder.resolve().name
@@ -123,6 +119,7 @@ def _ranks(paths: Paths) -> IntArray:
 
 def _matrices(paths: Paths, carrier_hz: float) -> dict[str, NDArray[Any]]:
     """Matrices by DeepMIMO's names with first axis p: dBW, degrees, seconds, metres."""
+    # Gains are without the carrier's phase, which DeepMIMO expects; whole turns are removed before the exponential.
     delay = paths.length_m / speed_of_light
     phase = np.angle(paths.gain * np.exp(-2j * np.pi * np.remainder(carrier_hz * delay, 1)), deg=True)
     # From the base station: the interactions of a path backwards.
@@ -131,6 +128,7 @@ def _matrices(paths: Paths, carrier_hz: float) -> dict[str, NDArray[Any]]:
     backwards = np.arange(len(paths))[:, None], bounces[:, None] - 1 - np.arange(depth)
     kinds = np.where(backwards[1] >= 0, paths.interactions[backwards], 0)
     vertices = np.where(backwards[1][..., None] >= 0, paths.vertices_m[backwards], np.nan)
+    # A decimal digit for each interaction, the first in the leading place.
     code = np.zeros(len(paths))
     for level in range(depth):
         digit = np.array([CODES[int(kind)] for kind in kinds[:, level]], float)
@@ -159,12 +157,12 @@ def _params(traced: TraceResult, paths: Paths, carrier_hz: float) -> dict[str, A
         "raytracer_name": "Sionna Ray Tracing",
         "raytracer_version": version("sionna-rt"),
         "frequency": carrier_hz,
-        "max_path_depth": options.max_depth,
-        "max_reflections": options.reflections,
+        "max_path_depth": options.depth,
+        "max_reflections": options.most_reflections,
         "max_diffractions": int(options.diffraction),
         "max_scattering": int(options.scattering),
-        "max_transmissions": options.max_depth if options.transmission else 0,
-        "diffuse_reflections": options.max_depth - 1 if options.scattering and options.reflection else 0,
+        "max_transmissions": options.depth if options.transmission else 0,
+        "diffuse_reflections": options.depth - 1 if options.scattering and options.reflection else 0,
         "diffuse_diffractions": 0,
         "diffuse_transmissions": 0,
         "diffuse_final_interaction_only": False,
@@ -181,14 +179,12 @@ def _params(traced: TraceResult, paths: Paths, carrier_hz: float) -> dict[str, A
         "raw_params": {"written_by": f"wrf-mi {__version__}", "phase": "with the carrier's exp(-j 2 pi f delay)"},
     }
     scene = {"num_scenes": 1, "n_objects": 0, "n_vertices": 0, "n_faces": 0, "n_triangular_faces": 0}
-    sets = (STATIONS, "base_stations", paths.n_rx, paths.rx), (USERS, "users", paths.n_tx, paths.tx)
-    return {
-        "version": VERSION,
-        "rt_params": rt_params,
-        "txrx_sets": {f"txrx_set_{key}": _set(key, name, count, reached) for key, name, count, reached in sets},
-        "materials": {},
-        "scene": {**scene, "representation": "hull"},
+    sets = {
+        "txrx_set_0": _set(STATIONS, "base_stations", paths.n_rx, paths.rx),
+        "txrx_set_1": _set(USERS, "users", paths.n_tx, paths.tx),
     }
+    scene_facts = {**scene, "representation": "hull"}
+    return {"version": VERSION, "rt_params": rt_params, "txrx_sets": sets, "materials": {}, "scene": scene_facts}
 
 
 def _set(number: int, name: str, count: int, reached: IntArray) -> dict[str, Any]:

@@ -3,26 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ..core import InputError
 
 MAX_DEPTH = 12
 MAX_RAYS = 1 << 24
-MAX_DEGREE = 8
-"""Largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`."""
+MAX_DEGREE = 8  # largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`
 FACTOR, DISC = "surface.factor", "surface.disc"
 """Parameters of Gaussians on surfaces (`wrf_mi.tracing.paths.surface_gaussians`): trained [2, g], logarithmic
 amplitudes and phases in rad, and constant [6, g], centres in metres and unit normals."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class SpecularOptions:
+    """Options of the search for specular paths, which the settings of every model with a scene embed.
+
+    Attributes:
+        depth: largest number of interactions per path, transmissions included.
+        reflections: largest number of reflections among them; None: ``depth``.
+        transmission: whether paths pass straight through surfaces (slabs of the material's thickness).
+        rays: number of rays from each source (best a power of two).
+    """
+
+    depth: Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")] = 3
+    reflections: int | None = 3
+    transmission: bool = True
+    rays: Annotated[int | Literal["auto"], Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
+
+    @property
+    def options(self) -> TraceOptions:
+        """Options of a trace: those that these settings have, and the defaults of all others."""
+        names = [field.name for field in fields(TraceOptions) if hasattr(self, field.name)]
+        return TraceOptions(**{name: getattr(self, name) for name in names})
+
+
 @dataclass(frozen=True)
-class TraceOptions:
+class TraceOptions(SpecularOptions):
     """Settings of `wrf_mi.tracing.trace_paths`; kinds of path that are off cost no time.
 
-    >>> options = TraceOptions(transmission=True, max_depth=4, max_reflections=1)
+    >>> options = TraceOptions(transmission=True, depth=4, reflections=1)
     >>> options.reflection, options.diffraction
     (True, False)
 
@@ -32,9 +55,9 @@ class TraceOptions:
         transmission: transmissions straight through surfaces (slabs of the material's thickness).
         diffraction: one diffraction at an edge.
         scattering: diffuse reflection with ``scattering_coefficient`` at every surface.
-        max_depth: largest number of interactions per path, transmissions included.
-        max_reflections: largest number of reflections among them, except in paths with scattering or diffraction;
-            None: ``max_depth``.
+        depth: largest number of interactions per path, transmissions included.
+        reflections: largest number of reflections among them, except in paths with scattering or diffraction; None:
+            ``depth``.
         rays: number of rays from each source (best a power of two), or ``"auto"``: doubled until the paths of a sample
             of positions converge, see `wrf_mi.tracing.paths.solve.converged_rays`.
         seed: seed of the rays' directions.
@@ -45,26 +68,22 @@ class TraceOptions:
 
     line_of_sight: bool = True
     reflection: bool = True
+    # The published figures of ``wrf-mi trace`` are those of paths that pass no wall.
     transmission: bool = False
     diffraction: bool = False
     scattering: bool = False
-    max_depth: int = 3
-    max_reflections: int | None = None
+    reflections: int | None = None
     rays: int | Literal["auto"] = 1 << 17
     seed: int = 1
     scattering_coefficient: float = 0.3
     phase_error: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            InputError: a setting that is out of range.
-        """
-        if not 0 <= self.max_depth <= MAX_DEPTH:
-            raise InputError(f"max_depth {self.max_depth}: give 0 to {MAX_DEPTH}")
-        if self.max_reflections is not None and self.max_reflections < 0:
-            raise InputError(f"max_reflections {self.max_reflections}: give 0 or more")
+        """Check the settings; `InputError` for one that is out of range."""
+        if not 0 <= self.depth <= MAX_DEPTH:
+            raise InputError(f"depth {self.depth}: give 0 to {MAX_DEPTH}")
+        if self.reflections is not None and self.reflections < 0:
+            raise InputError(f"reflections {self.reflections}: give 0 or more")
         if self.rays != "auto" and not (isinstance(self.rays, int) and 1 <= self.rays <= MAX_RAYS):
             raise InputError(f'rays {self.rays}: give 1 to {MAX_RAYS}, or "auto"')
         if self.seed < 0:
@@ -75,36 +94,35 @@ class TraceOptions:
             raise InputError(f"phase_error {self.phase_error}: give 0 or more, rad")
 
     @property
-    def reflections(self) -> int:
+    def most_reflections(self) -> int:
         """Largest number of reflections of a specular path."""
-        most = self.max_depth if self.max_reflections is None else min(self.max_reflections, self.max_depth)
-        return most if self.reflection else 0
+        stated = self.depth if self.reflections is None else self.reflections
+        return min(stated, self.depth) if self.reflection else 0
 
     @property
     def surfaces_met(self) -> int:
         """Largest number of surfaces that a ray of the search for specular paths meets."""
-        return self.max_depth if self.transmission else self.reflections
+        return self.depth if self.transmission else self.most_reflections
 
     @property
     def sampled(self) -> bool:
         """Whether paths are drawn at random (scattering) or along edges, by Sionna RT's search."""
-        return (self.diffraction or self.scattering) and self.max_depth > 0
+        return (self.diffraction or self.scattering) and self.depth > 0
 
 
 DEFAULTS = TraceOptions()
 
-FURTHER = ("transmission", "diffraction", "scattering")
-"""Kinds of path that are traced only where they are asked for."""
+FURTHER = ("transmission", "diffraction", "scattering")  # kinds of path that are traced only where they are asked for
 
 KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
 """Kinds of path in the command's terms."""
 
 
 def stated_kinds(text: str) -> dict[str, bool]:
-    """Fields of `TraceOptions` that trace the kinds of path, of `KINDS`, in a list separated by commas, and no others.
+    """Fields of `TraceOptions` that trace the kinds of path in a list separated by commas, and no others.
 
     Raises:
-        InputError: an unknown kind.
+        InputError: a kind that is not among `KINDS`.
     """
     asked = [kind.strip() for kind in text.split(",")]
     if unknown := [kind for kind in asked if kind not in KINDS]:
@@ -114,19 +132,20 @@ def stated_kinds(text: str) -> dict[str, bool]:
 
 def without_effect(options: TraceOptions) -> dict[str, str]:
     """Names of settings that differ from their defaults and change no path, with the reason."""
-    reflects, interacts = options.reflections > 0, options.reflection or any(getattr(options, kind) for kind in FURTHER)
+    reflects = options.most_reflections > 0
+    interacts = options.reflection or any(getattr(options, kind) for kind in FURTHER)
     by_rays, needs_rays = reflects or options.sampled, "no reflection, diffraction or scattering is traced"
     reasons = {
         # A depth of 0 says what such paths have.
-        "max_depth": (options.max_depth > 0 and not interacts, "no path has an interaction"),
-        "max_reflections": (bool(options.max_reflections) and not options.reflection, "no reflection is traced"),
+        "depth": (options.depth > 0 and not interacts, "no path has an interaction"),
+        "reflections": (bool(options.reflections) and not options.reflection, "no reflection is traced"),
         "rays": (not by_rays, needs_rays),
         "seed": (not by_rays, needs_rays),
-        **{kind: (options.max_depth == 0, "max_depth is 0") for kind in FURTHER},
+        **{kind: (options.depth == 0, "depth is 0") for kind in FURTHER},
         "scattering_coefficient": (not options.scattering, "no scattering is traced"),
         "phase_error": (not by_rays, needs_rays),
     }
-    if options.max_reflections is not None and options.reflection and options.max_reflections > options.max_depth:
-        reasons["max_reflections"] = True, f"max_depth is {options.max_depth}"
+    if options.reflections is not None and options.reflection and options.reflections > options.depth:
+        reasons["reflections"] = True, f"depth is {options.depth}"
     changed = {field.name for field in fields(options) if getattr(options, field.name) != getattr(DEFAULTS, field.name)}
     return {name: reason for name, (idle, reason) in reasons.items() if idle and name in changed}

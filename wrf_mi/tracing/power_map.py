@@ -35,13 +35,10 @@ from .search.devices import solid_around
 
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
-MOST_POINTS = 6000
-"""Most traced positions; the grid becomes wider for larger scenes."""
-LAYER_M = 0.5
-"""Greatest distance of the grid's layers over the transmitter's heights."""
+MOST_POINTS = 6000  # most traced positions; the grid becomes wider for larger scenes
+LAYER_M = 0.5  # greatest distance of the grid's layers over the transmitter's heights
 SAME_HEIGHT_M = 0.02
-LEAST_SHARE = 1e-3
-"""Least share of a neighbourhood outside of solids; below, the nearest point with more is used."""
+LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, the nearest point with more is used
 
 
 @dataclass(frozen=True)
@@ -123,46 +120,41 @@ class TracedPower:
         return TracedPower(local, self._trace, self._places[places], self._known, self._keeps)
 
 
-Traced = PowerMap | TracedPower
-"""Mean of signal strengths."""
+Traced = PowerMap | TracedPower  # mean of signal strengths
 
 
-def power_tracer(scene: Any, record: Record, max_depth: int, max_reflections: int) -> Tracer:
+def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
     """Function of `TracedPower` that traces a scene for a record's receivers."""
-    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
     prepared = Prepared(scene)
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": record.tx_antenna, "check": False}
 
     def trace(position_m: FloatArray, places: IntArray | None) -> FloatArray:
         receivers = record.receivers if places is None else [record.receivers[place] for place in places]
         power = np.full((len(receivers), len(position_m)), np.nan)
         outside = solid_around(prepared.surfaces, position_m) < 0
         if outside.any():
-            power[:, outside] = rssi_dbm(trace_paths(scene, position_m[outside], receivers, options, **how).paths)
+            power[:, outside] = _power_dbm(prepared, position_m[outside], receivers, options, record.tx_antenna)
         return power
 
     return trace
 
 
-def trace_map(
-    scene: Any, record: Record, spacing_m: float, smooth_m: float, max_depth: int, max_reflections: int
-) -> PowerMap:
+def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions) -> PowerMap:
     """Trace a scene on a grid over its extent and all of a record's positions.
 
-    Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: local means
-    exclude them, and they take the mean of the points outside, or the value of the nearest of these.
+    Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: they take the
+    mean of the points around them that are outside, or the nearest such mean.
 
     Args:
         scene: from `wrf_mi.tracing.open_scene`.
         record: receivers and heights of the transmitter.
         spacing_m: spacing of the grid.
         smooth_m: standard deviation of the Gaussian over which powers are averaged; 0: none.
-        max_depth: interactions of a path at most, transmissions included.
-        max_reflections: reflections of a path at most.
+        options: kinds of path, depth, rays.
 
     Raises:
         InputError: no path to a receiver from anywhere, or a scene filled by a solid.
     """
+    # The grid covers the scene and all positions; storeys of the transmitter's heights are layers of it.
     box = scene.mi_scene.bbox()
     low = np.minimum([box.min.x, box.min.y], record.tx_pos_m[:, :2].min(axis=0))
     high = np.maximum([box.max.x, box.max.y], record.tx_pos_m[:, :2].max(axis=0))
@@ -172,13 +164,13 @@ def trace_map(
     spacing = max(spacing_m, float(np.sqrt(np.prod(high - low) * layers / MOST_POINTS)))
     x_m, y_m = (np.linspace(a, b, 2 + int((b - a) / spacing)) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1)
-    options = TraceOptions(transmission=True, max_depth=max_depth, max_reflections=min(max_reflections, max_depth))
+    # Antennas inside solids have no path: nobody has stated these positions, so they are no error.
     points, prepared = grid.reshape(-1, 3), Prepared(scene)
     outside = solid_around(prepared.surfaces, points) < 0
     if not outside.any():
         raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
     traced = np.full((len(record.receivers), len(points)), np.nan)
-    traced[:, outside] = traced_powers(scene, prepared, points[outside], record.receivers, options, record.tx_antenna)
+    traced[:, outside] = traced_powers(prepared, points[outside], record.receivers, options, record.tx_antenna)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers, which lie further apart than the neighbourhood and may be on different floors.
@@ -186,8 +178,8 @@ def trace_map(
     power = _means_outside(power, outside.reshape(grid.shape[:3]), sigma, steps)
     for receiver, grid_mw in zip(record.receivers, power, strict=True):
         if not (grid_mw > 0).any():
-            raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or max_depth")
-        grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()
+            raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or depth")
+        grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()  # no path: as weak as the weakest point with one
     return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
 
 
@@ -202,8 +194,7 @@ def _means_outside(
     return np.asarray(mean[:, *nearest])
 
 
-def traced_powers(
-    scene: Any,
+def _power_dbm(
     prepared: Prepared,
     tx_pos_m: FloatArray,
     receivers: Sequence[Receiver],
@@ -211,6 +202,20 @@ def traced_powers(
     tx_antenna: Antenna,
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
+    return np.asarray(rssi_dbm(trace_paths(prepared.scene, tx_pos_m, receivers, options, **how).paths), float)
+
+
+def traced_powers(
+    prepared: Prepared,
+    tx_pos_m: FloatArray,
+    receivers: Sequence[Receiver],
+    options: TraceOptions,
+    tx_antenna: Antenna,
+) -> FloatArray:
+    """Received powers of `_power_dbm`, kept in the user's cache."""
+    # The key holds all that determines the powers, code and versions included; a stale file is never read.
+    scene = prepared.scene
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
     if (slab_of_face >= 0).all():  # other materials have no digest
@@ -223,8 +228,7 @@ def traced_powers(
         path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
         if path.exists():
             return np.asarray(stored_arrays(path)[POWER], float)
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
-    power = np.asarray(rssi_dbm(trace_paths(scene, tx_pos_m, receivers, options, **how).paths), float)
+    power = _power_dbm(prepared, tx_pos_m, receivers, options, tx_antenna)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {POWER: power})

@@ -28,9 +28,8 @@ logger = logging.getLogger(__name__)
 GAIN_DB = 10.0
 """Gain in median power by the other polarisation above which a link counts as cross-polarised. Reflections turn the
 polarisation of some paths, but a co-polarised link keeps most of its power."""
-SAMPLE = 256
-"""Transmitters on which the gain is judged."""
-TRACED, ROUGH = 32, TraceOptions(transmission=True, max_depth=2, max_reflections=1, rays=1 << 12)
+SAMPLE = 256  # transmitters on which the gain is judged
+TRACED, ROUGH = 32, TraceOptions(transmission=True, depth=2, reflections=1, rays=1 << 12)
 """Transmitters and options of the trace for models that do not trace all transmitters at once."""
 
 
@@ -94,6 +93,7 @@ class RayTracer:
         if carriers_hz is None:
             return traced
 
+        # Paths do not depend on the carrier, and are searched for once; gains are those of each row's carrier.
         def gains(carrier_hz: float, which: IntArray) -> NDArray[Any]:
             return recompute(traced.select(which), self._at(carrier_hz)).paths.gain
 
@@ -136,13 +136,10 @@ class Offsets:
 
 
 def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
-    """Fit an offset to each receiver: the median of measured minus traced, which minimises the absolute error.
+    """Fit an offset to each receiver: the median of measured minus traced training rows [n_rx, n].
 
-    A receiver that received nothing takes the mean offset of the others, and their weakest signal.
-
-    Args:
-        traced_dbm: shape [n_rx, n], NaN where no path arrives.
-        measured_dbm: measured training rows [n_rx, n], NaN where nothing was received.
+    Values are NaN where no path arrives, or where nothing was received. A receiver that received nothing takes the mean
+    offset of the others, and their weakest signal.
 
     Raises:
         InputError: a receiver that received rows, but none that was traced.
@@ -156,16 +153,15 @@ def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
                 f"receiver {receiver}: no training row is both received and reached by a path; trace more kinds of path"
             )
     offset_db, floor_dbm = np.empty((2, len(measured)))
+    # The median minimises the absolute error, by which signal strengths are scored.
     offset_db[heard], floor_dbm[heard] = np.nanmedian(difference[heard], axis=1), np.nanmin(measured[heard], axis=1)
     offset_db[~heard], floor_dbm[~heard] = offset_db[heard].mean(), floor_dbm[heard].min()
     return Offsets(offset_db, floor_dbm)
 
 
 def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
-    """Gains in dB, `GAIN_DB` or more, by the names of receivers whose polarisation is turned by 90 degrees.
-
-    Of the paths of `SAMPLE` transmitters, evenly spaced, in the scene in which they were traced.
-    """
+    """Gains in dB, `GAIN_DB` or more, by the names of receivers whose polarisation is turned by 90 degrees."""
+    # A sample, evenly spaced, in the scene in which it was traced: gains alone are computed anew.
     sample = traced.select(np.isin(traced.paths.tx, spread(len(traced.tx_pos_m), SAMPLE)))
     if sample.carriers_hz is not None:  # both at the scene's carrier
         sample = recompute(sample, scene)

@@ -169,7 +169,7 @@ def paths_content(
         options = getattr(getattr(settings, "traced", settings), "options", None)
         options = options if isinstance(options, TraceOptions) else TraceOptions()
         traced = trace_paths(scene, tx_pos_m, record.receivers, options, progress, tx_antenna=record.tx_antenna)
-        depth = traced.options.max_depth
+        depth = traced.options.depth
         source = f"traced for this view in {run.config.scene}, at most {depth} interactions, {traced.rays} rays"
     else:
         return None, []

@@ -24,7 +24,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
-TRACE = TraceOptions(max_depth=2, rays=1 << 12)
+TRACE = TraceOptions(depth=2, rays=1 << 12)
 QUICK = ("steps=60",)
 FLOAT32_GREY = 1e-4
 """Of greys that a batch of transmitters and a single one give: sums in single precision."""

@@ -304,14 +304,15 @@ def test_invalid_arguments_are_refused() -> None:
 
 def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:  # type: ignore[no-untyped-def]
     """A room with a metal wall across it: without measurements less power is predicted behind it."""
-    from wrf_mi.tracing import open_scene
+    from wrf_mi.tracing import TraceOptions, open_scene
 
     wall = trimesh.creation.box((0.1, 6.0, 3.0), trimesh.transformations.translation_matrix((3.0, 3.0, 1.5)))
     floor = trimesh.creation.box((8.0, 8.0, 0.1), trimesh.transformations.translation_matrix((3.0, 3.0, -0.05)))
     trimesh.util.concatenate([wall, floor]).export(tmp_path / "room.ply")
     scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
     record = made(20, noise_db=1.0)
-    model = fit_strengths(record, np.array([], int), trace_map(scene, record, 0.5, 0.3, 2, 1), FAST)
+    options = TraceOptions(transmission=True, depth=2, reflections=1)
+    model = fit_strengths(record, np.array([], int), trace_map(scene, record, 0.5, 0.3, options), FAST)
     # Equally far from the receiver at the origin, before the wall and behind it.
     seen, hidden = model.predict(Inputs(np.array([[0.0, 5.0, 1.3], [5.0, 0.7, 1.3]])), 0).mean
     assert seen > hidden + 5

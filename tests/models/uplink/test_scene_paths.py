@@ -42,7 +42,7 @@ def room() -> Record:
     """Sixteen transmitters in the laboratory, 25 dB above noise; what is scored has none."""
     receiver = replace(RECEIVER, array_m=planar_array(4, 6, 0.06))
     positions = transmitter_path(16)
-    options = TraceOptions(transmission=True, max_depth=2)
+    options = TraceOptions(transmission=True, depth=2)
     h = trace_channels(open_scene("laboratory", 2.437e9), receiver, positions, HZ, [options])
     seen = noisy(h, np.random.default_rng(0)).astype(np.complex64)
     return Record(

@@ -55,7 +55,7 @@ def _traced(problem: Problem, split: Split) -> PredictAll:
     """Traced reports; strengths with the offset of each receiver that fits its training rows."""
     record, how = problem.record, default_options(problem.record)
     stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
-    options = TraceOptions(transmission=True, max_depth=how.depth, max_reflections=how.reflections)
+    options = TraceOptions(transmission=True, depth=how.depth, reflections=how.reflections)
     assert problem.scene is not None
     tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
     offsets = None

@@ -22,6 +22,7 @@ from ...core import InputError, Prediction, Receiver, Split
 from ...core.files import write_atomically
 from ...correction.options import STRENGTHS
 from ...tasks import task_of
+from ...tracing.options import TraceOptions
 from ...tracing.paths.solve import Prepared
 from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ...tracing.tracer import check_polarization
@@ -34,8 +35,8 @@ from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
-REACH = STRENGTHS.depth, STRENGTHS.reflections
-"""Interactions of a path at most, and reflections among them."""
+TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)
+"""Paths of the traced mean: as deep as those of a correction."""
 DEFAULT = StrengthSettings()
 SEARCH_ROWS = 30
 """Least number of rows by which hyperparameters about an exact mean are searched."""
@@ -146,7 +147,7 @@ def _searched(mean: ExactMean | None) -> StrengthSettings:
 
 
 def _traced(problem: Problem) -> ExactMean:
-    trace, names = power_tracer(problem.opened_scene, problem.record, *REACH), _names(problem.record.receivers)
+    trace, names = power_tracer(problem.opened_scene, problem.record, TRACE), _names(problem.record.receivers)
     power = TracedPower(_local_mean(problem), trace, np.arange(len(names)), {})
     return lambda receivers: power.at(np.array([names.index(name) for name in _names(receivers)]))
 
@@ -156,7 +157,7 @@ def _names(receivers: Sequence[Receiver]) -> list[str]:
 
 
 def _local_mean(problem: Problem) -> PowerMap:
-    return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, *REACH)
+    return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, TRACE)
 
 
 def fit_in_scene(
@@ -183,7 +184,7 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
 
     @cache
     def tracer() -> Tracer:  # the scene is opened where something is traced
-        return power_tracer(inner.opened_scene, inner.record, *REACH)
+        return power_tracer(inner.opened_scene, inner.record, TRACE)
 
     return FittedStrengths(
         Strengths.from_arrays(arrays, lambda position_m, places: tracer()(position_m, places)), inner

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
-from ...tracing.options import TraceOptions
+from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays, keyed, under
 from .csi_bands import Bands, bands_of, known_rows, principal_axes, relative_error
@@ -140,7 +140,7 @@ BOTH_GAPS = (1, 2)
 
 
 @dataclass(frozen=True)
-class PathSettings(CheckedSettings):
+class PathSettings(SpecularOptions, CheckedSettings):
     """Settings of the search for paths.
 
     Attributes:
@@ -151,8 +151,6 @@ class PathSettings(CheckedSettings):
         final: steps of refinement after the last addition.
         spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
         choice_rows: validation rows that choose the wave model.
-        depth: with a scene: most interactions of its paths.
-        reflections: with a scene: reflections among them at most.
     """
 
     wavefront: Kind = "auto"
@@ -164,6 +162,7 @@ class PathSettings(CheckedSettings):
     choice_rows: Count = 16
     depth: Count = 5
     reflections: int = 3
+    rays: int = 1 << 17
 
 
 def choose(
@@ -250,8 +249,8 @@ def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
 def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
     if problem.scene is None:
         return None
-    options = TraceOptions(transmission=True, max_depth=settings.depth, max_reflections=settings.reflections)
-    return ScenePaths(problem.opened_scene, problem.record.receivers[0], problem.record.tx_antenna, options)
+    record = problem.record
+    return ScenePaths(problem.opened_scene, record.receivers[0], record.tx_antenna, settings.options)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import permutations
 
 import numpy as np
@@ -13,35 +12,15 @@ import trimesh
 
 from ...core.angles import FloatArray
 from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
-from .surfaces import KINDS, Kind, Surface, number_names
-from .surfaces import bodies as connected_bodies
+from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, number_names
 
-FLAT_M = 0.01
-"""Largest distance of the vertices of a facet's triangles from its plane."""
+FLAT_M = 0.01  # largest distance of the vertices of a facet's triangles from its plane
 PARALLEL = np.cos(np.radians(2))
-SMALLEST_M2 = 0.05
-"""Least area of a facet that bounds a room."""
-MOST_FACETS = 400
-"""Facets of a body; the rest of a curved or measured surface stays as it is."""
+SMALLEST_M2 = 0.05  # least area of a facet that bounds a room
+MOST_FACETS = 400  # facets of a body; the rest of a curved or measured surface stays as it is
 INSIDE_M = 0.01
-REACHES = 0.95
-"""Least share of the room's height of a solid that is part of the building: a column, a partition."""
-LAYERS_M = 0.5
-"""Largest distance between both faces of a floor or roof."""
-
-
-@dataclass(frozen=True)
-class _Body:
-    """Triangles [f, 3, 3] that are connected by their edges, see `wrf_mi.scene.mesh.surfaces.bodies`."""
-
-    corners_m: FloatArray
-    closed: bool
-    volume_m3: float
-
-    @cached_property
-    def bounds_m(self) -> FloatArray:
-        """Lowest and highest coordinates, shape [2, 3]."""
-        return _bounds(self.corners_m)
+REACHES = 0.95  # least share of the room's height of a solid that is part of the building: a column, a partition
+LAYERS_M = 0.5  # largest distance between both faces of a floor or roof
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,26 +46,24 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     Returns:
         Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.
     """
-    triangles = [surface.vertices_m[surface.faces] for surface in surfaces]
-    bodies = [
-        _Body(corners[faces], closed, volume_m3)
-        for corners in triangles
-        for faces, closed, volume_m3 in connected_bodies(corners)
-    ]
-    facets = _room_facets(bodies)
+    parts_of = [bodies(surface.vertices_m[surface.faces]) for surface in surfaces]
+    mesh_bodies = [body for of_surface in parts_of for body in of_surface]
+    facets = _room_facets(mesh_bodies)
     if not facets:
         return list(surfaces)
-    low, high = _bounds(np.concatenate([facet.corners_m for facet in facets]))[:, 2]
+    low, high = bounds(np.concatenate([facet.corners_m for facet in facets]))[:, 2]
     roles = _same_on_both_sides(facets, kinds(facets, float(low + high) / 2))
     parts: list[tuple[Kind, FloatArray]] = []
-    without_role = [np.ones(len(body.corners_m), bool) for body in bodies]
+    without_role = [np.ones(len(body.corners_m), bool) for body in mesh_bodies]
     for role, facet in zip(roles, facets, strict=True):
         if role != "other":
             parts.append((role, facet.corners_m))
             without_role[facet.body] &= ~facet.rows
     if not parts:
         return list(surfaces)
-    parts += [("other", body.corners_m[rows]) for body, rows in zip(bodies, without_role, strict=True) if rows.any()]
+    parts += [
+        ("other", body.corners_m[rows]) for body, rows in zip(mesh_bodies, without_role, strict=True) if rows.any()
+    ]
     parts.sort(key=lambda part: (KINDS.index(part[0]), -trimesh.triangles.area(part[1]).sum()))
     split = []
     for name, (kind, corners) in zip(number_names([kind for kind, _ in parts]), parts, strict=True):
@@ -95,11 +72,11 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     return split
 
 
-def _room_facets(bodies: Sequence[_Body]) -> list[_Facet]:
+def _room_facets(mesh_bodies: Sequence[Body]) -> list[_Facet]:
     """Facets that may be floors, ceilings and walls: sheets and slabs, and flat parts of bodies that bound rooms."""
-    slabs = {index: slab for index, body in enumerate(bodies) if (slab := _slab(body, index))}
-    others = {index: body for index, body in enumerate(bodies) if index not in slabs}
-    shell_m = [_bounds(np.concatenate([slab.corners_m for slab in slabs.values()]))] if slabs else []
+    slabs = {index: slab for index, body in enumerate(mesh_bodies) if (slab := _slab(body, index))}
+    others = {index: body for index, body in enumerate(mesh_bodies) if index not in slabs}
+    shell_m = [bounds(np.concatenate([slab.corners_m for slab in slabs.values()]))] if slabs else []
     facets = [*slabs.values()]
     for index, body in others.items():
         if _bounds_rooms(body, [other for other in others.values() if other is not body], shell_m):
@@ -107,7 +84,7 @@ def _room_facets(bodies: Sequence[_Body]) -> list[_Facet]:
     return [facet for facet in facets if _is_large(facet)]
 
 
-def _slab(body: _Body, index: int) -> _Facet | None:
+def _slab(body: Body, index: int) -> _Facet | None:
     """A body that is a sheet or slab as one facet in its middle, or None."""
     cross = trimesh.triangles.cross(body.corners_m)
     normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
@@ -118,7 +95,7 @@ def _slab(body: _Body, index: int) -> _Facet | None:
     return _facet(body, np.ones(len(away), bool), normal, float(away.min() + away.max()) / 2, index)
 
 
-def _facets(body: _Body, index: int) -> Iterator[_Facet]:
+def _facets(body: Body, index: int) -> Iterator[_Facet]:
     """Flat parts of a body, whichever way their normals point, each about the largest triangle that is left."""
     cross = trimesh.triangles.cross(body.corners_m)
     size = np.linalg.norm(cross, axis=-1)
@@ -137,7 +114,7 @@ def _facets(body: _Body, index: int) -> Iterator[_Facet]:
         yield _facet(body, inside, normal, offset, index)
 
 
-def _facet(body: _Body, rows: Mask, normal: FloatArray, offset_m: float, index: int) -> _Facet:
+def _facet(body: Body, rows: Mask, normal: FloatArray, offset_m: float, index: int) -> _Facet:
     corners = body.corners_m[rows]
     plane = with_axes(Plane(normal, offset_m, corners[:, [0, 1, 2, 2]], corners.mean(axis=(0, 1)), 0.0))
     flat = shapely.polygons(plane.flat(corners))
@@ -151,11 +128,8 @@ def _is_large(facet: _Facet) -> bool:
     return facet.area.area >= SMALLEST_M2 and not low
 
 
-def _bounds_rooms(body: _Body, others: Sequence[_Body], shell_m: Sequence[FloatArray]) -> bool:
-    """Whether the facets of a body may be floors, ceilings and walls.
-
-    ``others`` are the other bodies but for slabs, and ``shell_m`` the bounds [2, 3] of all slabs, if there are any.
-    """
+def _bounds_rooms(body: Body, others: Sequence[Body], shell_m: Sequence[FloatArray]) -> bool:
+    """Whether the facets of a body may bound rooms, among other bodies and a shell of slabs [2, 3]."""
     if not body.closed:
         return True
     height_m = np.ptp(body.bounds_m[:, 2])
@@ -164,20 +138,15 @@ def _bounds_rooms(body: _Body, others: Sequence[_Body], shell_m: Sequence[FloatA
     around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
     if any(_is_cavity(body, other) for other in around):
         return True
-    outer_m = [other.bounds_m for other in around] + [bounds for bounds in shell_m if _within(body.bounds_m, bounds)]
-    return all(height_m >= REACHES * np.ptp(bounds[:, 2]) for bounds in outer_m)
+    outer_m = [other.bounds_m for other in around] + [shell for shell in shell_m if _within(body.bounds_m, shell)]
+    return all(height_m >= REACHES * np.ptp(outer[:, 2]) for outer in outer_m)
 
 
-def _is_cavity(body: _Body, outer: _Body) -> bool:
+def _is_cavity(body: Body, outer: Body) -> bool:
     """Whether a body is a room in a solid around it: normals face each other, and it is clear of floor and ceiling."""
     (low, high), (floor, ceiling) = body.bounds_m[:, 2], outer.bounds_m[:, 2]
     clear = low > floor + INSIDE_M and high < ceiling - INSIDE_M  # furniture stands on the floor
     return bool(outer.closed and body.volume_m3 < 0 < outer.volume_m3 and clear)
-
-
-def _bounds(corners_m: FloatArray) -> FloatArray:
-    """Lowest and highest coordinates [2, 3] of triangles [f, 3, 3]."""
-    return np.stack([corners_m.min(axis=(0, 1)), corners_m.max(axis=(0, 1))])
 
 
 def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:

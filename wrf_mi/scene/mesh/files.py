@@ -28,15 +28,12 @@ logger = logging.getLogger(__name__)
 SUFFIXES = (".ply", ".stl", ".obj", ".glb")
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
-SMALLEST_FACE_M2 = 1e-10
-"""Smaller faces are degenerate: nothing reflects from them, and their normals are noise."""
+SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
 STL_HEADER, STL_FACE = 84, 50
 """Bytes of the header of a binary STL file, whose last four are the number of triangles, and of a triangle."""
-FLAT_POLYGON = 1e-9
-"""Least ratio of a polygon's second extent to its first; below it has no area."""
-COLLINEAR = 1e-6
-"""Sine of the angle below which a corner lies in a straight side: rounding of float32."""
+FLAT_POLYGON = 1e-9  # least ratio of a polygon's second extent to its first; below it has no area
+COLLINEAR = 1e-6  # sine of the angle below which a corner lies in a straight side: rounding of float32
 GRID = 1e-5
 """Distance relative to a polygon's extent at which its corners and sides touch: that rounding some metres away."""
 
@@ -138,13 +135,7 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
 
 
 def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | Path) -> list[Surface]:
-    """The surfaces of parts of a mesh without degenerate and doubled faces, see `read_mesh`.
-
-    Args:
-        parts: parts of one mesh, in their unit.
-        unit_m: length of the unit, metres.
-        name: name of the mesh, for messages.
-    """
+    """Surfaces of parts of a mesh, in a unit of some metres, without degenerate and doubled faces, see `read_mesh`."""
     require_precise(np.concatenate([part.vertices for part in parts]), unit_m, name)
     surfaces = []
     for part_name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
@@ -165,17 +156,11 @@ def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | 
 
 
 def triangles_of(polygons: Polygons) -> tuple[IntArray, IntArray]:
-    """Triangles that fill polygons.
+    """Triangles [t, 3] that fill polygons, and the number of each triangle's polygon [t].
 
-    Convex polygons are fans about their first corner, as other programs have them. Others become Delaunay triangles in
-    their plane, with all corners; a hole that is joined to the outline by an edge there and back stays open. Polygons
-    without an area are fans, too.
-
-    Returns:
-        Vertex indices of the triangles [t, 3], and the number of each triangle's polygon [t].
-
-    Raises:
-        ValueError: a polygon whose edges cross or that covers a place twice, by its place in the file.
+    Convex polygons, and those without an area, are fans about their first corner, as other programs have them. Others
+    become Delaunay triangles in their plane, with all corners; a hole that is joined to the outline by an edge there
+    and back stays open. `ValueError`, by its place in the file, for one whose edges cross or that covers a place twice.
     """
     polygons = _without_repeats(polygons)
     first = np.cumsum(polygons.sizes) - polygons.sizes
@@ -220,10 +205,7 @@ def _fan(size: int) -> IntArray:
 
 
 def _convex(corners: FloatArray) -> NDArray[np.bool_]:
-    """Whether each polygon [n, s, 3] turns one way at all corners, and round once.
-
-    One with a corner in a straight side does not: a fan about its neighbour would have a triangle without an area.
-    """
+    """Whether each polygon [n, s, 3] turns one way at all corners, and round once."""
     edges = np.roll(corners, -1, axis=1) - corners
     following = np.roll(edges, -1, axis=1)
     normal = _normal(corners)
@@ -233,6 +215,7 @@ def _convex(corners: FloatArray) -> NDArray[np.bool_]:
     cosine = (edges * following).sum(axis=-1)
     # A star turns one way at all corners, too, but twice round.
     rounds = np.arctan2(sine, cosine).sum(axis=-1) / (2 * np.pi)
+    # One with a corner in a straight side does not: a fan about its neighbour would have a triangle without an area.
     convex: NDArray[np.bool_] = (sine > COLLINEAR * size).all(axis=-1) & (rounds < 1.5)
     return convex
 

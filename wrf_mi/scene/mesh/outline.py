@@ -17,34 +17,28 @@ from .planes import Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)
-POINTS_PER_CELL = 8
-"""Number of points in the cells of the sparse fifth of the area, which sets the cells' size."""
+POINTS_PER_CELL = 8  # number of points in the cells of the sparse fifth of the area, which sets the cells' size
 SHARE = 0.2
 """Least number of points of an occupied cell, relative to those around it: half of the last cell is on the plane."""
 EDGE_SHARE = 0.3
 """Share of a cell by which an edge is found too far out: a last cell filled to a share x of `SHARE` to 1 counts, and
 the mean of 1 - x times its chance is 0.32."""
 AROUND_CELLS = 5
-CLOSED_CELLS = 1
-"""Gaps of up to twice this many cells are noise."""
+CLOSED_CELLS = 1  # gaps of up to twice this many cells are noise
 STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
 """A stray part of an area is smaller than this share of the whole and sparser than this share."""
 SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
-RECTANGLE_SHARE = 0.88
-"""Least share of its tightest rectangle that a rectangular area fills."""
+RECTANGLE_SHARE = 0.88  # least share of its tightest rectangle that a rectangular area fills
 SCAN_LINES = 31
 SHADOW_CELL_M = 0.1
 BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
 """Largest distance from a surface of what hides it: cupboards; tables and lamps."""
-HIDDEN_SHARE = 0.5
-"""Least share of a gap before which something stands, for the gap to be filled."""
+HIDDEN_SHARE = 0.5  # least share of a gap before which something stands, for the gap to be filled
 SMALLEST_GAP_M2 = 0.02
-STEEPEST = np.cos(np.radians(20))
-"""Planes that meet at a smaller angle have no reliable line in common."""
+STEEPEST = np.cos(np.radians(20))  # planes that meet at a smaller angle have no reliable line in common
 GRID_M = 1e-5
-PASSES = 2
-"""Number of passes over all pairs of planes; the second pass closes the corner of three planes."""
+PASSES = 2  # number of passes over all pairs of planes; the second pass closes the corner of three planes
 
 
 def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
@@ -74,8 +68,8 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
 def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
     """The area of a floor, ceiling or wall with its shadows filled: gaps before which things stand.
 
-    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. ``points_m`` [n,
-    3] are those of things alone: floors, ceilings and walls are seen through a gap and do not hide it.
+    A gap with nothing before it (a door, a window, the missing quarter of an L-shaped room) stays. The points [n, 3]
+    are those of things alone, since floors, ceilings and walls are seen through a gap and do not hide it.
     """
     if kind == "other":
         return area
@@ -100,11 +94,10 @@ def polygons(area: Any) -> list[Any]:
 
 
 def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]) -> list[Any]:
-    """Extend or cut areas to the lines where their planes meet.
+    """Areas (shapely, each in its plane's coordinates) extended or cut to the lines where their planes meet.
 
     Where two areas come within ``reach_m`` of the common line along the same stretch of it, an area on one side of the
-    line is made to end there; an area on both sides stays, and the other ends at it. The areas (shapely) are in the
-    coordinates of their planes.
+    line is made to end there; an area on both sides stays, and the other ends at it.
     """
     areas = list(areas)
     corners = [_corners(plane, area) for plane, area in zip(planes, areas, strict=True)]

@@ -14,18 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from ...core.angles import FloatArray
 from .surfaces import Kind
 
-THICKEST_M = 0.3
-"""A thicker box holds more than a plane."""
-MARGIN_M = 0.15
-"""A plane may reach this far beyond the patch it was found as."""
-LEVEL = np.cos(np.radians(10))
-"""Cosine of the largest slope of a floor."""
-UPRIGHT = np.sin(np.radians(20))
-"""Sine of the largest lean of a wall."""
-STOREY_M = 1.8
-"""Least height of a room."""
-SLAB_M = 1.0
-"""Largest distance from a ceiling to the floor above it."""
+THICKEST_M = 0.3  # a thicker box holds more than a plane
+MARGIN_M = 0.15  # a plane may reach this far beyond the patch it was found as
+LEVEL = np.cos(np.radians(10))  # cosine of the largest slope of a floor
+UPRIGHT = np.sin(np.radians(20))  # sine of the largest lean of a wall
+STOREY_M = 1.8  # least height of a room
+SLAB_M = 1.0  # largest distance from a ceiling to the floor above it
 LARGE_SHARE, LARGE_M2 = 0.2, 6.0
 """Floors and ceilings have at least this share of the largest level plane's area, or this area."""
 WALL_SHARE, WALL_HEIGHT_M = 0.7, 2.0
@@ -116,12 +110,7 @@ def over(plane: Plane, area: Any, points_m: FloatArray, band_m: float) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A plane where it was seen.
-
-    Attributes:
-        plane: the plane.
-        area: shapely, in the coordinates of the plane.
-    """
+    """A plane where it was seen: its area (shapely) in the coordinates of the plane."""
 
     plane: Plane
     area: Any
@@ -154,11 +143,11 @@ class Face:
 
 
 def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
-    """The role of each face.
+    """The role of each face, of which the median height of the points separates floors from ceilings if there is one
+    alone.
 
     Level faces that are large are floors and ceilings in turn from the lowest up, at least `STOREY_M` apart; steeper
-    large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls. The median
-    height of the points, ``middle_m``, separates floors from ceilings where there is only one of them.
+    large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls.
     """
     least_m2 = least_level_area(faces)
     large = sorted((face for face in faces if face.area.area >= least_m2), key=lambda face: face.span_m[0])

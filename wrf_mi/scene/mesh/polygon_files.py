@@ -25,12 +25,9 @@ PLY_TYPES = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8"},
 }
 PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-CORNERS = ("vertex_indices", "vertex_index")
-"""Names that writers of PLY give the list of a face's vertices."""
-FACES = ("face", "tristrips")
-"""Elements of PLY that make a mesh of points."""
-LONGEST_HEADER = 1 << 20
-"""Bytes in which a PLY file's header has to end."""
+CORNERS = ("vertex_indices", "vertex_index")  # names that writers of PLY give the list of a face's vertices
+FACES = ("face", "tristrips")  # elements of PLY that make a mesh of points
+LONGEST_HEADER = 1 << 20  # bytes in which a PLY file's header has to end
 
 
 @dataclass(frozen=True)
@@ -62,11 +59,7 @@ class Polygons:
 
 
 def read_obj(path: Path) -> Polygons:
-    """Polygons of a Wavefront OBJ file; faces of one material (``usemtl``) are one part.
-
-    Raises:
-        ValueError: a damaged line, by its number.
-    """
+    """Polygons of a Wavefront OBJ file, a part for each material (``usemtl``); `ValueError` for a damaged line."""
     vertices: list[list[float]] = []
     corners: list[int] = []
     sizes, lines, parts = list[int](), list[int](), list[int]()
@@ -129,10 +122,7 @@ def _obj_index(word: str, count: int) -> int:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """An element of a PLY file: its name, number of rows, and properties.
-
-    A property has a name, a NumPy type, and for a list the type of the number before it, else None.
-    """
+    """An element of a PLY file: rows of properties with a name, a NumPy type, and for a list the type of its length."""
 
     name: str
     count: int
@@ -140,11 +130,7 @@ class PlyElement:
 
 
 def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
-    """Elements of a PLY file, its byte order (``<``, ``>``, or empty for text), and where its body begins.
-
-    Raises:
-        ValueError: no header of a PLY file.
-    """
+    """Elements of a PLY file, its byte order (``<``, ``>``, or empty for text), and where its body begins."""
     # The line end may be LF, CR LF or CR; of binary data none may be taken for a part of it.
     begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\n|\r)", content)
     end = begin and re.compile(rb"end_header[ \t]*" + begin[1]).search(content[:LONGEST_HEADER])
@@ -171,10 +157,7 @@ def ply_header(content: bytes) -> tuple[list[PlyElement], str, int]:
 
 
 def read_ply(path: Path) -> Polygons:
-    """Polygons of a PLY file as one part.
-
-    Raises:
-        ValueError: a damaged file, or one without vertices.
+    """Polygons of a PLY file as one part; `ValueError` for a damaged file, or one without vertices.
 
     Source: G. Turk, "The PLY polygon file format" (1994).
     """
@@ -211,10 +194,7 @@ def read_ply(path: Path) -> Polygons:
 
 
 def _ply_columns(body: bytes, at: int, element: PlyElement, order: str) -> tuple[dict[str, Any], int]:
-    """Values of an element's properties by name, and where the next element begins.
-
-    A property is an array [n]; a list is its values, row after row, and the number of them in each row [n].
-    """
+    """Values [n] of an element's properties by name, of lists with their lengths [n]; where the next element begins."""
     if not element.count:
         return {}, at
     try:

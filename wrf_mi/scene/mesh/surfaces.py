@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -43,6 +44,28 @@ class Surface:
         return trimesh.Trimesh(self.vertices_m, self.faces, process=False)
 
 
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Triangles that are connected by their edges.
+
+    Attributes:
+        faces: numbers of its triangles among those that were given [n].
+        corners_m: their corners [n, 3, 3], metres.
+        closed: whether two of them meet at every edge.
+        volume_m3: volume of a closed body: positive where the normals point outwards, 0 where they disagree.
+    """
+
+    faces: IntArray
+    corners_m: FloatArray
+    closed: bool
+    volume_m3: float
+
+    @cached_property
+    def bounds_m(self) -> FloatArray:
+        """Lowest and highest coordinates, shape [2, 3]."""
+        return bounds(self.corners_m)
+
+
 def number_names(kinds: Sequence[str]) -> list[str]:
     """A unique name for each part: ``floor``, or ``wall_01``, ``wall_02``, ... where a kind comes more than once."""
     names, total, number = [], Counter(kinds), Counter[str]()
@@ -57,10 +80,15 @@ def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:
     return [replace(surface, vertices_m=trimesh.transform_points(surface.vertices_m, matrix)) for surface in surfaces]
 
 
+def bounds(points_m: FloatArray) -> FloatArray:
+    """Lowest and highest coordinates [2, 3] of points [..., 3]."""
+    points = points_m.reshape(-1, 3)
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
 def box_of(surfaces: Sequence[Surface]) -> FloatArray:
     """Lower and upper corner [2, 3] of the box around surfaces, metres."""
-    corners = np.concatenate([surface.vertices_m for surface in surfaces])
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return bounds(np.concatenate([surface.vertices_m for surface in surfaces]))
 
 
 def cut_lines(surface: Surface, height_m: float) -> FloatArray:
@@ -72,8 +100,7 @@ def cut_lines(surface: Surface, height_m: float) -> FloatArray:
 def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
     """Edges of triangles [f, 3, 3], the same for faces whose corners coincide.
 
-    Returns:
-        Number of the edge from each corner of each face to its next, shape [3 f], and both ends' vertices [3 f, 2].
+    Returns the number of the edge from each corner of each face to its next [3 f], and both ends' vertices [3 f, 2].
     """
     _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
@@ -89,13 +116,8 @@ def sampled(triangles: FloatArray, count: int = 20_000) -> FloatArray:
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
 
 
-def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
-    """Bodies of triangles [f, 3, 3] that are connected by their edges.
-
-    Returns:
-        Of each body its faces [n], whether it is closed (two faces at every edge), and the volume in m^3 of a closed
-        body: positive where the normals point outwards, 0 where they disagree.
-    """
+def bodies(corners_m: FloatArray) -> list[Body]:
+    """Bodies of triangles [f, 3, 3], metres."""
     count = len(corners_m)
     if not count:
         return []
@@ -110,4 +132,7 @@ def bodies(corners_m: FloatArray) -> list[tuple[IntArray, bool, float]]:
     a, b, c = (corners_m - corners_m[0, 0]).transpose(1, 0, 2)
     volume = np.bincount(body, (a * np.cross(b, c)).sum(axis=1) / 6) * (crossed == 0)
     members = np.split(np.argsort(body, kind="stable"), np.cumsum(np.bincount(body))[:-1])
-    return list(zip(members, (unpaired == 0).tolist(), volume.tolist(), strict=True))
+    closed = (unpaired == 0).tolist()
+    return [
+        Body(faces, corners_m[faces], *facts) for faces, *facts in zip(members, closed, volume.tolist(), strict=True)
+    ]

@@ -18,27 +18,19 @@ from ...core.angles import FloatArray
 from .lines import rotation_2d
 from .sources import POINT_CELL_M, Mask, PlanGrid, grid_from_points
 
-STANDING_S = 1.0
-"""Largest time between successive scans of a stop."""
-SAME_STOP = 0.6
-"""Least match of a scan with the stop before it; two scans from the same place match to 0.8 or more."""
-SAME_PLACE = 0.5
-"""Least match of a stop with the map; with less it keeps its pose."""
-STAYS = 0.2
-"""Least share of a stop's scans that see a cell: moving things and noise are seen once."""
+STANDING_S = 1.0  # largest time between successive scans of a stop
+SAME_STOP = 0.6  # least match of a scan with the stop before it; two scans from the same place match to 0.8 or more
+SAME_PLACE = 0.5  # least match of a stop with the map; with less it keeps its pose
+STAYS = 0.2  # least share of a stop's scans that see a cell: moving things and noise are seen once
 POSE_DEVIATION_M, POSE_DEVIATION_RAD = 0.4, np.radians(8)
 """Standard deviations of a robot's positioning; they penalise matches with the wrong wall."""
 POSE_WEIGHT = 0.05
-HIDDEN_SHARE = 0.15
-"""Largest share of a scan's returns that may lie behind others as seen from the sensor."""
+HIDDEN_SHARE = 0.15  # largest share of a scan's returns that may lie behind others as seen from the sensor
 BEHIND_M = 0.15
 """Least distance by which a return lies behind another in the same direction, more than the slope of an edge."""
-BEARINGS = 240
-"""Directions in which returns hide one another."""
-SECTORS = 36
-"""Sectors over which returns are spread evenly."""
-SEARCH_M = 0.1
-"""Step of the search for the sensor."""
+BEARINGS = 240  # directions in which returns hide one another
+SECTORS = 36  # sectors over which returns are spread evenly
+SEARCH_M = 0.1  # step of the search for the sensor
 ROUNDS = 3
 
 Step = tuple[float, float, float, float]
@@ -116,12 +108,8 @@ class _Canvas:
 def grid_from_scans(xy_m: FloatArray, time_s: FloatArray) -> PlanGrid:
     """A map in cells of `POINT_CELL_M`: cells that were hit, and cells that beams went through.
 
-    Args:
-        xy_m: returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres.
-        time_s: time of each return's scan, shape [n].
-
-    Raises:
-        InputError: as `wrf_mi.scene.plan.sources.grid_from_points`.
+    Of returns [n, 2] in a common frame, each scan moved by its pose, which may be off by some decimetres, and the time
+    of each return's scan [n]. Errors are those of `wrf_mi.scene.plan.sources.grid_from_points`.
     """
     grid_from_points(xy_m)  # raises before the search
     canvas = _Canvas(xy_m)
@@ -165,9 +153,6 @@ def _stops(xy_m: FloatArray, time_s: FloatArray, canvas: _Canvas) -> list[_Stop]
 def sensor_of(scan_m: FloatArray) -> FloatArray | None:
     """Place [2] of the sensor of a scan [n, 2]: the fewest returns lie behind others; None where too many do
     everywhere.
-
-    Of places in a convex room that see all returns, it is the place from which they are spread most evenly over the
-    directions, because a sensor turns at a constant rate.
     """
     # Most returns surround the sensor, few come from far away.
     low, high = np.percentile(scan_m, (2, 98), axis=0)
@@ -176,7 +161,8 @@ def sensor_of(scan_m: FloatArray) -> FloatArray | None:
     hidden, uneven = np.array([_seen_from(scan_m, place) for place in places]).T
     if hidden.min() > HIDDEN_SHARE * len(scan_m):
         return None
-    # In a convex room all places see all returns: among those that hide as few, the evenest is taken.
+    # In a convex room all places see all returns: among those that hide as few, returns are spread most evenly about
+    # the sensor, because it turns at a constant rate.
     possible = hidden <= hidden.min() + 0.01 * len(scan_m)
     return np.asarray(places[possible][np.argmin(uneven[possible])])
 

@@ -17,24 +17,16 @@ from ...core.angles import FloatArray
 from ..mesh.outline import large_parts
 from .sources import Mask, PlanGrid
 
-HALF_WIDTH_M = 0.1
-"""Largest distance of cells that support a line: half the width of a blurred wall."""
+HALF_WIDTH_M = 0.1  # largest distance of cells that support a line: half the width of a blurred wall
 CLEARED_M = 0.2
 """Largest distance of cells that are explained by a run; they support no other run along the same stretch."""
-LARGEST_HOLE_M = 0.25
-"""Largest hole in a run, narrower than any door."""
-SHORTEST_RUN_M = 0.4
-"""Least length of a run; shorter pieces may be clutter."""
-FILLED = 0.6
-"""Least share of a run's length that holds occupied cells."""
-LARGEST_RISE_M = 0.2
-"""Cells that rise by more across a run climb through its window: a wall of another direction."""
-SMALLEST_BLOB_CELLS = 4
-"""Least number of connected occupied cells; fewer are stray returns."""
-SMALLEST_ROOM_M2 = 1.0
-"""Least area of a room; smaller free areas are gaps that beams went through."""
-PEAK = 0.1
-"""Share of the range of the sharpness, from the top, that counts as its peak."""
+LARGEST_HOLE_M = 0.25  # largest hole in a run, narrower than any door
+SHORTEST_RUN_M = 0.4  # least length of a run; shorter pieces may be clutter
+FILLED = 0.6  # least share of a run's length that holds occupied cells
+LARGEST_RISE_M = 0.2  # cells that rise by more across a run climb through its window: a wall of another direction
+SMALLEST_BLOB_CELLS = 4  # least number of connected occupied cells; fewer are stray returns
+SMALLEST_ROOM_M2 = 1.0  # least area of a room; smaller free areas are gaps that beams went through
+PEAK = 0.1  # share of the range of the sharpness, from the top, that counts as its peak
 DIRECTION_STEP_RAD = np.radians(0.25)
 ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
 

@@ -26,18 +26,12 @@ Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
-NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")
-"""Arrays of numbers in an NPZ file."""
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")  # arrays of numbers in an NPZ file
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
-FREE_PROBABILITY = 0.196
-"""A cell less likely than this is free (``free_thresh`` there)."""
-POINT_CELL_M = 0.05
-"""Side of the cells that points are counted in, as usual for maps of indoor robots."""
-LARGEST_GRID_CELLS = 4_000_000
-"""100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away."""
-
-
+FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
+POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
+LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
@@ -106,19 +100,16 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
     xy = np.asarray(xy_m, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
         raise InputError(f"points of a plan have shape [n, 2] with n > 0, these have {xy.shape}")
-    if not np.isfinite(xy).all():
-        bad = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
-        raise InputError(f"point {bad} is not finite; remove such points")
+    if len(bad := np.flatnonzero(~np.isfinite(xy).all(axis=1))):
+        raise InputError(f"point {bad[0]} is not finite; remove such points")
     cell = POINT_CELL_M if resolution_m is None else float(resolution_m)
     # An empty rim keeps every window of the search inside.
     low = (np.floor(xy.min(axis=0) / cell) - 2) * cell
     columns, rows = (np.floor((xy.max(axis=0) - low) / cell).astype(int) + 3).tolist()
     if rows * columns > LARGEST_GRID_CELLS:
-        size = np.ptp(xy, axis=0)
-        raise InputError(
-            f"{size[0]:.0f} m x {size[1]:.0f} m in cells of {cell} m are too many; are the units metres? "
-            "Remove stray points or give a coarser resolution"
-        )
+        size = " x ".join(f"{side:.0f} m" for side in np.ptp(xy, axis=0))
+        remedy = "are the units metres? Remove stray points or give a coarser resolution"
+        raise InputError(f"{size} in cells of {cell} m are too many; {remedy}")
     occupied = np.zeros((rows, columns), bool)
     column, row = ((xy - low) / cell).astype(int).T
     occupied[row, column] = True
@@ -199,10 +190,7 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")
-    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
-
-
-def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
+    xy, time = numbers["xy_m"], numbers.get("time_s")
     if xy.ndim != 2 or xy.shape[1] != 2:
         raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
     if time is not None and time.shape != xy.shape[:1]:
@@ -238,9 +226,8 @@ def _stated_side(path: Path, stated: NDArray[Any] | None) -> Row0:
         way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
         raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
     word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
-    for side in get_args(Row0):
-        if side == word.strip().lower():
-            return cast(Row0, side)
+    if (side := word.strip().lower()) in get_args(Row0):
+        return cast(Row0, side)
     raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")
 
 

@@ -18,10 +18,8 @@ from .walls import find_walls
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
-COVERED = 0.9
-"""Least share of the walls that stand on the floor or at its edge."""
-EDGE_M = 0.1
-"""A wall this near to the floor's edge stands at it."""
+COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
+EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
 
 
@@ -36,10 +34,8 @@ def layout_walls(vertices_m: FloatArray) -> FloatArray:
 
 
 def floor_of(walls_m: FloatArray) -> BaseGeometry:
-    """The area (shapely) that walls [n, 2, 2] enclose, openings between them closed; outlines without inner yards.
-
-    Raises:
-        InputError: they enclose nothing.
+    """The area (shapely) that walls [n, 2, 2] enclose, openings closed, without inner yards; `InputError`: they enclose
+    none.
     """
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
@@ -62,13 +58,10 @@ def _filled(area: BaseGeometry) -> BaseGeometry:
 
 
 def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None) -> FloatArray:
-    """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres.
+    """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres; `InputError`: it has none.
 
     Points whose scans are known by their times are aligned with one another first, and free space is found from the
     places of the sensor (`wrf_mi.scene.plan.alignment`).
-
-    Raises:
-        InputError: no wall.
     """
     if isinstance(source, PlanPoints):
         if source.time_s is None:

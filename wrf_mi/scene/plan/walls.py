@@ -23,47 +23,29 @@ from ...core.angles import FloatArray
 from .lines import CLEARED_M, HALF_WIDTH_M, Run, dominant_direction, find_runs, rotation_2d, turned, without_specks
 from .sources import Mask, PlanGrid
 
-REACH_M = 0.35
-"""Largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open."""
-SHORTEST_LOOSE_M = 0.8
-"""A shorter piece has to meet other walls at both ends: legs of tables and chairs do not."""
-SHORTEST_GROUP_M = 2.0
-"""Total length of walls that touch; shorter groups apart from all others are things in the room."""
+REACH_M = 0.35  # largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open
+SHORTEST_LOOSE_M = 0.8  # a shorter piece has to meet other walls at both ends: legs of tables and chairs do not
+SHORTEST_GROUP_M = 2.0  # total length of walls that touch; shorter groups apart from all others are things in the room
 MOST_DIRECTIONS = 4
-SHORTEST_OBLIQUE_M = 1.0
-"""Least length of runs in the secondary directions: smears leave short pieces."""
+SHORTEST_OBLIQUE_M = 1.0  # least length of runs in the secondary directions: smears leave short pieces
 TOUCHING_M = 0.05
-LEAST_ANGLE_RAD = np.radians(20)
-"""Least angle of a corner."""
-SAME_WALL_M = 0.25
-"""Largest distance of parallel runs of the same wall: the blur of a map, or a partition's two faces."""
-SAME_LINE_M = 0.15
-"""Largest difference in offset of collinear runs."""
-NARROW_GAP_M = 0.5
-"""Largest gap that is closed where free space is unknown: narrower than any door (0.6 m)."""
-HIDDEN_GAP_M = 3.0
-"""Longest hidden stretch of a wall."""
-FURNITURE_DEPTH_M = 0.7
-"""Depth of wardrobes, kitchens and sofas along a wall, 0.6 m and a margin."""
-BESIDE_M = 0.4
-"""Largest distance of free space from a wall that was seen; between them lies the blur of the map."""
-SEEN_SHARE = 0.3
-"""Least share of a run beside free space; other runs were seen through windows and mirrors."""
-MOST_ROUNDS = 4
-"""Extending a wall uncovers furniture before it, and removing that lets another wall be extended."""
-HIDING_SHARE = 0.7
-"""Least covered share of a hidden stretch or a furniture front."""
-FREE_SHARE = 0.1
-"""Largest share of a stretch with free cells that is attributed to noise."""
+LEAST_ANGLE_RAD = np.radians(20)  # least angle of a corner
+SAME_WALL_M = 0.25  # largest distance of parallel runs of the same wall: the blur of a map, or a partition's two faces
+SAME_LINE_M = 0.15  # largest difference in offset of collinear runs
+NARROW_GAP_M = 0.5  # largest gap that is closed where free space is unknown: narrower than any door (0.6 m)
+HIDDEN_GAP_M = 3.0  # longest hidden stretch of a wall
+FURNITURE_DEPTH_M = 0.7  # depth of wardrobes, kitchens and sofas along a wall, 0.6 m and a margin
+BESIDE_M = 0.4  # largest distance of free space from a wall that was seen; between them lies the blur of the map
+SEEN_SHARE = 0.3  # least share of a run beside free space; other runs were seen through windows and mirrors
+MOST_ROUNDS = 4  # extending a wall uncovers furniture before it, and removing that lets another wall be extended
+HIDING_SHARE = 0.7  # least covered share of a hidden stretch or a furniture front
+FREE_SHARE = 0.1  # largest share of a stretch with free cells that is attributed to noise
 
 
 def find_walls(grid: PlanGrid) -> FloatArray:
-    """Straight walls of a plan: end points [n, 2, 2] in metres, the longest wall first.
+    """Straight walls of a plan [n, 2, 2], metres, the longest wall first; `InputError`: it shows none.
 
     Walls along and across the main direction are taken first; the remaining cells may show further directions.
-
-    Raises:
-        InputError: no wall was found.
     """
     grid = without_specks(grid)
     left, walls = grid, list[FloatArray]()
@@ -166,9 +148,8 @@ class _Strips:
 
     def free_beside(self, run: Run) -> float:
         """Share of a run with free cells at its sides."""
-        return self.share(
-            self.grid.free, run.axis, (run.offset - BESIDE_M, run.offset + BESIDE_M), (run.start, run.end)
-        )
+        sides = run.offset - BESIDE_M, run.offset + BESIDE_M
+        return self.share(self.grid.free, run.axis, sides, (run.start, run.end))
 
     def free_between(self, a: Run, b: Run, along: tuple[float, float]) -> float:
         """Share of a stretch where free cells lie between two parallel runs, without their smears."""

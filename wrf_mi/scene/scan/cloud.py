@@ -20,26 +20,21 @@ from .points import thin
 
 logger = logging.getLogger(__name__)
 
-REACH_M = 0.15
-"""Gaps and overlaps up to this are closed where walls, floor and ceiling meet."""
+REACH_M = 0.15  # gaps and overlaps up to this are closed where walls, floor and ceiling meet
 STRAIGHT_M = 1e-3
-SMALLEST_M2 = 0.05
-"""Least area of a surface."""
+SMALLEST_M2 = 0.05  # least area of a surface
 FEWEST_POINTS = 20
 LEAST_CONTRAST = 2.0
 """Least density of points in a plane relative to the density beside it; chance alignments have less."""
 TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 """Bounds of the angle by which planes are turned: a levelled scanner and its registration leave the lower."""
-ERRORS = 3.0
-"""Angle by which planes are turned, in standard errors of their direction."""
+ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """A plane, its area (shapely), the distance within which its corners are closed, and areas of recesses in it."""
+@dataclass(frozen=True, eq=False)
+class _Piece(Face):
+    """A face, the distance within which its corners are closed, and areas (shapely) of recesses in it."""
 
-    plane: Plane
-    area: Any
     reach_m: float
     recesses: Sequence[Any] = ()
 
@@ -68,11 +63,8 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
     planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
-    roles = kinds(list(map(Face, planes, areas)), float(np.median(cloud.points_m[:, 2])))
-    reach = [
-        piece.reach_m if kind == "other" else max(piece.reach_m, REACH_M)
-        for piece, kind in zip(pieces, roles, strict=True)
-    ]
+    roles = kinds(pieces, float(np.median(cloud.points_m[:, 2])))
+    reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
     areas = join(planes, areas, reach)
     # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
     things = np.ones(len(cloud.points_m), bool)
@@ -94,10 +86,7 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
 
 
 def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[_Piece]:
-    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first.
-
-    A point where two planes meet goes to the larger plane, or a shelf would grow along the wall behind it.
-    """
+    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first."""
     pieces = list[_Piece]()
     free = np.ones(len(points), bool)
     for refined in _refined(planes, points, noise_m):
@@ -121,7 +110,7 @@ def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list
         inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
         if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
             pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
-            free &= ~over(plane, area, points, BAND * noise_m)
+            free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
     return pieces
 
 
@@ -145,16 +134,15 @@ def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> lis
 
 
 def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
-    """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre.
-
-    A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one standard
-    deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real slope stays.
-    """
+    """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre."""
     up = np.array([0.0, 0.0, 1.0])
     headings: list[FloatArray] = []
     turned = []
     for plane in planes:
         side = np.ptp(plane.flat(plane.patches_m.reshape(-1, 3)), axis=0).min()
+        # A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one
+        # standard deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real
+        # slope stays.
         error = max(ERRORS * plane.angle_error_rad, noise_m / max(side, noise_m))
         tolerance = float(np.clip(error, *TOLERANCE_RANGE_RAD))
         n = plane.normal

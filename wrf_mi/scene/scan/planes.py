@@ -26,51 +26,34 @@ from .points import Thinned, lidar_package
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
 """Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
 joins the walls of a sparse room around its corners, but finds narrow faces."""
-SEARCH_M = 0.10
-"""Half thickness of a patch in which parallel layers, such as both sides of a partition, are separated."""
-BAND = 3.0
-"""Points within this many standard deviations belong to a plane."""
-REPEAT = 5.0
-"""A later plane nearer than this to a parallel plane, in standard deviations, consists of its strays."""
-PLANAR_SHARE = 0.6
-"""A patch with fewer of its points in its layers is bent: a chair, a curtain."""
-NOISE_RANGE_M = (0.002, 0.04)
-"""Range of the noise: scanner on a tripod to phone."""
-LAYER_SHARE = 0.2
-"""Least density of a layer relative to the densest layer of its patch."""
-LAYER_CORE = (0.02, 0.98)
-"""Quantiles of a layer's points that bound it along each axis; the rest may be strays."""
-MERGE_GAP_M = 1.0
-"""Coplanar pieces nearer than this are one plane: wall on both sides of a door."""
+SEARCH_M = 0.10  # half thickness of a patch in which parallel layers, such as both sides of a partition, are separated
+BAND = 3.0  # points within this many standard deviations belong to a plane
+REPEAT = 5.0  # a later plane nearer than this to a parallel plane, in standard deviations, consists of its strays
+PLANAR_SHARE = 0.6  # a patch with fewer of its points in its layers is bent: a chair, a curtain
+NOISE_RANGE_M = (0.002, 0.04)  # range of the noise: scanner on a tripod to phone
+LAYER_SHARE = 0.2  # least density of a layer relative to the densest layer of its patch
+LAYER_CORE = (0.02, 0.98)  # quantiles of a layer's points that bound it along each axis; the rest may be strays
+MERGE_GAP_M = 1.0  # coplanar pieces nearer than this are one plane: wall on both sides of a door
 MERGE_ANGLE_RAD = float(np.radians(1.0))
 SHORTEST_EDGE_M = 0.2
 FEWEST_VOXELS = 60
-POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8
-"""Mean and least number of points of a cell."""
+POINTS_PER_CELL, FEWEST_PER_CELL = 24, 8  # mean and least number of points of a cell
 CELL_RANGE_M = (0.1, 0.4)
-AROUND = 6.0
-"""Half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise."""
+AROUND = 6.0  # half thickness of the slab about a plane in which layers are sought, in standard deviations of the noise
 LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
 """Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
-GROWN_ERRORS = 2.0
-"""The same of cells beside."""
-LAYER_M2, LAYER_CELLS = 0.3, 8
-"""Least size of a layer."""
+GROWN_ERRORS = 2.0  # the same of cells beside
+LAYER_M2, LAYER_CELLS = 0.3, 8  # least size of a layer
 FLATNESS = 2.0
 """Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
-MEDIAN_ERROR = 1.25
-"""Standard error of a median, in that of a mean."""
-TUKEY = 4.685
-"""Constant of the biweight."""
-NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution in its median absolute deviations."""
+MEDIAN_ERROR = 1.25  # standard error of a median, in that of a mean
+TUKEY = 4.685  # constant of the biweight
+NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median absolute deviations
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
-    """The planes of a thinned cloud and its noise.
-
-    Returns:
-        Planes, the one with the most points first, and the standard deviation of the points from them in metres.
+    """The planes of a thinned cloud, those of most points first, and the standard deviation of points from them,
+    metres.
     """
     planes: list[Plane] = []
     free = np.ones(len(cloud.points_m), bool)
@@ -78,7 +61,7 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
     for spread_deg in NORMAL_SPREADS_DEG:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
-        candidates = [plane for box in boxes for plane in _layers(cloud, free, box, noise)]
+        candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
         candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
         if not candidates:
             break
@@ -215,12 +198,10 @@ def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
     return float(np.clip(np.quantile(widths, 0.5, weights=areas, method="inverted_cdf"), *NOISE_RANGE_M))
 
 
-def _layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
-    """The parallel planes within a patch, none where it is bent.
-
-    The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
-    all points about it may run across two real layers. The sharper of both is used.
-    """
+def _patch_layers(cloud: Thinned, free: Mask, box: Any, noise_m: float) -> list[Plane]:
+    """The parallel planes within a patch, none where it is bent."""
+    # The middle plane of a box may be turned by a degree, which smears a large wall into two layers; a plane fitted to
+    # all points about it may run across two real layers. The sharper of both is used.
     middle, _ = _box_plane(box)
     fitted = _fit_near(cloud, free & near(middle, cloud.points_m, SEARCH_M, 0.0), middle, SEARCH_M / 2)
     step = max(noise_m / 4, 0.002)
@@ -274,11 +255,8 @@ class Layer:
 def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tuple[Plane, list[Layer]]:
     """The plane of most cells, and the layers of others.
 
-    Args:
-        plane: a plane with its axes.
-        points_m: points of the scan [n, 3], metres.
-        free: points that belong to no other plane [n].
-        noise_m: standard deviation of points from planes.
+    Of a plane with its axes, points of the scan [n, 3], metres, those that belong to no other plane [n], and their
+    noise.
     """
     reach = min(AROUND * noise_m, SEARCH_M)
     rows = np.flatnonzero(free & near(plane, points_m, reach))
@@ -287,9 +265,8 @@ def layers(plane: Plane, points_m: FloatArray, free: Mask, noise_m: float) -> tu
     away, flat = plane.distance(points_m[rows]).astype(float), plane.flat(points_m[rows]).astype(float)
     low = flat.min(axis=0)
     # Density where there are points: the rectangle around them may be mostly empty.
-    density = len(rows) / max(
-        len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0)) * CELL_RANGE_M[0] ** 2, 1e-9
-    )
+    occupied = len(np.unique(np.floor((flat - low) / CELL_RANGE_M[0]), axis=0))
+    density = len(rows) / (occupied * CELL_RANGE_M[0] ** 2)
     side = float(np.clip(np.sqrt(POINTS_PER_CELL / density), *CELL_RANGE_M))
     cell = np.floor((flat - low) / side).astype(int)
     shape = tuple(cell.max(axis=0) + 1)

@@ -22,18 +22,15 @@ from ..mesh.polygon_files import read_obj, read_ply
 
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 """Libraries that Open3D is linked against and a small system lacks."""
-MOST_LAZ = 1000
-"""Largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred."""
+MOST_LAZ = 1000  # largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred
 LAS_HEADER, LAS_MINOR, LAS_EXTENDED = 375, 25, 4
 """Bytes of the header of LAS 1.4, place of its minor version, and the version from which extended records exist."""
 LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
 """Places of the numbers (32 bits) of variable-length records in the header, and the least bytes of a record."""
 LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads LAZ beside its points, and the time that it has."""
-VOXEL_M = 0.03
-"""Edge of the cells: a desk's side still has several."""
-MOST_VOXELS = 600_000
-"""The cells of a large building grow until there are no more: bounds time and memory."""
+VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
+MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
 NORMAL_RADIUS_M, NORMAL_NEIGHBOURS = 0.15, 50
 STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
 """A mean farther from its neighbours than usual by this many standard deviations is a stray."""

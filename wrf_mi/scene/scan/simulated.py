@@ -15,8 +15,7 @@ from ...core.angles import FloatArray
 RAYS_PER_POSE = 300_000
 RANGE_NOISE_M = 0.02
 """Standard deviation of a range, metres: a phone or a mobile scanner; one on a tripod has a tenth of it."""
-OUTLIERS = 0.01
-"""Share of stray returns: edges, glass, people walking by."""
+OUTLIERS = 0.01  # share of stray returns: edges, glass, people walking by
 
 
 def simulate_scan(scene: Any, poses_m: ArrayLike, *, rays_per_pose: int = RAYS_PER_POSE, seed: int = 1) -> FloatArray:

@@ -15,6 +15,7 @@ from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, store
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.paths import read_paths_file, save_paths
+from ...core.settings import settings_from
 from ...core.types import IntArray
 from ..options import TraceOptions
 from ..search.legs import Legs
@@ -199,7 +200,7 @@ def load_trace(file: str | Path) -> TraceResult:
             extra["primitives"],
             extra["probability"],
             {key.removeprefix("wedge/"): values for key, values in extra.items() if key.startswith("wedge/")},
-            TraceOptions(**json.loads(str(extra["options"]))),
+            settings_from(TraceOptions, json.loads(str(extra["options"])), str(file)),
             int(extra["rays"]),
             bool(extra["from_receivers"]),
             float(extra["frequency_hz"]),

@@ -250,7 +250,7 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
     Returns:
         The last number but two, as further doublings found nothing; 2^24 at most, with a warning.
     """
-    if not len(shared.surfaces.plane) or not options.reflections:
+    if not len(shared.surfaces.plane) or not options.most_reflections:
         return FIRST_RAYS
     sources = sources_m[spread(len(sources_m), SAMPLE[0])]
     targets = targets_m[spread(len(targets_m), SAMPLE[1])]

@@ -21,23 +21,16 @@ from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_CHUNK = 1 << 24
-"""Pairs of chain and position in a chunk: 64 MiB for each single-precision array."""
-RAYS_PER_CHUNK = 1 << 20
-"""Rays in a chunk."""
-MARGIN_M = 1e-3
-"""Slack of the bounds of planes."""
+PAIRS_PER_CHUNK = 1 << 24  # pairs of chain and position in a chunk: 64 MiB for each single-precision array
+RAYS_PER_CHUNK = 1 << 20  # rays in a chunk
+MARGIN_M = 1e-3  # slack of the bounds of planes
 BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
 displaced by `wrf_mi.tracing.search.images`."""
-MOST_KEPT = 1 << 27
-"""Bytes of chains that a process keeps."""
+MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
 SECONDS_PER_HIT = 1.2e-7
 """Of each surface that a ray meets, on two cores; finding duplicates takes most of it (docs/limits.md)."""
-WARN_S, MOST_S = 10.0, 3600.0
-"""Durations from which a search is announced, and refused."""
-Choices = list[tuple[int, ...]]
-"""Indices of the hits that reflect, for each time that the rays are shot."""
+WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
@@ -78,30 +71,19 @@ class ReflectionChains:
 def shoot(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
-    """Chains of planes at which rays from a point are reflected, without duplicates and with all their prefixes.
+    """Chains of planes [c, reflections] at which rays from a point [3] are reflected, -1 beyond the last.
 
-    Rays leave on a randomly rotated Fibonacci lattice. Where waves pass surfaces, the rays are shot once for each
-    choice of the hits that reflect: up to two to the power of the depth. The process keeps `MOST_KEPT` bytes of the
-    last results: models, folds and carriers trace the same rooms from the same receivers.
-
-    Args:
-        scene: ``sionna.rt.Scene``.
-        surfaces: surfaces of the scene.
-        source_m: position [3], metres.
-        options: numbers of surfaces met and of reflections, and whether rays pass surfaces.
-        rays: number of rays.
-        seed: seed of the lattice's random rotation.
-
-    Returns:
-        Shape [c, reflections], -1 beyond the last; in lexical order, not to be written to.
+    Each chain comes once, with all its prefixes, in lexical order; the array is not to be written to. Where waves pass
+    surfaces, the rays are shot once for each choice of the hits that reflect: up to two to the power of the depth. The
+    seed turns the rays' lattice.
     """
-    reach = options.surfaces_met, options.reflections, options.transmission
+    # Models, folds and carriers trace the same rooms from the same receivers.
+    reach = options.surfaces_met, options.most_reflections, options.transmission
     key = surfaces.digest, source_m.tobytes(), rays, seed, *reach
     if key in _kept:
         _kept.move_to_end(key)
     else:
-        turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-        _kept[key] = _chains(scene, surfaces, source_m, rays, turn, options.surfaces_met, patterns(*reach))
+        _kept[key] = _chains(scene, surfaces, source_m, options, rays, seed)
         _kept[key].flags.writeable = False
         while len(_kept) > 1 and sum(chains.nbytes for chains in _kept.values()) > MOST_KEPT:
             _kept.popitem(last=False)
@@ -109,24 +91,25 @@ def shoot(
 
 
 def _chains(
-    scene: Any, surfaces: Surfaces, source_m: FloatArray, rays: int, turn: FloatArray, depth: int, choices: Choices
+    scene: Any, surfaces: Surfaces, source_m: FloatArray, options: TraceOptions, rays: int, seed: int
 ) -> IntArray:
-    reflections = len(choices[0])
+    reflections = options.most_reflections
     chains = [np.zeros((0, reflections), np.int64)]
     if not len(surfaces.plane) or not reflections:
         return chains[0]
-    for reflecting in choices:
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    for reflecting in patterns(options.surfaces_met, reflections, options.transmission):
         for start in range(0, rays, RAYS_PER_CHUNK):
             stop = min(start + RAYS_PER_CHUNK, rays)
             sequence = np.full((stop - start, reflections), -1, np.int64)
-            hits = _shoot(scene, surfaces, turn @ lattice(start, stop, rays), source_m, depth, reflecting)
-            for column, level in enumerate(reflecting):
-                sequence[:, column] = hits[level]
+            directions = turn @ lattice(start, stop, rays)
+            hits = _shoot(scene, surfaces, directions, source_m, options.surfaces_met, reflecting)
+            sequence[:, : len(reflecting)] = hits[list(reflecting)].T
             chains.append(unique_chains(sequence))  # chunk by chunk: most rays find the same few chains
     return unique_chains(np.concatenate(chains))
 
 
-def patterns(depth: int, reflections: int, passing: bool) -> Choices:
+def patterns(depth: int, reflections: int, passing: bool) -> list[tuple[int, ...]]:
     """Indices of the hits that reflect: all choices that are not a prefix of another one, see `shoot`."""
     if not passing:
         return [tuple(range(reflections))]
@@ -174,6 +157,7 @@ def _shoot(
         shape: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
         face = dr.gather(mi.UInt32, first, shape, active) + hit.prim_index
         planes.append(dr.select(active, mi.Int32(dr.gather(mi.UInt32, plane, face, active)), -1))
+        # Law of reflection, d' = d - 2 (d . n) n; a ray that passes keeps its direction.
         mirrored = ray.d - 2 * dr.dot(ray.d, hit.n) * hit.n
         ray = hit.spawn_ray(dr.select((pattern >> level) & 1 == 1, mirrored, ray.d))
     dr.eval(planes)
@@ -182,6 +166,7 @@ def _shoot(
 
 def unique_chains(sequence: IntArray) -> IntArray:
     """Distinct sequences of planes [n, depth] with all their prefixes, without empty ones, in lexical order."""
+    # Prefixes are paths, too: the wave may reach the target before the ray meets a further plane.
     once = _unique_rows(sequence)
     level = np.arange(sequence.shape[1])
     together = _unique_rows(np.concatenate([np.where(level < length, once, -1) for length in level + 1]))
@@ -198,12 +183,10 @@ def _unique_rows(rows: IntArray) -> IntArray:
 def possible(
     surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of chain and target [n, 3] whose points of reflection lie within the bounds of the chain's planes.
+    """Indices of chains and of targets [n, 3] whose points of reflection lie within the bounds of the chain's planes.
 
     A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
-
-    Yields:
-        Indices of chains and of targets, in chunks; in a chunk by the number of reflections.
+    Pairs come in chunks, each by the number of reflections.
     """
     import drjit as dr
     import mitsuba as mi
@@ -244,28 +227,20 @@ def possible(
 
 
 def hits(options: TraceOptions, rays: int) -> int:
-    """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere.
-
-    Where waves pass surfaces, rays are shot once for each choice of the hits that reflect
-    (`shoot`), of which there are up to two to the power of the depth.
-    """
-    if not options.reflections:
+    """Number of surfaces that the rays of one source meet in a closed room; an upper bound elsewhere."""
+    if not options.most_reflections:
         return 0
     met = options.surfaces_met
-    return len(patterns(met, options.reflections, options.transmission)) * rays * met
+    return len(patterns(met, options.most_reflections, options.transmission)) * rays * met
 
 
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
-    """Announce a search from a number of sources that takes long.
-
-    Raises:
-        InputError: a search of more than an hour, naming what makes it shorter.
-    """
+    """Announce a search from a number of sources that takes long; `InputError` for one of more than an hour."""
     duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
     if duration_s < WARN_S:
         return
-    search = f"search for paths with up to {options.reflections} reflections"
-    remedy = f"a smaller --depth (max_depth, {options.max_depth}) or --reflections (max_reflections)"
+    search = f"search for paths with up to {options.most_reflections} reflections"
+    remedy = f"a smaller --depth ({options.depth}) or --reflections"
     if duration_s > MOST_S:
         raise InputError(f"{search}: about {duration_s / 3600:.1f} hours; give {remedy}")
     logger.warning("%s: about %.0f s; faster with %s", search, duration_s, remedy)

@@ -11,16 +11,14 @@ from trimesh.triangles import closest_point
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .surfaces import Solid, Surfaces
+from ...scene.mesh.surfaces import Body, bounds
+from .surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
-BEHIND_M = 0.01
-"""Distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it."""
-BEFORE_M = 1e-4
-"""Least distance before a surface from which an antenna on it is traced."""
-CLEAR = 2.5e-5
-"""That distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna."""
+BEHIND_M = 0.01  # distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it
+BEFORE_M = 1e-4  # least distance before a surface from which an antenna on it is traced
+CLEAR = 2.5e-5  # that distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna
 ON_M = 1e-6
 """Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
 ON_SHARE = 0.1
@@ -31,7 +29,7 @@ PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Refuse antennas at positions [n, 3], metres, inside a solid object; warn of those outside the scene.
+    """Warn of antennas at positions [n, 3], metres, outside the scene.
 
     Raises:
         InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
@@ -44,7 +42,7 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
-    low, high = surfaces.bounds_m
+    low, high = bounds(surfaces.triangles)
     beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
@@ -60,10 +58,11 @@ def clear_m(surfaces: Surfaces) -> float:
 def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Move antennas at positions [n, 3] that are mounted on a surface before it, so that they have a side.
 
-    Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where no
-    path arrives, or inside a cabinet. Outer walls, with all of the scene on one side, and solids have a right side, to
-    which antennas up to `BEHIND_M` behind are moved; at other sheets an antenna keeps its side.
+    Outer walls, with all of the scene on one side, and solids have a right side, to which antennas up to `BEHIND_M`
+    behind are moved; at other sheets an antenna keeps its side.
     """
+    # Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where
+    # no path arrives, or inside a cabinet.
     moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)
     for point, plane in _pairs_near(surfaces, moved):
         for index in np.unique(plane):
@@ -87,23 +86,25 @@ def from_behind(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     return np.where(behind[:, None], moved, positions_m)
 
 
-def _near_solids(surfaces: Surfaces, positions_m: FloatArray, margin_m: float) -> Iterator[tuple[Solid, IntArray]]:
-    """Solids with the positions [n, 3] that lie within their bounds and a margin."""
+def _near_solids(
+    surfaces: Surfaces, positions_m: FloatArray, margin_m: float
+) -> Iterator[tuple[Body, FloatArray, IntArray]]:
+    """Solids, with their normals, and the positions [n, 3] that lie within their bounds and a margin."""
     low, high = surfaces.solid_bounds_m
     near = np.ones((len(positions_m), len(low)), bool)
     # Axis by axis: furnished scenes have hundreds of solids, and predictions few positions.
     for axis, coordinate in enumerate(positions_m.T):
         near &= (coordinate[:, None] >= low[:, axis] - margin_m) & (coordinate[:, None] <= high[:, axis] + margin_m)
     for number in np.flatnonzero(near.any(axis=0)):
-        yield surfaces.solids[number], np.flatnonzero(near[:, number])
+        yield *surfaces.solids[number], np.flatnonzero(near[:, number])
 
 
 def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     """Positions [n, 3], moved before the nearest face where they are on a solid, or up to `BEHIND_M` inside."""
     moved, clear = positions_m.copy(), clear_m(surfaces)
     # What one solid moves may come to lie at the next one.
-    for (_, corners, normal), rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
-        if len(normal) < len(corners):
+    for solid, normal, rows in _near_solids(surfaces, positions_m, BEHIND_M + 2 * clear):
+        if len(normal) < len(corners := solid.corners_m):
             continue
         # Distances from planes are computed faster than those from faces, and rule out most positions.
         height = moved[rows] @ normal.T - (corners[:, 0] * normal).sum(axis=1)
@@ -120,9 +121,9 @@ def _outside_solids(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
 def solid_around(surfaces: Surfaces, positions_m: FloatArray) -> IntArray:
     """Object of the solid around each position [n, 3], -1 for none; see `wrf_mi.tracing.search.surfaces.Surfaces`."""
     enclosing = np.full(len(positions_m), -1)
-    for solid, rows in _near_solids(surfaces, positions_m, 0.0):
-        inside = winding_number(solid.corners, positions_m[rows]) > 0.5
-        enclosing[rows[inside]] = surfaces.object_of(solid.face[:1])[0]
+    for solid, _, rows in _near_solids(surfaces, positions_m, 0.0):
+        inside = winding_number(solid.corners_m, positions_m[rows]) > 0.5
+        enclosing[rows[inside]] = surfaces.object_of(solid.faces[:1])[0]
     return enclosing
 
 
@@ -131,7 +132,7 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
     Source: van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), IEEE Trans. Biomed. Eng. 30(2).
     """
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low, high = bounds(triangles)
     number = np.zeros(len(points))
     candidates = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     step = max(1, PAIRS_PER_CHUNK // len(triangles))
@@ -139,9 +140,11 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
         part = candidates[start : start + step]
         a, b, c = (triangles[None, :, k] - points[part, None] for k in range(3))
         la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-        dot = lambda u, v: (u * v).sum(axis=-1)  # noqa: E731
-        solid = np.arctan2(dot(a, np.cross(b, c)), la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
-        number[part] = np.abs(solid.sum(axis=1)) / (2 * np.pi)
+        ab, bc, ca = ((u * v).sum(axis=-1) for u, v in ((a, b), (b, c), (c, a)))
+        # tan(omega / 2) = a . (b x c) / (|a| |b| |c| + (a . b) |c| + (b . c) |a| + (c . a) |b|), in the quadrant of
+        # both terms; the solid angles omega of a closed surface add up to 4 pi inside it, and to 0 outside.
+        half_angle = np.arctan2((a * np.cross(b, c)).sum(axis=-1), la * lb * lc + ab * lc + bc * la + ca * lb)
+        number[part] = np.abs(half_angle.sum(axis=1)) / (2 * np.pi)
     return number
 
 

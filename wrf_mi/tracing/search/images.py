@@ -20,12 +20,9 @@ from .legs import SPECULAR, Legs, join
 from .surfaces import Surfaces
 from .visibility import reflect_on_faces, unobstructed
 
-CANDIDATES_PER_CHUNK = 1 << 20
-"""Candidates in a chunk, which take some 100 bytes for each interaction."""
-PARALLEL = 1e-9
-"""Difference of heights in metres below which a ray runs along a plane and keeps the point that it met."""
-COINCIDENT_M = 1e-6
-"""Distance below which two antennas are at one place, with no path straight from one to the other."""
+CANDIDATES_PER_CHUNK = 1 << 20  # candidates in a chunk, which take some 100 bytes for each interaction
+PARALLEL = 1e-9  # difference of heights in metres below which a ray runs along a plane and keeps the point that it met
+COINCIDENT_M = 1e-6  # distance below which two antennas are at one place, with no path straight from one to the other
 DISPLACED = 5e-6
 """Displacement of a pair's first antenna, as a share of `Surfaces.scale_m`: 0.05 mm at 10 m, eighty times the rounding
 of a coordinate in single precision."""
@@ -44,13 +41,10 @@ def mirrored(vectors: FloatArray, normal: FloatArray, offset_m: FloatArray | flo
 
 
 def image_sources(normal: FloatArray, offset_m: FloatArray, plane: IntArray, source_m: FloatArray) -> FloatArray:
-    """Images of a source after 0, 1, ... reflections, [c, b + 1, 3], metres.
+    """Images [c, b + 1, 3] of a source [3], or of the source of each chain [c, 3], after 0, 1, ... reflections, metres.
 
-    Args:
-        normal: unit normals of the scene's planes [q, 3].
-        offset_m: offsets of the planes [q], metres.
-        plane: planes of each chain in their order from the source [c, b], -1 for none.
-        source_m: source [3], or the source of each chain [c, 3], metres.
+    The planes q . x = o of the scene have normals [q, 3] and offsets [q]; a chain's planes [c, b] are in their order
+    from the source, -1 for none.
     """
     image = np.repeat(np.broadcast_to(source_m, (len(plane), 3))[:, None], plane.shape[1] + 1, axis=1)
     # The image after a reflection is that before it, mirrored in the plane that reflects: Balanis (2012), section 7.4.
@@ -65,17 +59,10 @@ def image_sources(normal: FloatArray, offset_m: FloatArray, plane: IntArray, sou
 def meeting_point(
     start_m: FloatArray, end_m: FloatArray, normal: FloatArray, offset_m: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points where lines through two points meet planes.
+    """Points [n, 3] where lines through first and second points [n, 3] meet planes, and heights [n] of both above
+    these.
 
-    Args:
-        start_m: first points [n, 3], metres.
-        end_m: second points [n, 3], metres.
-        normal: unit normals of the planes [n, 3].
-        offset_m: offsets of the planes [n], metres.
-
-    Returns:
-        The points [n, 3], which are the first points where a line is parallel to its plane; heights of the first and
-        of the second points above the planes [n], metres.
+    Planes have unit normals [n, 3] and offsets [n], metres. A line parallel to its plane meets it at the first point.
     """
     near, far = ((point * normal).sum(axis=1) - offset_m for point in (start_m, end_m))
     share = np.divide(near, near - far, out=np.zeros_like(near), where=near != far)
@@ -89,19 +76,12 @@ def specular_paths(
     targets_m: FloatArray,
     options: TraceOptions,
 ) -> Legs:
-    """Every unobstructed path from sources to each target by the reflections of ``chains``.
+    """Every unobstructed path from sources [s, 3] to targets [n, 3], metres, by the reflections of chains from these
+    sources.
 
-    Args:
-        surfaces: surfaces of the scene.
-        chains: chains from these sources, see `wrf_mi.tracing.search.chains.shoot`.
-        sources_m: positions [s, 3], metres.
-        targets_m: positions [n, 3], metres.
-        options: kinds of interaction and depth.
-
-    Returns:
-        Paths with source 0..s-1 and target 0..n-1, vertices in float64 on the surfaces' planes.
+    Returns paths with source 0..s-1 and target 0..n-1 and vertices in float64 on the surfaces' planes.
     """
-    depth = max(options.max_depth, 1)
+    depth = max(options.depth, 1)
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
     source, target = np.divmod(direct, len(targets_m))
     apart = np.linalg.norm(targets_m[target] - sources_m[source], axis=1) > COINCIDENT_M
@@ -132,20 +112,19 @@ def specular_paths(
 
 
 def displaced(scale_m: float, source_m: FloatArray, target_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions [n, 3] of pairs of antennas near the stated ones, in general position.
-
-    At the stated ones, which are often round numbers, a path may meet the foot of a wall, the seam of two sheets or the
-    edge in which two reflections coincide. Then two answers are right, those of the positions on both sides, and
-    rounding would choose between them at random: neighbouring walls would choose differently, and a closed room leak.
-    Displaced positions have one answer for all surfaces. It is the same in both directions: the antenna that comes
-    first in the order of coordinates takes the shorter displacement.
+    """Positions [n, 3] of pairs of antennas near the stated ones, in general position; the same in both directions.
 
     Source: symbolic perturbation, Edelsbrunner and Mücke, "Simulation of simplicity" (1990), ACM Trans. Graphics 9(1);
     here by a number that single precision resolves.
     """
+    # At stated positions, which are often round numbers, a path may meet the foot of a wall, the seam of two sheets or
+    # the edge in which two reflections coincide. Then two answers are right, those of the positions on both sides, and
+    # rounding would choose between them at random: neighbouring walls would choose differently, and a closed room leak.
+    # Displaced positions have one answer for all surfaces.
     differs = source_m != target_m
     axis = differs.argmax(axis=1)[:, None]
     first = np.take_along_axis(source_m, axis, axis=1) <= np.take_along_axis(target_m, axis, axis=1)
+    # The antenna that comes first in the order of coordinates takes the shorter displacement, whichever is the source.
     largest = np.maximum(np.abs(source_m), np.abs(target_m)).max(axis=1, keepdims=True, initial=0.0)
     by = DISPLACED * np.maximum(scale_m, largest) * ASLANT
     return source_m + np.where(first, 1, FARTHER) * by, target_m + np.where(first, FARTHER, 1) * by
@@ -154,9 +133,7 @@ def displaced(scale_m: float, source_m: FloatArray, target_m: FloatArray) -> tup
 def _vertices(
     surfaces: Surfaces, plane: IntArray, source_m: FloatArray, target_m: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Sources, points of reflection and targets [n, b + 2, 3] of chains of planes [n, b] (-1: none), NaN beyond a
-    target; and whether each plane lies between the point after it and the image before it [n].
-    """
+    """Sources, points of reflection and targets [n, b + 2, 3] of chains of planes [n, b]; which exist [n]."""
     images = image_sources(surfaces.normal, surfaces.offset, plane, source_m)
     length, levels = np.count_nonzero(plane >= 0, axis=1), plane.shape[1]
     vertices, point = np.full((len(plane), levels + 2, 3), np.nan), target_m.copy()
@@ -173,8 +150,8 @@ def _vertices(
 
 
 def _mounted(surfaces: Surfaces, plane: IntArray, source_m: FloatArray, target_m: FloatArray) -> NDArray[np.bool_]:
-    """Mask of chains [n, b] whose first or last plane holds the source, or the target: an antenna on a wall has no
-    image in it.
+    """Mask [n] of chains [n, b] whose first plane holds the source, or last plane the target: on a wall there is no
+    image.
     """
     rows, last = np.arange(len(plane)), np.count_nonzero(plane >= 0, axis=1) - 1
     mounted = np.zeros(len(plane), bool)

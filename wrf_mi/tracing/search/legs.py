@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 
-SPECULAR, TRANSMISSION = 1, 4
-"""Values of Sionna RT's ``InteractionType``."""
+SPECULAR, TRANSMISSION = 1, 4  # values of Sionna RT's ``InteractionType``
 ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
 """Fields of `Legs` with a value, or a row, for each path."""
 

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -21,15 +21,13 @@ from numpy.typing import NDArray
 from ...core.angles import FloatArray
 from ...core.digest import content_digest
 from ...core.types import IntArray
-from ...scene.mesh.surfaces import bodies, shared_edges
+from ...scene.mesh.surfaces import Body, bodies, bounds, shared_edges
 
-COPLANAR_M = 2e-5
-"""Largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m."""
+COPLANAR_M = 2e-5  # largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m
 COPLANAR_COS = 0.99
 """Smallest cosine between normals of a face and its plane, 8 degrees: more than a sliver's rounding, less than a thin
 object's rim."""
-MERGED_M2 = 0.01
-"""Smallest area of a plane that takes in other faces."""
+MERGED_M2 = 0.01  # smallest area of a plane that takes in other faces
 MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)
 """Mesh file in Mitsuba's description of a shape; there is no attribute."""
 MERGED_COUNT = 1000
@@ -46,25 +44,10 @@ by which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""
-FARTHEST = 25.0
-"""Largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors."""
+FARTHEST = 25.0  # largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors
 MOST_AT_CORNER = 8.0
 """Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
 infinity."""
-
-
-class Solid(NamedTuple):
-    """A closed body that is an object.
-
-    Attributes:
-        face: its faces [f].
-        corners: their corners [f, 3, 3], metres.
-        normal: their normals [f, 3], outwards; fewer where faces have no area.
-    """
-
-    face: IntArray
-    corners: FloatArray
-    normal: FloatArray
 
 
 @dataclass(frozen=True)
@@ -120,8 +103,7 @@ class Surfaces:
     @cached_property
     def centre_m(self) -> FloatArray:
         """Middle of the box around the scene [3], from which single precision is finest; the origin without faces."""
-        corners = self.triangles.reshape(-1, 3)
-        return (corners.min(axis=0) + corners.max(axis=0)) / 2 if len(corners) else np.zeros(3)
+        return bounds(self.triangles).sum(axis=0) / 2 if len(self.triangles) else np.zeros(3)
 
     @cached_property
     def scale_m(self) -> float:
@@ -136,15 +118,14 @@ class Surfaces:
     @cached_property
     def boxes(self) -> tuple[shapely.STRtree, FloatArray]:
         """Boxes around the enlarged faces of each plane [q, 2, 3], and a tree of their extents in x and y."""
-        count, slack = len(self.normal), ENLARGED * self.scale_m
-        low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(low, self.plane, self.triangles.min(axis=1) - slack)
-        np.maximum.at(high, self.plane, self.triangles.max(axis=1) + slack)
+        low, high = plane_bounds(self.plane, self.triangles, len(self.normal))
+        low, high = low - ENLARGED * self.scale_m, high + ENLARGED * self.scale_m
         return shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T)), np.stack([low, high], axis=1)
 
     @cached_property
     def face_edges(self) -> tuple[FloatArray, FloatArray]:
         """Unit vectors [f, 3, 3] in each face across its edges, inwards, and their products with the edges [f, 3]."""
+        # Across an edge, in the face: the product of the face's normal and the edge.
         along = np.roll(self.triangles, -1, axis=1) - self.triangles
         inwards = np.cross(trimesh.triangles.cross(self.triangles)[:, None], along)
         size = np.linalg.norm(inwards, axis=2, keepdims=True)
@@ -169,13 +150,12 @@ class Surfaces:
     def moved_planes(
         self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.plane_parameters`.
+        """Normals [k, 3] and offsets [k], metres, of planes (by default all) that are shifted and tilted.
 
-        Args:
-            shift_m: shifts along the normals [k].
-            tilt: tilts about the centres towards both axes [k, 2], rad.
-            planes: numbers of the planes; by default all.
+        Shifts [k] are along the normals, metres; tilts [k, 2], rad, are about the centres towards both axes
+        (`wrf_mi.tracing.paths.plane_parameters`).
         """
+        # A tilt is a rotation to first order; the normal is scaled to unit length again.
         normal = self.normal[planes] + np.einsum("qa,qad->qd", tilt, self.axes[planes])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return normal, (normal * self.plane_centres_m[planes]).sum(axis=1) + shift_m
@@ -193,26 +173,24 @@ class Surfaces:
         return mi.Vector3f(*x[:3]), x[3], *axes, mi.Point2f(*x[10:12]), mi.Point2f(*x[12:])
 
     @cached_property
-    def solids(self) -> list[Solid]:
-        """Each closed, consistently oriented body that is an object rather than a room."""
-        area, solids = trimesh.triangles.area(self.triangles), []
-        for face, closed, volume in bodies(self.triangles):
-            if closed and 0 < 2 * abs(volume) < SOLID_M * area[face].sum():
-                corners = self.triangles[face]
-                solids.append(Solid(face, corners, np.sign(volume) * trimesh.triangles.normals(corners)[0]))
+    def solids(self) -> list[tuple[Body, FloatArray]]:
+        """Each closed, consistently oriented body that is an object rather than a room, and its normals outwards.
+
+        There are fewer normals than faces where faces have no area.
+        """
+        solids = []
+        for body in bodies(self.triangles):
+            # Mean thickness 2 V / A of a slab: thin bodies are objects, thick ones rooms, whose inside is air.
+            area = trimesh.triangles.area(body.corners_m).sum()
+            if body.closed and 0 < 2 * abs(body.volume_m3) < SOLID_M * area:
+                normals, _ = trimesh.triangles.normals(body.corners_m)
+                solids.append((body, np.sign(body.volume_m3) * normals))
         return solids
 
     @cached_property
-    def solid_bounds_m(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates of the solids [s, 3], metres."""
-        bounds = [np.stack([solid.corners.min((0, 1)), solid.corners.max((0, 1))]) for solid in self.solids]
-        low, high = np.reshape(bounds, (-1, 2, 3)).swapaxes(0, 1)
-        return low, high
-
-    @cached_property
-    def bounds_m(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates of the faces [3], metres."""
-        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+    def solid_bounds_m(self) -> FloatArray:
+        """Lowest and highest coordinates of the solids [2, s, 3], metres."""
+        return np.reshape([body.bounds_m for body, _ in self.solids], (-1, 2, 3)).swapaxes(0, 1)
 
     def called(self, index: int) -> str:
         """Name of an object in error messages, with its mesh file if that has another name."""
@@ -292,6 +270,7 @@ def find_planes(
     is_own_plane = plane[biggest[labels]] == np.arange(len(labels))
     face = np.where(is_own_plane, biggest[labels], largest_face(plane, area))
     normal, offset = normal[face], offset[face]
+    # Axes along and across an edge of the largest face.
     edge = triangles[face][:, 1] - triangles[face][:, 0]
     edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-30)
     axes = np.stack([edge, np.cross(normal, edge)], axis=1)
@@ -305,11 +284,11 @@ def largest_face(plane: IntArray, area: FloatArray) -> IntArray:
     return order[np.searchsorted(plane[order], np.arange(plane.max(initial=-1) + 1))]
 
 
-def plane_bounds(plane: IntArray, flat_m: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Bounds [count, 2] of the corners [f, 3, 2] of faces in the coordinates of their planes [f]."""
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, plane, flat_m.min(axis=1))
-    np.maximum.at(high, plane, flat_m.max(axis=1))
+def plane_bounds(plane: IntArray, corners_m: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Bounds [count, k] of the faces of each plane, of which [f] are the planes and [f, 3, k] the corners."""
+    low, high = (np.full((count, corners_m.shape[-1]), end) for end in (np.inf, -np.inf))
+    np.minimum.at(low, plane, corners_m.min(axis=1))
+    np.maximum.at(high, plane, corners_m.max(axis=1))
     return low, high
 
 

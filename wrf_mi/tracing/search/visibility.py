@@ -28,22 +28,17 @@ the first then ends at whichever plane its ray meets."""
 WINDOW = 2 * CLUSTER
 """Distance from a point of reflection within which rays cannot tell sides, as a share of the same:
 `with_crossings` finds what is crossed there."""
-MOST_CLUSTERED = 3
-"""Reflections in a cluster: three planes meet in a corner."""
-NO_PLANE = 0xFFFFFFFF
-"""Plane of the end of the last leg, the target."""
-REFLECTS = 1 << 31
-"""Bit of a face's number that tells a reflection from a transmission."""
+MOST_CLUSTERED = 3  # reflections in a cluster: three planes meet in a corner
+NO_PLANE = 0xFFFFFFFF  # plane of the end of the last leg, the target
+REFLECTS = 1 << 31  # bit of a face's number that tells a reflection from a transmission
 NEAR = 1e-5
 """Distance from a point of reflection up to which crossings are looked for, as a share of `Surfaces.scale_m`: five
 times that within which rays do not count them (`WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
 """Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
 leave which were modelled one by one, `wrf_mi.scene.mesh.surfaces.SAME_CORNER_M`."""
-PAIRS_TOGETHER = 1 << 20
-"""Pairs of points and planes, or faces, in a chunk."""
-UNKNOWN_FACE = (1 << 31) - 1
-"""Face of a reflection that rays cannot distinguish from another one at the same point."""
+PAIRS_TOGETHER = 1 << 20  # pairs of points and planes, or faces, in a chunk
+UNKNOWN_FACE = (1 << 31) - 1  # face of a reflection that rays cannot distinguish from another one at the same point
 
 
 class Met(NamedTuple):
@@ -73,15 +68,7 @@ class Met(NamedTuple):
 
 
 def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool) -> Met:
-    """Candidates that are paths.
-
-    A ray follows each leg to the next vertex. The plane that reflects there has to be met at the end of the leg;
-    surfaces before are passed, or obstruct the path. Faces are closed (`surfaces.screens`): a ray that meets an
-    edge is obstructed by what ends there. So is a reflection at the foot of a wall that stands between both legs
-    (`with_crossings`).
-
-    Mitsuba's surface interaction takes a call of each shape, which to trace and compile takes longer than the rays:
-    points are computed from distances here.
+    """Candidates that are paths: what obstructs none of their legs, and at each reflection the plane that reflects.
 
     Args:
         surfaces: surfaces of the scene.
@@ -115,6 +102,10 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     codes = dr.full(mi.UInt32, REFLECTS | UNKNOWN_FACE, size * depth)
     points = dr.zeros(mi.Point3f, size * depth)
 
+    # A ray follows each leg to the next vertex. The plane that reflects there has to be met at the end of the leg;
+    # surfaces before are passed, or obstruct the path. Faces are closed (`Surfaces.screens`): a ray that meets an edge
+    # is obstructed by what ends there. Points are computed from distances, since Mitsuba's surface interaction takes a
+    # call of each shape, which to trace and compile takes longer than the rays.
     def body(active: Any, reached: Any, leg: Any, step: Any, count: Any, way: Any, last: Any) -> Any:
         start = dr.gather(mi.Point3f, vertices, lane * (legs + 1) + leg, active)
         end = dr.gather(mi.Point3f, vertices, lane * (legs + 1) + leg + 1, active)
@@ -183,10 +174,9 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
 
 
 def clusters(vertices_m: FloatArray, plane: IntArray, apart_m: float) -> IntArray:
-    """Number of reflections at the end of each leg [n, b + 1] that no distance tells apart, `MOST_CLUSTERED` at most.
+    """Number of reflections at the end of each leg [n, b + 1] that rays cannot tell apart, `MOST_CLUSTERED` at most.
 
-    0 for the leg that ends at the target. For vertices and planes as of `unobstructed`; rays tell points apart that are
-    more than ``apart_m`` from each other.
+    Of vertices and planes as of `unobstructed`, those nearer than ``apart_m``; 0 for the leg that ends at the target.
     """
     number = (plane >= 0).astype(np.int64)
     for level in reversed(range(plane.shape[1] - 1)):
@@ -212,8 +202,7 @@ class _Crossings(NamedTuple):
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
 
-    Of k paths with vertices and planes as of `unobstructed`, and what rays met away from the points of reflection, with
-    `UNKNOWN_FACE`.
+    Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`.
     """
     met, faces = _with_faces(surfaces, vertices_m, plane, met)
     vertices_m, plane = vertices_m[faces], plane[faces]
@@ -346,8 +335,8 @@ def _crossed(
 
 
 def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Points [n, 3] on planes [n] that are within `NEAR` of another plane whose faces touch those of the first: the
-    point's index, the other plane, and the point, for each pair.
+    """Index of each point [n, 3] on planes [n], number of another plane within `NEAR` that touches its plane, and the
+    point.
     """
     tree, boxes = surfaces.boxes
     groups = list(_by_value(plane))

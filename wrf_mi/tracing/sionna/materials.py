@@ -82,10 +82,7 @@ def set_frequency(
     Raises:
         InputError: a material has neither a range of ITU-R P.2040 nor a constant at this frequency.
     """
-    import mitsuba as mi
-    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-
-    constant = []
+    below_range = []
     for name, material in scene.radio_materials.items():
         if thickness_m and name in thickness_m:
             material.thickness = thickness_m[name]
@@ -93,24 +90,12 @@ def set_frequency(
         if itu_type is None:
             if name in laws and not hasattr(material, EXPONENT):
                 _follow(material, *laws[name])
-            continue
-        if in_itu_range(itu_type, frequency_hz):
-            continue
-        ranges_ghz = ITU_MATERIALS_PROPERTIES[itu_type]
-        if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
-            where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in sorted(ranges_ghz))
-            text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
-            bsdf = CONSTANTS_XML.format(f"mat-my_{itu_type}")
-            way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {bsdf}"
-            raise InputError(f"{text}; choose another material, or {way}")
-        material.frequency_update_callback = lambda _, values=BELOW_1_GHZ[itu_type]: tuple(map(mi.Float, values))
-        constant.append(itu_type)
-    if constant:
-        logger.info(
-            "%g MHz is below the range of ITU-R P.2040 for %s: constant values of 1 GHz used",
-            frequency_hz / 1e6,
-            ", ".join(sorted(constant)),
-        )
+        elif not in_itu_range(itu_type, frequency_hz):
+            _extend(material, name, frequency_hz)
+            below_range.append(itu_type)
+    if below_range:
+        text = "%g MHz is below the range of ITU-R P.2040 for %s: constant values of 1 GHz used"
+        logger.info(text, frequency_hz / 1e6, ", ".join(sorted(below_range)))
     for material in scene.radio_materials.values():
         if absorbs(material):
             # Sionna RT 2.2 calls this of every material when the frequency is set, and absorbers lack it.
@@ -119,14 +104,29 @@ def set_frequency(
     _share_kernels(scene, frequency_hz)
 
 
-def _share_kernels(scene: Any, frequency_hz: float) -> None:
-    """Make carrier and constants inputs of Dr.Jit's kernels.
+def _extend(material: Any, name: str, frequency_hz: float) -> None:
+    """Give an ITU material the constants of `BELOW_1_GHZ`; `InputError` where there are none at a frequency."""
+    import mitsuba as mi
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    As literals they are part of the compiled code, which LLVM then compiles for each material and carrier anew.
-    """
+    itu_type = material.itu_type
+    if itu_type not in BELOW_1_GHZ or not CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
+        ranges_ghz = sorted(ITU_MATERIALS_PROPERTIES[itu_type])
+        where = " and ".join(f"{low:g} to {high:g} GHz" for low, high in ranges_ghz)
+        text = f"radio material {name}: not known at {frequency_hz / 1e9:g} GHz, ITU-R P.2040 has it for {where}"
+        bsdf = CONSTANTS_XML.format(f"mat-my_{itu_type}")
+        way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {bsdf}"
+        raise InputError(f"{text}; choose another material, or {way}")
+    constants = BELOW_1_GHZ[itu_type]
+    material.frequency_update_callback = lambda _: tuple(map(mi.Float, constants))
+
+
+def _share_kernels(scene: Any, frequency_hz: float) -> None:
+    """Make carrier and constants inputs of Dr.Jit's kernels."""
     import drjit as dr
     import mitsuba as mi
 
+    # As literals they are part of the compiled code, which LLVM then compiles for each material and carrier anew.
     values = [
         (material, name, float(getattr(material, name)[0]))
         for material in scene.radio_materials.values()

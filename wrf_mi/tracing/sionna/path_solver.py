@@ -29,8 +29,7 @@ SLOTS_PER_CHUNK = 1 << 22
 for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
 WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
 """Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
-PATHS_PER_CHUNK = 1 << 19
-"""Paths in a chunk; the field calculator takes some 300 bytes per path and interaction."""
+PATHS_PER_CHUNK = 1 << 19  # paths in a chunk; the field calculator takes some 300 bytes per path and interaction
 AT_ANTENNA_M = 1e-9
 """Distance within which an interaction is at the antenna, or at its image, so that it tells no direction."""
 SHORT = 1e-4
@@ -57,16 +56,14 @@ class Devices:
         return np.broadcast_to(angles, (len(self.position_m), 3))
 
 
-Ends = tuple[Devices, Devices]
-"""Sources and targets of a search, or transmitters and receivers."""
+Ends = tuple[Devices, Devices]  # sources and targets of a search, or transmitters and receivers
 
 
 def sionna_orientation(to_world: ArrayLike) -> FloatArray:
-    """Sionna RT's orientation (alpha, beta, gamma; rad) of a device, or of several [n, 3].
+    """Orientations (alpha, beta, gamma; rad) of devices in Sionna RT [..., 3].
 
-    Args:
-        to_world: rotation [3, 3], or rotations [n, 3, 3], from the device's frame, whose boresight is +x, to the
-            world's; see `wrf_mi.core.Antenna.to_world`.
+    Of rotations [..., 3, 3] from the device's frame, whose boresight is +x, to the world's
+    (`wrf_mi.core.Antenna.to_world`).
     """
     with warnings.catch_warnings():
         # A device that looks straight up or down has many equivalent angles.
@@ -82,6 +79,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
 
     from ...backend.device import columns_on_device, on_device, to_vectors
 
+    # Objects and triangles by Mitsuba's numbers; all bits set is Sionna RT's number for none.
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
@@ -95,6 +93,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     integers: Any = mi.TensorXu
     numbers = columns_on_device((legs.interactions, shape, primitive), mi.UInt32)
     buffer._interaction_types, buffer._shapes, buffer._primitives = (integers(values, face.shape) for values in numbers)
+    # Points in single precision: the phase exp(-j k length) is that of lengths in float64, see `path_gains`.
     vertices = np.nan_to_num(legs.vertices_m, nan=0.0).astype(np.float32)
     for level in range(1, depth):  # beyond the last interaction Sionna RT reads the last point, and adds its distance
         vertices[:, level] = np.where(used[:, level, None], vertices[:, level], vertices[:, level - 1])
@@ -144,7 +143,8 @@ def sampled_paths(
 
     from ...backend.device import to_vectors
 
-    step = max(1, SLOTS_PER_CHUNK // (rays * options.max_depth))
+    # Stage 1: rays find candidates; the buffer has room for a path of every ray and interaction to each target.
+    step = max(1, SLOTS_PER_CHUNK // (rays * options.depth))
     parts = []
     for start in range(0, len(targets_m), step):
         batch = targets_m[start : start + step]
@@ -155,8 +155,8 @@ def sampled_paths(
             src_positions=ends[0],
             tgt_positions=ends[1],
             samples_per_src=rays,
-            max_num_paths_per_src=rays * options.max_depth * len(batch),
-            max_depth=options.max_depth,
+            max_num_paths_per_src=rays * options.depth * len(batch),
+            max_depth=options.depth,
             los=False,
             specular_reflection=options.reflection,
             diffuse_reflection=options.scattering,
@@ -168,6 +168,7 @@ def sampled_paths(
         buffer.schedule()
         dr.eval()
         buffer.shrink()
+        # Stage 2: the image method moves specular points, and tests visibility.
         buffer = ImageMethod()(
             scene=scene.mi_scene,
             paths=buffer,
@@ -193,12 +194,8 @@ def field_of(
 ) -> tuple[Any, Any]:
     """Complex gains [p] of paths as Dr.Jit arrays, without the phase exp(-j k length).
 
-    Args:
-        scene: ``sionna.rt.Scene``.
-        buffer: p paths from source to target, from `to_buffer`; may be used again.
-        ends: sources and targets.
-        rays: number of rays shot per source, for diffuse reflections.
-        loop_mode: Dr.Jit's mode of loops; the symbolic one is faster, the evaluated one differentiable in materials.
+    The buffer of `to_buffer` may be used again; diffuse reflections depend on the number of rays shot per source. Loops
+    are faster in Dr.Jit's symbolic mode, and differentiable in materials in the evaluated one.
     """
     import drjit as dr
     import mitsuba as mi
@@ -208,6 +205,7 @@ def field_of(
 
     if buffer.buffer_size == 0:
         return mi.Float(), mi.Float()
+    # Stage 3: fields along each path, from the source's antenna to the target's.
     calculator = FieldCalculator()
     calculator.loop_mode = loop_mode
     # The calculator marks paths of gain zero as invalid; all are evaluated again in the next call.
@@ -257,11 +255,7 @@ def _pattern(devices: Devices, index: Any) -> Any:
 
 
 def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
-    """Complex gains [p] of paths, without the phase exp(-j k length), in chunks.
-
-    Raises:
-        InputError: a gain that is not a number.
-    """
+    """Complex gains [p] of paths, without the phase exp(-j k length); `InputError` where one is not a number."""
     import drjit as dr
 
     gain, legs = np.zeros(len(legs), np.complex128), apart(legs, surfaces, ends)
@@ -277,11 +271,8 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
 
 
 def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
-    """Legs whose points of specular paths lie `SHORT` apart at least, so that each leg has a direction.
-
-    Sionna RT takes directions from points, which coincide where a path is reflected in an edge. Points are moved along
-    the true direction, which is that from the source's image to the leg's end.
-    """
+    """Legs whose points of specular paths lie `SHORT` apart at least, so that each leg has a direction."""
+    # Sionna RT takes directions from points, which coincide where a path is reflected in an edge.
     count = np.count_nonzero(legs.interactions, axis=1)
     points = np.concatenate([ends[0].position_m[legs.source, None], legs.vertices_m], axis=1)
     points = np.pad(points, ((0, 0), (0, 1), (0, 0)))
@@ -294,6 +285,7 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
         return legs
     reflects = legs.interactions[row] == SPECULAR
     plane = np.where(reflects, surfaces.plane[legs.face[row]], -1)
+    # The true direction of a leg is that from the source's image to the leg's end.
     image = image_sources(surfaces.normal, surfaces.offset, plane, points[row, 0])
     direction = points[row, 1:] - image
     size = np.linalg.norm(direction, axis=2, keepdims=True)

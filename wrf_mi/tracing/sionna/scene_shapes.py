@@ -30,14 +30,11 @@ from .materials import CONSTANTS
 
 logger = logging.getLogger(__name__)
 
-MESHES = ("ply", "obj")
-"""Shapes that are files of vertices and faces."""
+MESHES = ("ply", "obj")  # shapes that are files of vertices and faces
 SEGMENTS = 32
 """Segments of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off."""
-CHECKED_FILES = 4096
-"""Files whose triangles are remembered: a scene is opened once for each carrier and fold."""
-REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)
-"""Errors of Mitsuba and Sionna RT about a scene file."""
+CHECKED_FILES = 4096  # files whose triangles are remembered: a scene is opened once for each carrier and fold
+REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)  # errors of Mitsuba and Sionna RT about a scene file
 PLACE = re.compile(r"^\[[\w.]+:\d+\] (((Error while|While) loading|At) string \(line \d+, col \d+\): )?")
 """Begin of Mitsuba's messages: its source line, and a place in a text that is not the file."""
 PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")
@@ -118,11 +115,8 @@ def _mesh_content(shape: Element) -> bytes | None:
 
 @lru_cache(CHECKED_FILES)
 def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) -> bytes | None:
-    """`_mesh_content` of a file, which is read again if its state (inode, bytes, time of change) is another one.
-
-    Faces of vertices that are not there are refused before Mitsuba reads the file: Mitsuba follows them, and ends the
-    process.
-    """
+    """`_mesh_content` of a file, which is read again if its state (inode, bytes, time of change) is another one."""
+    # Faces of vertices that are not there are refused first: Mitsuba follows them, and ends the process.
     parts = mesh_parts(file)
     if not parts:
         raise InputError(f"{file}: holds no triangles; remove the shape or restore the file")
@@ -208,11 +202,7 @@ def plain_ply(mesh: trimesh.Trimesh) -> bytes:
 
 
 def check_materials(root: Element, path: Path) -> None:
-    """Refuse materials without the names by which Sionna RT knows them.
-
-    Raises:
-        InputError: a BSDF, in a shape or beside the shapes, without id.
-    """
+    """Refuse (`InputError`) a BSDF, in a shape or beside the shapes, without the id by which Sionna RT knows it."""
     materials = [(f"<bsdf> {number}", bsdf) for number, bsdf in enumerate(root.findall("bsdf"), start=1)]
     materials += [(f"{name}: its <bsdf>", bsdf) for name, shape in named_shapes(root) for bsdf in shape.findall("bsdf")]
     for where, bsdf in materials:
@@ -224,8 +214,7 @@ def check_materials(root: Element, path: Path) -> None:
 def load_checked(root: Element, path: Path, folder: Path) -> Any:
     """Load a scene in Sionna RT from the root of its file, by way of a file in a folder.
 
-    Raises:
-        InputError: naming the file, the shape at fault where it is one, and Mitsuba's or Sionna RT's reason.
+    `InputError` names the file, the shape at fault where it is one, and Mitsuba's or Sionna RT's reason.
     """
     try:
         return _load(root, folder / "scene.xml")

@@ -14,7 +14,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 from ... import backend
 from ...core import InputError
 from ...core.yaml_files import read_yaml
-from ...scene.coordinates import require_near, up_of, warn_of_up
+from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import thicknesses
@@ -25,8 +25,7 @@ from .materials import perfect_reflector, set_frequency
 from .scene_shapes import check_materials, load_checked, plain_ply, replace_shapes
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
-HIGHEST_M = 500.0
-"""Height above which a scene counts as one in millimetres."""
+HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
 
 
 def open_scene(
@@ -61,9 +60,7 @@ def load_scene(
 ) -> tuple[Any, dict[str, float], dict[str, tuple[float, float]]]:
     """Load a scene in Sionna RT without setting its frequency, with the arguments and errors of `open_scene`.
 
-    Returns:
-        A ``sionna.rt.Scene``, thicknesses of its materials in metres, and laws of their conductivities, as
-        `set_frequency` takes them.
+    Returns a ``sionna.rt.Scene``, and thicknesses and laws of its materials as `set_frequency` takes them.
     """
     backend.init()
     path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()
@@ -126,7 +123,7 @@ def _from_mesh(path: Path, material: str) -> Any:
     parts, scene = mesh_parts(path), rt.load_scene()
     if parts:
         triangles = np.concatenate([np.asarray(part.triangles) for part in parts])
-        warn_of_up(sampled(triangles), path, up_of(path, None))
+        warn_of_up(sampled(triangles), path)
     with tempfile.TemporaryDirectory() as folder:
         objects = []
         for index, part in enumerate(parts):
