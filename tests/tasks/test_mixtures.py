@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wrf_mi.tasks import TASKS
-from wrf_mi.tasks.mixtures import ssim_mixtures
+from wrf_mi.tasks.scores import ssim_mixtures
 
 EXACT = 1e-9
 """Moments of windows are differences of float64 sums of 49 values below one."""

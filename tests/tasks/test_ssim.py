@@ -16,8 +16,7 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core import InputError
-from wrf_mi.tasks.losses import spectrum_loss
-from wrf_mi.tasks.ssim import ssim
+from wrf_mi.tasks.losses import spectrum_loss, ssim
 
 Float64 = dr.float64_array_t(mi.Float)
 

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..receivers.instruments import Instrument
-from .mixtures import MixtureScores, mixture_scores
+from .scores import MixtureScores
 
 UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
@@ -169,10 +170,11 @@ class Task(ABC):
         """
         sign = 1 if self.higher_is_better else -1
 
-        def limited(mean: NDArray[Any], observed: NDArray[Any]) -> FloatArray:
-            return np.asarray(sign * np.clip(self.of_rows(mean[None], observed[None])[0], *self.limits))
+        def scores(weights: FloatArray, rows: IntArray) -> FloatArray:
+            mean = np.einsum("mk,km...->m...", weights, predictions[:, rows])
+            return np.asarray(sign * np.clip(self.of_rows(mean[None], truth[rows][None])[0], *self.limits))
 
-        return mixture_scores(predictions, truth, limited)
+        return scores
 
     def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
         """Score of each receiver and row.
