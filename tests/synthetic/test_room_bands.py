@@ -18,8 +18,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.channel import received_power
 from wrf_mi.synthetic import load_record, traced_room_bands
-from wrf_mi.synthetic.furnished_room import opaque_parts
-from wrf_mi.synthetic.room_bands import DEFAULT, RECEIVERS, RoomBands, channels_at_carriers
+from wrf_mi.synthetic.furnished_room import DEFAULT_BANDS, RECEIVERS, RoomBands, channels_at_carriers, opaque_parts
 from wrf_mi.synthetic.searches import searched_paths, set_scattering, trace_channels
 from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tracing import TraceOptions, open_scene
@@ -78,7 +77,7 @@ def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
     ceiling, wall = (receiver.to_world for receiver in RECEIVERS)
     np.testing.assert_allclose(ceiling[:, 2], [0, 0, -1], atol=1e-12)
     np.testing.assert_allclose(wall[:, 1:], np.array([[0, 0, 1], [-1, 0, 0]]).T, atol=1e-12)
-    assert DEFAULT.spacing_m < speed_of_light / max(DEFAULT.carriers_hz) / 2
+    assert DEFAULT_BANDS.spacing_m < speed_of_light / max(DEFAULT_BANDS.carriers_hz) / 2
 
 
 def test_data_are_stored_and_reproducible(record: Record, folder: Path, tmp_path: Path) -> None:
