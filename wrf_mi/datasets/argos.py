@@ -142,7 +142,40 @@ def _local(file: Path, group: Any, name: str) -> Any:
 def _open(
     file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
 ) -> tuple[_Layout, Iterator[NDArray[Any]]]:
-    """The layout, and chunks of samples [frames, users, antennas, slot, 2]."""
+    """The layout, and chunks of samples (`_chunks`)."""
+    shape = _check_samples(file, pilots)
+    asked = range(shape[0])[frames or slice(None)]
+    if not len(asked) or asked.step < 0:
+        raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
+    layout = (_sounder if len(shape) == 5 else _argos)(file, shape, attributes, start)
+    if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
+        text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
+        raise DataFault(file, f"{text}; give start")
+    needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
+    require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
+    if len(shape) == 5:
+        if cell is None and shape[1] > 1:
+            raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+        if not 0 <= (cell or 0) < shape[1]:
+            raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
+    return layout, _chunks(pilots, layout, asked, cell or 0)
+
+
+def _chunks(pilots: Any, layout: _Layout, frames: range, cell: int) -> Iterator[NDArray[Any]]:
+    """Samples [frames, users, antennas, slot, 2] of at most `CHUNK_SIZE` bytes at a time."""
+    step = max(1, CHUNK_SIZE // int(np.prod(pilots.shape[1:]) * pilots.dtype.itemsize))
+    for first in range(0, len(frames), step):
+        chunk = frames[first : first + step]
+        rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
+        if pilots.ndim == 4:
+            values = pilots[rows][:, :, : layout.users * layout.slot]
+            yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
+        else:
+            yield pilots[rows, cell].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
+
+
+def _check_samples(file: Path, pilots: Any) -> tuple[int, ...]:
+    """The shape of the samples, which are whole numbers in the file itself."""
     shape = tuple(int(size) for size in pilots.shape)
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
@@ -152,33 +185,7 @@ def _open(
     size = file.stat().st_size
     if pilots.nbytes > MOST_DEFLATED * size:
         raise DataFault(file, f"{PILOTS} states {list(shape)} samples, and the file has {size} bytes; fetch it again")
-    asked = range(shape[0])[frames or slice(None)]
-    if not len(asked) or asked.step < 0:
-        raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
-    find = _sounder if len(shape) == 5 else _argos
-    layout = find(file, shape, attributes, start)
-    if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
-        text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
-        raise DataFault(file, f"{text}; give start")
-    needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
-    require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
-    if len(shape) == 5 and cell is None and shape[1] > 1:
-        raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
-    if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:
-        raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
-
-    def parts() -> Iterator[NDArray[Any]]:
-        step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
-        for first in range(0, len(asked), step):
-            chunk = asked[first : first + step]
-            rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
-            if len(shape) == 4:
-                values = pilots[rows][:, :, : layout.users * layout.slot]
-                yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
-            else:
-                yield pilots[rows, cell or 0].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
-
-    return layout, parts()
+    return shape
 
 
 def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:

@@ -21,7 +21,7 @@ from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT
 from ..core.carriers import FREQUENCY
-from ..core.files import atomic_folder, one_line
+from ..core.files import atomic_folder, one_line, write_csv
 from ..core.types import IntArray
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
@@ -37,7 +37,6 @@ from .folder_files import (
     refuse_unstated,
     runs_of,
     shown,
-    write_csv,
     write_extra,
 )
 from .unknown import Table, long_columns, table_text
@@ -139,19 +138,18 @@ def write_ble_folder(
             if any(antenna != ANTENNA for antenna in group)
         }
         positions = np.stack([receiver.position_m for receiver in record.receivers])
-        write_csv(part / ANCHORS, {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated})
+        columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated}
+        write_csv(part / ANCHORS, columns, zip(*columns.values(), strict=True))
         for file, rows in zip((TRAINING, TEST), official, strict=True):
-            columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
-            if record.tx_heading_rad is not None:
-                columns["heading"] = record.tx_heading_rad[rows].tolist()
-            if carriers is not None:
-                columns[FREQUENCY] = carriers[rows].tolist()
-            if record.runs is not None:
-                columns[RUN] = record.runs[rows].tolist()
-            for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
+            columns = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
+            of_rows = {"heading": record.tx_heading_rad, FREQUENCY: carriers, RUN: record.runs}
+            columns |= {name: values[rows].tolist() for name, values in of_rows.items() if values is not None}
+            # Where nothing was received, the number of readings is an empty field, as are strength and noise.
+            counts = None if record.n_readings is None else np.where(record.n_readings, record.n_readings, None)
+            for prefix, values in ((RSSI, record.observation), (COUNT, counts), (STD, record.std)):
                 if values is not None:
                     columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
-            write_csv(part / file, columns)
+            write_csv(part / file, columns, zip(*columns.values(), strict=True))
         write_extra(part, extra)
     return Path(path)
 

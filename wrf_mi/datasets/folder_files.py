@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, text_lines
+from ..core.files import one_line, text_lines, write_csv
 from ..core.types import IntArray
 from .faults import attempt, recoverable, refuse
 
@@ -324,22 +324,13 @@ def write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
-def write_csv(path: Path, columns: Mapping[str, Iterable[Any]]) -> None:
-    """Write columns of texts or numbers to their last digit; NaN, and a count of zero, are empty fields."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
-
-
 def write_positions(path: Path, stated: Positions) -> None:
     """Write positions and carriers to the last digit, and runs; `read_positions` reads them."""
     columns: dict[str, list[Any]] = dict(zip(AXES.split(","), stated.positions_m.astype(float).T.tolist(), strict=True))
     for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs)):
         if values is not None:
             columns[name] = values.tolist()
-    write_csv(path, columns)
+    write_csv(path, columns, zip(*columns.values(), strict=True))
 
 
 def write_extra(folder: Path, extra: Mapping[str, str | bytes] | None) -> None:

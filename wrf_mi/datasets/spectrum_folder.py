@@ -127,6 +127,26 @@ def write_spectrum_folder(
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
+    _check_writable(path, record)
+    grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
+    several = len(record.receivers) > 1
+    with atomic_folder(Path(path), replace) as part:
+        for receiver, spectra in zip(record.receivers, grey, strict=True):
+            images = part / IMAGES / receiver.name if several else part / IMAGES
+            images.mkdir(parents=True)
+            for row, image in enumerate(spectra, start=1):
+                Image.fromarray(image).save(images / f"{row:05d}.png")
+        info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
+        (part / GATEWAYS).write_text(info, encoding="utf-8")
+        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
+        write_official(part, record.official, first=1, digits=5)
+        if record.folds is not None:
+            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
+        write_extra(part, extra)
+    return Path(path)
+
+
+def _check_writable(path: str | Path, record: Record) -> None:
     if (
         record.observation.ndim != 4
         or np.iscomplexobj(record.observation)
@@ -140,34 +160,22 @@ def write_spectrum_folder(
         raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
     refuse_runs(path, record)
     refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
-    grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
-    with atomic_folder(Path(path), replace) as part:
-        several = len(record.receivers) > 1
-        for receiver, spectra in zip(record.receivers, grey, strict=True):
-            images = part / IMAGES / receiver.name if several else part / IMAGES
-            images.mkdir(parents=True)
-            for row, image in enumerate(spectra, start=1):
-                Image.fromarray(image).save(images / f"{row:05d}.png")
-        content: dict[str, Any] = {"dataset_name": record.name}
-        for rx in record.receivers:
-            entry = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
-            if antenna := antenna_entry(rx.antenna):
-                entry["antenna"] = antenna
-            if rx.array_m is not None:
-                entry["array"] = {"elements_m": rx.array_m.tolist()}
-            content[rx.name] = entry
-        if antenna := antenna_entry(record.tx_antenna):
-            content[TX_ANTENNA] = antenna
-        if record.frequencies_hz is not None:
-            content["frequency_hz"] = float(record.frequencies_hz[0])
-        info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-        (part / GATEWAYS).write_text(info, encoding="utf-8")
-        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
-        write_official(part, record.official, first=1, digits=5)
-        if record.folds is not None:
-            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
-        write_extra(part, extra)
-    return Path(path)
+
+
+def _gateway_info(record: Record) -> dict[str, Any]:
+    """Content of `GATEWAYS`."""
+    content: dict[str, Any] = {"dataset_name": record.name}
+    for rx in record.receivers:
+        content[rx.name] = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
+        if antenna := antenna_entry(rx.antenna):
+            content[rx.name]["antenna"] = antenna
+        if rx.array_m is not None:
+            content[rx.name]["array"] = {"elements_m": rx.array_m.tolist()}
+    if antenna := antenna_entry(record.tx_antenna):
+        content[TX_ANTENNA] = antenna
+    if record.frequencies_hz is not None:
+        content["frequency_hz"] = float(record.frequencies_hz[0])
+    return content
 
 
 def parse_folds(path: Path, rows: int) -> IntArray:

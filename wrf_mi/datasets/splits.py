@@ -94,34 +94,35 @@ def make_splits(
         raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0")
-    splits = []
-    for label, train, test, held, left in _train_and_test(record, name, seed):
-        what = f"{record.name}, split {label}"
-        for verb, part in (("trains", train), ("scores", test)):
-            if len(part) == 0:
-                raise InputError(f"{what}: no row that was received {verb}; use another split")
-        # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it
-        # is nested in a longer one, validation rows included.
-        order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
-        count = len(order)
-        if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
-            count = int(n_train)
-        elif n_train is not None:
-            count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
-        if not 1 <= count <= len(order):
-            raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
-        order = order[:count]
-        # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
-        counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
-        validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
-        parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)
-        pairs = rows_left(record, np.sort(order), held, left, seed)
-        for receiver in held:
-            if (has := int((pairs[:, 0] == receiver).sum())) < left:
-                who = f"{record.name}: {record.receivers[receiver].name} received {has} of the training rows"
-                raise InputError(f"{who}, and split {label} leaves it {left}; leave fewer")
-        splits.append(Split(label, seed, *parts, held, pairs))
-    return splits
+    return [_split(record, rows, seed, n_train, validation_fraction) for rows in _train_and_test(record, name, seed)]
+
+
+def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, validation_fraction: float) -> Split:
+    what = f"{record.name}, split {rows.name}"
+    for verb, part in (("trains", rows.train), ("scores", rows.test)):
+        if len(part) == 0:
+            raise InputError(f"{what}: no row that was received {verb}; use another split")
+    # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it is
+    # nested in a longer one, validation rows included.
+    order = np.random.default_rng([seed, 1]).permutation(np.sort(rows.train))
+    count = len(order)
+    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+        count = int(n_train)
+    elif n_train is not None:
+        count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
+    if not 1 <= count <= len(order):
+        raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
+    order = order[:count]
+    # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
+    counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
+    validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
+    parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(rows.test)
+    left = rows_left(record, np.sort(order), rows.held_receivers, rows.left, seed)
+    for receiver in rows.held_receivers:
+        if (count_left := int((left[:, 0] == receiver).sum())) < rows.left:
+            who = f"{record.name}: {record.receivers[receiver].name} received {count_left} of the training rows"
+            raise InputError(f"{who}, and split {rows.name} leaves it {rows.left}; leave fewer")
+    return Split(rows.name, seed, *parts, rows.held_receivers, left)
 
 
 def splits_below(record: Record, name: str) -> tuple[str, ...]:
