@@ -127,7 +127,7 @@ def cut(name: str):
 
 
 GREY = np.zeros((5, 8), np.uint8)
-WRONG = {
+WRONG = {  # each is refused, see test_faults.py
     "no poses": (remove("gateway_info.yml"), "gateway_info.yml", "missing"),
     "no positions file": (remove("tx_pos.csv"), "tx_pos.csv", "missing"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
@@ -171,13 +171,6 @@ WRONG = {
     "fold far away": (text("blocked_folds.txt", r"^2", "9" * 15), "blocked_folds.txt", "fold 3 has no row"),
     "one fold": (write("blocked_folds.txt", "0\n" * 12), "blocked_folds.txt", "one fold only"),
 }
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_refused_with_file_and_row(folder: Path, case: str):
-    change, file, message = WRONG[case]
-    change(folder)
-    assert file in refusal(read_spectrum_folder, folder, message)
 
 
 @pytest.mark.parametrize(("w", "unit"), [("0.8005", True), ("0.8025", False)])

@@ -80,15 +80,11 @@ def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
     assert DEFAULT_BANDS.spacing_m < speed_of_light / max(DEFAULT_BANDS.carriers_hz) / 2
 
 
-def test_data_are_stored_and_reproducible(record: Record, folder: Path, tmp_path: Path) -> None:
+def test_data_are_stored(record: Record, folder: Path) -> None:
     before = (folder / "tx_pos.csv").stat().st_mtime_ns
     again = traced_room_bands(folder, SMALL)
     assert (folder / "tx_pos.csv").stat().st_mtime_ns == before
     np.testing.assert_array_equal(again.observation, record.observation)
-    moved = traced_room_bands(tmp_path / "moved", replace(SMALL, seed=2))
-    assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
-    back = traced_room_bands(tmp_path / "moved", SMALL)
-    np.testing.assert_array_equal(back.observation, record.observation)
 
 
 def test_splits_keep_positions_and_carriers_apart(record: Record) -> None:
@@ -108,6 +104,7 @@ def test_spectra_of_a_carrier_are_those_made_at_it_alone(record: Record, tmp_pat
     for number, carrier_hz in enumerate(SMALL.carriers_hz):
         alone = traced_room_bands(tmp_path / str(number), replace(SMALL, carriers_hz=(carrier_hz,)))
         np.testing.assert_array_equal(alone.frequencies_hz, [carrier_hz])
+        np.testing.assert_array_equal(alone.tx_pos_m, record.tx_pos_m[number::2])
         np.testing.assert_array_equal(alone.observation, record.observation[:, number::2])
     assert not np.array_equal(record.observation[:, ::2], record.observation[:, 1::2])
 
