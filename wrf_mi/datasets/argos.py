@@ -215,8 +215,7 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
 
 def _check_sequence(file: Path, attributes: dict[str, Any]) -> None:
     """Refuse pilots that are not the long training symbol."""
-    found = np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))
-    word = found[0] if len(found) else ""
+    word = next(iter(np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))), "")
     text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
     if not text or not isinstance(word, bytes | str):
         what = "empty" if not text else shown(word)
@@ -238,8 +237,8 @@ def _number(attributes: dict[str, Any], key: str) -> float | None:
 def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
     value = _number(attributes, key)
     if value is None or value < 0 or value != int(value):
-        found = f"is {shown(attributes[key])}" if key in attributes else "is missing"
-        raise DataFault(file, f"attribute {key} {found}; it must state the layout of {PILOTS}")
+        state = f"is {shown(attributes[key])}" if key in attributes else "is missing"
+        raise DataFault(file, f"attribute {key} {state}; it must state the layout of {PILOTS}")
     return int(value)
 
 

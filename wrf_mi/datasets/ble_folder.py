@@ -74,7 +74,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """
     folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
     anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
-    ids = attempt(_read_ids, anchors, whole=True)
+    ids = attempt(_read_ids, anchors, complete=True)
     anchors_m = attempt(_positions, anchors, "xyz")
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
@@ -188,12 +188,12 @@ def _read_ids(table: CsvTable) -> list[str]:
         logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
-        found = _id(text)
-        wrong = None if row - 1 in table.damaged else _wrong_id(found, ids)
+        anchor = _id(text)
+        wrong = None if row - 1 in table.damaged else _wrong_id(anchor, ids)
         if wrong:
             remedy = "give each anchor a number or name that no other has"
             refuse(DataFault(table.path, f"id {shown(text)} {wrong}; {remedy}", row=row))
-        ids.append(found)
+        ids.append(anchor)
     if table.damaged:
         stop_at_faults()  # an anchor without id
     return ids
@@ -222,11 +222,11 @@ def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
     entries = [
         {key: text for key, texts in stated.items() if (text := texts[row].strip())} for row in range(len(table.rows))
     ]
-    found = [
+    antennas = [
         attempt(read_antenna, table.path, f"{prefix}antenna", entry, ANTENNA_WORDS, row)
         for row, entry in enumerate(entries, start=1)
     ]
-    return [antenna.value for antenna in found]
+    return [antenna.value for antenna in antennas]
 
 
 def _id(text: str) -> str:
@@ -272,25 +272,25 @@ def _in_both(column: str, tables: list[CsvTable]) -> Any:
 
 def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
     """Columns of a table that begin with a prefix, by the anchor that they name."""
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for column in table.header:
         if column.startswith(prefix):
-            first = found.setdefault(_id(column.removeprefix(prefix)), column)
+            first = columns.setdefault(_id(column.removeprefix(prefix)), column)
             if first != column:
                 text = f"{first} and {column} name one anchor; remove one of them"
                 refuse(DataFault(table.path, text, line=1))
-    return found
+    return columns
 
 
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
     """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
-    found = [_by_anchor(prefix, table) for table in tables]
-    if not any(anchor in columns for columns in found for anchor in ids):
+    columns_by_anchor = [_by_anchor(prefix, table) for table in tables]
+    if not any(anchor in columns for columns in columns_by_anchor for anchor in ids):
         return None
     parts = []
-    for table, columns, strength in zip(tables, found, strengths, strict=True):
+    for table, columns, strength in zip(tables, columns_by_anchor, strengths, strict=True):
         if lacking := [anchor for anchor in ids if anchor not in columns]:
             text = f"no column {prefix}{lacking[0]}; give one for every anchor in both files, or none"
             refuse(DataFault(table.path, text, line=1))

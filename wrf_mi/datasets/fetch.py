@@ -119,11 +119,11 @@ class _Bounded(io.FileIO):
 
 
 def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str]) -> None:
-    whole = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+    unbounded = pooch.HTTPDownloader(timeout=TIMEOUT_S)
 
     def bounded(url: str, path: str, store: pooch.Pooch, most: int) -> None:
         with _Bounded(path, most) as file:
-            whole(url, file, store)
+            unbounded(url, file, store)
 
     logger = pooch.get_logger()
     level = logger.level

@@ -47,11 +47,11 @@ def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
     """The only file of a folder with one of some suffixes, or the path itself where it is no folder."""
     if not path.is_dir():
         return path
-    found = sorted(file for file in path.iterdir() if file.suffix in suffixes)
-    if len(found) != 1:
-        names = ", ".join(file.name for file in found) or "none"
+    candidates = sorted(file for file in path.iterdir() if file.suffix in suffixes)
+    if len(candidates) != 1:
+        names = ", ".join(file.name for file in candidates) or "none"
         raise DataFault(path, f"{what} is read at a time, found {names}; give the file itself")
-    return found[0]
+    return candidates[0]
 
 
 def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:
@@ -211,9 +211,9 @@ def read_columns(path: Path, *headers: str) -> FloatArray:
 
 def _read_table(path: Path, headers: tuple[str, ...]) -> CsvTable:
     table = read_csv(path)
-    found = ",".join(table.header)
-    if found.lower() not in headers:
-        raise DataFault(path, f"header is {found[:40]!r}; it must be {' or '.join(headers)}", line=1)
+    header = ",".join(table.header)
+    if header.lower() not in headers:
+        raise DataFault(path, f"header is {header[:40]!r}; it must be {' or '.join(headers)}", line=1)
     return table
 
 
@@ -288,7 +288,7 @@ def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) 
 
 
 def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
-    seen: dict[int, int] = {}
+    line_of_row: dict[int, int] = {}
     lines = text_lines(path)
     for line, text in enumerate(lines, start=1):
         with recoverable():
@@ -296,13 +296,13 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
             if not first <= row < rows + first:
                 known = f"{source} has rows {first} to {rows + first - 1}"
                 raise DataFault(path, f"row {row} is out of range; {known}", line=line)
-            if row in seen:
-                text = f"row {row} stands in line {seen[row]} already; remove one of them"
+            if row in line_of_row:
+                text = f"row {row} stands in line {line_of_row[row]} already; remove one of them"
                 raise DataFault(path, text, line=line)
-            seen[row] = line
+            line_of_row[row] = line
     if not lines:
         raise DataFault(path, "no rows in it; give one row number per line")
-    return np.array(list(seen), np.int64) - first
+    return np.array(list(line_of_row), np.int64) - first
 
 
 def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:

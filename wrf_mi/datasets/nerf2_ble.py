@@ -18,16 +18,8 @@ from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.yaml_files import read_yaml
-from .faults import attempt, refuse, stop_at_faults
-from .folder_files import (
-    POSITIONS,
-    CsvTable,
-    data_folder,
-    finite_numbers,
-    read_csv,
-    read_official,
-    shown,
-)
+from .faults import attempt, recoverable, refuse, stop_at_faults
+from .folder_files import POSITIONS, CsvTable, data_folder, finite_numbers, read_csv, read_official, shown
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
 NOT_RECEIVED_DBM = -100.0
@@ -50,13 +42,16 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
             the row.
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
-    found = attempt(read_yaml, folder / GATEWAYS)
-    gateways = attempt(_read_gateways, folder / GATEWAYS, found)
+    info = attempt(read_yaml, folder / GATEWAYS)
+    gateways = attempt(_read_gateways, folder / GATEWAYS, info)
     table = attempt(_headed, folder / POSITIONS)
     positions = attempt(_read_positions, table)
-    power = attempt(_read_powers, folder / POWERS, found)
+    power = attempt(_read_powers, folder / POWERS, info)
     rows = attempt(_count_rows, table)
-    attempt(_check_rows, folder / POWERS, power, rows)
+    with recoverable():
+        if power.value.shape[1] != rows.value:
+            text = f"{power.value.shape[1]} rows, but {POSITIONS} has {rows.value}"
+            raise DataFault(folder / POWERS, f"{text}; give one row of each per transmission")
     official = attempt(read_official, folder, rows, 0)
     stop_at_faults()
     return Record(
@@ -71,15 +66,15 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
     )
 
 
-def _read_gateways(path: Path, found: dict[Any, Any]) -> dict[str, FloatArray]:
+def _read_gateways(path: Path, info: dict[Any, Any]) -> dict[str, FloatArray]:
     """Positions [3] of the gateways by their names."""
-    if not found:
+    if not info:
         raise DataFault(path, "no gateway in it; give one line NAME: [x, y, z] for each, metres")
-    for key in found:
+    for key in info:
         if not str(key).isprintable():
             text = f"gateway {shown(key)} does not go into one line; call it gateway1, gateway2, ..."
             refuse(DataFault(path, text))
-    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in found.items()}
+    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in info.items()}
     return {key: place.value for key, place in places.items()}
 
 
@@ -99,16 +94,9 @@ def _count_rows(table: CsvTable) -> int:
     return rows
 
 
-def _check_rows(path: Path, power: NDArray[np.float32], rows: int) -> None:
-    """Refuse another number of powers than of positions."""
-    if power.shape[1] != rows:
-        text = f"{power.shape[1]} rows, but {POSITIONS} has {rows}; give one row of each per transmission"
-        raise DataFault(path, text)
-
-
-def _read_powers(path: Path, found: dict[Any, Any]) -> NDArray[np.float32]:
+def _read_powers(path: Path, info: dict[Any, Any]) -> NDArray[np.float32]:
     """Powers [gateways, rows] in dBm, NaN where nothing was received."""
-    table, gateways = _headed(path), [str(key) for key in found]
+    table, gateways = _headed(path), [str(key) for key in info]
     if len(table.header) != len(gateways):
         text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways; give one column per gateway"
         raise DataFault(path, text, line=1)

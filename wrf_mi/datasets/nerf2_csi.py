@@ -22,7 +22,7 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_array
 from ..core.files import atomic_folder, readable
 from ..core.yaml_files import read_yaml
-from .faults import attempt, refuse, stop_at_faults
+from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     AXES,
     POSITIONS,
@@ -71,10 +71,14 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     n = attempt(_count_samples, folder / CHANNELS, channel)
     info = attempt(read_yaml, station)
     receiver = attempt(_read_station, station, info)
-    attempt(_check_antennas, station, receiver, channel)
+    with recoverable():
+        _check_antennas(station, receiver.value, channel.value)
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
-    stated = attempt(_read_positions, folder / POSITIONS)
-    positions = attempt(_positions, folder / POSITIONS, stated, n)
+    stated = attempt(read_columns, folder / POSITIONS, AXES) if (folder / POSITIONS).exists() else None
+    with recoverable():
+        if stated is not None and len(stated.value) != n.value:
+            text = f"{len(stated.value)} rows, but {CHANNELS} has {n.value} samples; give one for each"
+            raise DataFault(folder / POSITIONS, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(read_official, folder, n, 0, CHANNELS)
     tx_antenna = attempt(read_tx_antenna, station, info)
@@ -83,7 +87,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     return Record(
         name=name or folder.resolve().name,
         task="csi",
-        tx_pos_m=positions.value,
+        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
         official=official.value,
@@ -172,10 +176,10 @@ def _count_samples(path: Path, channel: NDArray[np.complex64]) -> int:
 
 
 def _frequencies(
-    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], given: FloatArray | None
+    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], of_call: FloatArray | None
 ) -> FloatArray | None:
-    """Frequencies of all subcarriers: those given, or else those of ``base-station.yml``, if any."""
-    stated = info.get("frequencies_hz") if given is None else given
+    """Frequencies of all subcarriers: those of the call, or else those of ``base-station.yml``, if any."""
+    stated = info.get("frequencies_hz") if of_call is None else of_call
     if stated is None:
         return None
     frequencies, subcarriers = numbers_of(stated), channel.shape[2]
@@ -185,20 +189,6 @@ def _frequencies(
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
         raise DataFault(path, f"{text}; give one for each, the uplink's first")
     return frequencies
-
-
-def _read_positions(path: Path) -> FloatArray | None:
-    """Positions [rows, 3], None where there is no file."""
-    return read_columns(path, AXES) if path.exists() else None
-
-
-def _positions(path: Path, stated: FloatArray | None, n: int) -> FloatArray:
-    """Positions [n, 3] of all samples, NaN where they are not stated."""
-    if stated is None:
-        return np.full((n, 3), np.nan)
-    if len(stated) != n:
-        raise DataFault(path, f"{len(stated)} rows, but {CHANNELS} has {n} samples; give one for each")
-    return stated
 
 
 def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.complex64] | None:

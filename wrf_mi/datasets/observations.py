@@ -25,7 +25,7 @@ def rows_received(record: Record, rows: IntArray) -> IntArray:
 
     Of rows at several carriers the largest number at one of them, as some models are fitted to each carrier alone.
     """
-    received = np.stack([~_states(one, rows)[0] for one in record.observation])
+    received = np.stack([~_states(observed, rows)[0] for observed in record.observation])
     if record.carriers_hz is None or not len(rows):
         return np.asarray(received.sum(axis=1), np.int64)
     carriers = np.unique(record.carriers_hz[rows])

@@ -75,12 +75,15 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     folder = data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
     info = attempt(read_yaml, gateways)
-    poses = attempt(_poses, gateways, info, whole=True)
+    poses = attempt(_poses, gateways, info, complete=True)
     array = attempt(_array, gateways, info, "array")
     receivers = attempt(_receivers, gateways, poses, array)
     table = attempt(read_positions, folder / POSITIONS)
     stated = attempt(_frequency, gateways, info)
-    attempt(_one_carrier, folder / POSITIONS, table, stated)
+    with recoverable():
+        if stated.value is not None and table.value.carriers_hz is not None:
+            text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
+            raise DataFault(folder / POSITIONS, text, line=1)
     rows = attempt(lambda read: len(read.positions_m), table)
     observation = attempt(_read_images, folder / IMAGES, poses, rows)
     official = attempt(read_official, folder, rows, 1)
@@ -199,13 +202,6 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     return folds
 
 
-def _one_carrier(path: Path, table: Positions, stated: FloatArray | None) -> None:
-    """Refuse a carrier for all rows beside one for each row."""
-    if stated is not None and table.carriers_hz is not None:
-        text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
-        raise DataFault(path, text, line=1)
-
-
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
     """The carrier [1] of all rows, stated for all receivers or in their entries; None if it is not stated."""
     stated = {key: info[key] for key in CARRIER_KEYS if key in info}
@@ -252,8 +248,8 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        found = shown(array if isinstance(array, dict) else str(array))
-        raise DataFault(path, f"{one_line(name)} is {found}; {remedy}")
+        text = f"{one_line(name)} is {shown(array if isinstance(array, dict) else str(array))}"
+        raise DataFault(path, f"{text}; {remedy}")
     return elements
 
 
@@ -270,16 +266,16 @@ def _poses(path: Path, info: dict[Any, Any]) -> dict[str, dict[Any, Any]]:
 
 def _receivers(path: Path, poses: dict[str, dict[Any, Any]], array_m: FloatArray | None) -> tuple[Receiver, ...]:
     """Receivers of the entries; ``array_m`` is the array of those that state none."""
-    found = []
+    receivers = []
     for name, pose in poses.items():
         position = attempt(finite_numbers, path, f"{name}: position", pose.get("position"), 3)
         orientation = attempt(unit_quaternion, path, name, pose.get("orientation"))
         antenna = attempt(read_antenna, path, f"{name}: antenna", pose.get("antenna"))
         array = attempt(_array, path, pose, f"{name}: array")
         with recoverable():
-            own = array.value if "array" in pose else array_m
-            found.append(Receiver(name, position.value, orientation.value, antenna.value, own))
-    return tuple(found)
+            elements_m = array.value if "array" in pose else array_m
+            receivers.append(Receiver(name, position.value, orientation.value, antenna.value, elements_m))
+    return tuple(receivers)
 
 
 def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> NDArray[np.float32]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -134,12 +133,12 @@ def splits_below(record: Record, name: str) -> tuple[str, ...]:
 def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: int, seed: int) -> IntArray:
     """Pairs [q, 2] of each of some receivers and up to ``count`` of the ``rows`` that it received, a seeded draw."""
     received = np.asarray(np.isfinite(record.observation[:, rows]).reshape(len(record.receivers), len(rows), -1).all(2))
-    found = [np.zeros((0, 2), np.int64)]
+    pairs = [np.zeros((0, 2), np.int64)]
     for receiver in receivers:
         order = np.random.default_rng([seed, 7, receiver]).permutation(rows[received[receiver]])
         chosen = np.sort(order[:count])
-        found.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
-    return np.concatenate(found)
+        pairs.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
+    return np.concatenate(pairs)
 
 
 def save_split(path: str | Path, split: Split) -> None:
@@ -166,7 +165,7 @@ def load_split(path: str | Path) -> Split:
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
         arrays = stored_arrays(Path(path))
         content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
-    held = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
+    held_receivers = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
     left = arrays.get("left", np.zeros((0, 2), np.int64))
     if content["format"] != SPLIT_FORMAT:
         raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
@@ -177,10 +176,11 @@ def load_split(path: str | Path) -> Split:
         raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
     if len(np.unique(rows)) != len(rows):
         raise InputError(f"{path}: a row is in the split twice; make the split again")
-    train, validation, test = (part.astype(np.int64) for part in parts)
-    if not (np.isin(left[:, 0], held).all() and np.isin(left[:, 1], np.concatenate([train, validation])).all()):
+    train, validation, test, left = (part.astype(np.int64) for part in (*parts, left))
+    split = Split(str(content["name"]), int(content["seed"]), train, validation, test, held_receivers, left)
+    if not (np.isin(left[:, 0], held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
         raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
-    return Split(str(content["name"]), int(content["seed"]), train, validation, test, held, left.astype(np.int64))
+    return split
 
 
 def position_folds(record: Record) -> IntArray:
@@ -226,8 +226,8 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
     received = np.asarray(~missing.all(axis=(0, 2)))
     rows = np.flatnonzero(received)
-    whole, colon, _ = name.partition(":")
-    kind, plus, left = whole.partition("+")
+    rule, colon, _ = name.partition(":")
+    kind, plus, left = rule.partition("+")
     leaves = kind == "receiver" and left.isascii() and left.isdecimal() and int(left) > 0
     if kind not in SPLIT_NAMES or (colon and kind not in FOLDED) or (plus and not leaves):
         known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
@@ -240,13 +240,15 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     if kind == "receiver":
         return _receivers_held_out(record, name, seed, int(left or 0))
     if kind in FOLDED:
-        found = {"blocked": position_folds, "other-run": _run_numbers}.get(kind, partial(_carrier_numbers, kind=kind))
-        of_row = found(record)[rows]
-        by_carrier = kind.startswith("frequency")
-        held = _held_out_positions(record, seed)[rows] if by_carrier else np.ones(len(rows), bool)
-        trains = np.ones(len(rows), bool) if kind != "frequency" else ~held
-        chosen = _folds(record, name, int(of_row.max(initial=0)) + 1)
-        return [_Rows(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
+        if kind.startswith("frequency"):
+            fold, tested = _carrier_numbers(record, kind)[rows], _held_out_positions(record, seed)[rows]
+        else:
+            fold = (position_folds if kind == "blocked" else _run_numbers)(record)[rows]
+            tested = np.ones(len(rows), bool)
+        # Held-out positions are new to the model: with "frequency-known" they are known at the other carriers.
+        trains = ~tested if kind == "frequency" else np.ones(len(rows), bool)
+        chosen = _folds(record, name, int(fold.max(initial=0)) + 1)
+        return [_Rows(f"{kind}:{k}", rows[(fold != k) & trains], rows[(fold == k) & tested]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
@@ -281,11 +283,11 @@ def _held_out_positions(record: Record, seed: int) -> NDArray[np.bool_]:
     distinct, number = np.unique(record.tx_pos_m, axis=0, return_inverse=True)
     number = number.reshape(-1)
     if record.official is not None:
-        held = np.unique(number[record.official[1]])
+        held_out = np.unique(number[record.official[1]])
     else:
         order = np.random.default_rng([seed, 2]).permutation(len(distinct))
-        held = order[round(TRAIN_FRACTION * len(distinct)) :]
-    return np.isin(number, held)
+        held_out = order[round(TRAIN_FRACTION * len(distinct)) :]
+    return np.isin(number, held_out)
 
 
 def _folds(record: Record, name: str, count: int) -> range:
@@ -308,14 +310,14 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
         order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
     (rows,) = (only for below in splits_below(record, name) for only in _train_and_test(record, below, seed))
     received = np.asarray(np.isfinite(record.observation).reshape(count, len(record), -1).all(axis=2), bool)
-    found = []
+    splits = []
     for k in _folds(record, name, int(order.max()) + 1):
-        held = np.asarray(order == k)
+        held_out = np.asarray(order == k)
         train, test = (
-            part[received[who][:, part].any(axis=0)] for who, part in ((~held, rows.train), (held, rows.test))
+            part[received[who][:, part].any(axis=0)] for who, part in ((~held_out, rows.train), (held_out, rows.test))
         )
         # A receiver without test rows cannot be scored; the others can.
         if len(test) or ":" in name:
             label = f"{name.partition(':')[0]}:{k}"
-            found.append(_Rows(label, train, test, tuple(np.flatnonzero(held).tolist()), left))
-    return found
+            splits.append(_Rows(label, train, test, tuple(np.flatnonzero(held_out).tolist()), left))
+    return splits

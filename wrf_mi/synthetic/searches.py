@@ -88,16 +88,16 @@ def free_positions(
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
     # A point every 2 cm or so: much less than the clearance.
     tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=seed)[0])
-    found = np.zeros((0, 3))
-    while len(found) < count:
+    positions = np.zeros((0, 3))
+    while len(positions) < count:
         drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
         free = tree.query(drawn)[0] > clear_m
         if station_m is not None:
             apart = np.linalg.norm(drawn[:, None] - np.atleast_2d(station_m), axis=-1)
             free &= apart.min(axis=1) > from_station_m
         free &= solid_around(surfaces, drawn) < 0
-        found = np.concatenate([found, drawn[free]])
-    return found[:count]
+        positions = np.concatenate([positions, drawn[free]])
+    return positions[:count]
 
 
 def trace_channels(
@@ -148,11 +148,11 @@ def searched_paths(
                 # With diffraction Sionna RT searches from transmitters, so the array is the transmitter.
                 traced = trace_paths(scene, receiver.position_m, ends, search, search_from="transmitters")
                 paths = traced.paths
-                kept = (paths.interactions == SCATTERING).any(axis=1)
+                counted = (paths.interactions == SCATTERING).any(axis=1)
                 if not search.scattering:
                     names = np.array([paths.object_names.index(name) for name in opaque if name in paths.object_names])
-                    kept = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
-                yield slice(start, start + len(part)), traced.select(kept)
+                    counted = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
+                yield slice(start, start + len(part)), traced.select(counted)
 
 
 def set_scattering(scene: Any, coefficient: float) -> None:

@@ -164,7 +164,7 @@ def channel_scales(record: Record, rows: IntArray) -> FloatArray:
     task = task_of(record)
     if not task.is_complex:
         return np.ones(len(record.receivers))
-    return np.array([task.unit(seen[rows]) for seen in record.observation])
+    return np.array([task.unit(observed[rows]) for observed in record.observation])
 
 
 def truth_of(
@@ -175,15 +175,15 @@ def truth_of(
     Greys [n, pixels]; powers [n, 1] in dBm; channels, real parts and then imaginary ones, [n, 2 outputs] in units of
     the receiver's ``scales``, or [n * antennas, 2 outputs] divided as in `normalised_uplink`.
     """
-    seen = record.observation[receiver, rows]
+    observed = record.observation[receiver, rows]
     if not task_of(record).is_complex:
-        return np.asarray(seen, np.float32).reshape(len(rows), -1)
+        return np.asarray(observed, np.float32).reshape(len(rows), -1)
     if outputs.by_uplink:
         assert record.uplink is not None
         divisor = normalised_uplink(record.uplink[rows])[1]
-        channel = seen.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
+        channel = observed.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
     else:
-        channel = seen / scales[receiver]
+        channel = observed / scales[receiver]
     flat = channel.reshape(-1, outputs.count)
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
 

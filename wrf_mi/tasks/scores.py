@@ -162,9 +162,9 @@ def ssim_mixtures(predictions: NDArray[Any], truth: NDArray[Any], stride: int = 
         mean = values.mean(axis=2)
         centred = values - mean[:, :, None]
         covariance = np.einsum("iwp,jwp->ijw", centred, centred) * SSIM_SAMPLE / WINDOW**2
-        for kept, moment in zip(kinds, (mean[0], mean[1:], covariance[0], covariance[1:, 1:]), strict=True):
-            kept.append(moment)
-    mean_y, mean_x, with_y, among = (np.stack(kept) for kept in kinds)
+        for moments, moment in zip(kinds, (mean[0], mean[1:], covariance[0], covariance[1:, 1:]), strict=True):
+            moments.append(moment)
+    mean_y, mean_x, with_y, among = map(np.stack, kinds)
     var_y, with_y = with_y[:, 0], with_y[:, 1:]
 
     def scores(weights: FloatArray, rows: IntArray) -> FloatArray:
