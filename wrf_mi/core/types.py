@@ -239,11 +239,8 @@ class Record:
         (median of ``std`` / ``std``)^2 where the data state ``std``, with the median over the observations received in
         these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance.
 
-        Args:
-            rows: numbers of rows [m].
-
         Returns:
-            Shape [n_rx, m], 1 where nothing was received; None where the data state neither.
+            Shape [n_rx, m] for m rows, 1 where nothing was received; None where the data state neither.
         """
         if self.std is None:
             return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)

@@ -116,7 +116,7 @@ def write_ble_folder(
     """Write signal strengths atomically in the layout of the BLE data.
 
     Args:
-        path: path of the folder.
+        path: path of the new folder.
         record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
             of that split.
         replace: replace an existing folder.

@@ -106,7 +106,7 @@ def write_nerf2_csi(
     """Write a record atomically in the layout of NeRF2's channel coefficients.
 
     Args:
-        path: path of the folder.
+        path: path of the new folder.
         record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
             the downlink.
         replace: replace an existing folder.

@@ -118,7 +118,7 @@ def write_spectrum_folder(
     """Write a record atomically in the NeRF2 spectrum layout.
 
     Args:
-        path: path of the folder.
+        path: path of the new folder.
         record: record with ``observation`` [n_rx, n, height, width] in 0..1, which is rounded to grey levels.
         bits: bits per pixel, 8 or 16.
         replace: replace an existing folder.

@@ -166,12 +166,8 @@ def made_in_room(
 ) -> Record:
     """Spectra of the furnished room: read from a folder, or traced and stored with a scan and the measured room.
 
-    Args:
-        folder: folder of the spectra in the NeRF2 layout, see `wrf_mi.synthetic.stored.stored`.
-        name: name of the record.
-        facts: parameters of the data beside those of the room.
-        room: parameters of the room.
-        trace: function of the true scene's folder that traces the record.
+    As `wrf_mi.synthetic.stored.stored`; ``facts`` are parameters of the data beside those of the room, ``trace`` makes
+    the record, of the folder of the true scene.
     """
 
     def write(folder: Path, recipe: Files) -> None:

@@ -20,13 +20,10 @@ from . import instrument_of, task_of
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
-    """Uplink channels as features, and the complex divisor of each.
+    """Uplink channels [m, antennas, subcarriers] as features, and the complex divisor of each.
 
     Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, which
     removes the radios' amplitude and phase, equal in both links.
-
-    Args:
-        uplink: [m, antennas, subcarriers], complex and finite.
 
     Returns:
         Real parts, then imaginary ones, of each row's antennas one after the other, [m * antennas, 2 subcarriers], and
@@ -149,11 +146,7 @@ def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> Flo
 
 
 def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
-    """The uplink of rows to predict.
-
-    Raises:
-        InputError: it is None.
-    """
+    """The uplink of rows to predict; an `InputError` if it is None."""
     if uplink is None:
         raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
     return uplink

@@ -31,7 +31,7 @@ def absolute_error(prediction: Any, truth: Any) -> Any:
 
 
 def squared_error(prediction: Any, truth: Any) -> Any:
-    """Mean squared difference over received observations, a Dr.Jit float of one value; 0 without any."""
+    """Mean squared difference, likewise."""
     return _mean_error(dr.square, prediction, truth)
 
 
@@ -45,15 +45,7 @@ def _mean_error(function: Callable[[Any], Any], prediction: Any, truth: Any) -> 
 def spectrum_loss(
     prediction: Any, truth: Any, batch: int, height: int, width: int, eta: float = SSIM_WEIGHT
 ) -> tuple[Any, Any]:
-    """(1 - eta) L1 + eta (1 - SSIM), averaged over a batch of spectra.
-
-    Args:
-        prediction: flat Dr.Jit float array of ``batch * height * width`` grey values.
-        truth: array of the same shape and type, in 0..1; taken as constant.
-        batch: number of spectra.
-        height: rows, at least 7.
-        width: columns, at least 7.
-        eta: weight of the structural term.
+    """(1 - eta) L1 + eta (1 - SSIM), averaged over a batch of spectra; arguments as of `ssim`.
 
     Returns:
         The loss, a Dr.Jit float of one value, and the structural similarity of each spectrum [batch].

@@ -34,14 +34,7 @@ MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
 
 
 def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-    """Structural similarity of each predicted spectrum.
-
-    Args:
-        prediction: grey values, shape [..., H, W], H and W at least 7.
-        truth: the same shape, in 0..1.
-
-    Returns:
-        Shape [...].
+    """Structural similarity [...] of predicted spectra [..., H, W] to true ones in 0..1; H and W are 7 at least.
 
     Raises:
         InputError: shapes that differ, a prediction that is not finite, or an image smaller than the window.
@@ -58,11 +51,7 @@ def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 
 
 def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-    """Absolute error of received powers in dB, NaN where nothing was received.
-
-    Args:
-        prediction: power in dBm, any shape.
-        truth: the same shape; NaN where nothing was received.
+    """Absolute error of powers in dBm, dB, any shape; NaN where the truth is, as nothing was received.
 
     Raises:
         InputError: shapes that differ, or no finite prediction where something was received.
@@ -76,12 +65,7 @@ def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     """Channel estimation accuracy in dB, -10 log10(sum |prediction - truth|^2 / sum |truth|^2) over subcarriers.
 
-    Args:
-        prediction: complex coefficients, shape [..., subcarriers].
-        truth: the same shape; against noise-free values where it is synthetic.
-
-    Returns:
-        Shape [...]; NaN where the truth is zero.
+    Of complex coefficients [..., subcarriers] the accuracies [...], NaN where the truth is zero.
 
     Raises:
         InputError: shapes that differ, or a prediction that is not finite.
@@ -101,10 +85,8 @@ def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
     """Share of the known values inside the predicted 90 % intervals.
 
-    Args:
-        prediction: any shape, real or complex.
-        std: predicted standard deviation, the same shape; errors are taken to be normal (complex: circular).
-        truth: the same shape; NaN where nothing was received.
+    Values have any shape and are real or complex, NaN in the truth where nothing was received; errors are taken to be
+    normal with the standard deviation ``std``, complex ones circular.
     """
     error = np.abs(np.asarray(prediction) - np.asarray(truth))
     bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
@@ -144,14 +126,10 @@ def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:
 
 
 def ssim_mixtures(predictions: NDArray[Any], truth: NDArray[Any], stride: int = WINDOW) -> MixtureScores:
-    """Structural similarity on every ``stride``-th window along rows and columns.
+    """Structural similarity of means of grey images [k, m, H, W] to true ones [m, H, W] on some windows.
 
     The similarity of a window depends on the weights by its first and second moments alone, which are computed once.
-
-    Args:
-        predictions: grey images [k, m, H, W].
-        truth: grey images [m, H, W].
-        stride: distance of neighbouring windows, pixels; 1: equal to `ssim`.
+    Windows are ``stride`` pixels apart along rows and columns; 1: equal to `ssim`.
     """
     # Moments of the truth, the predictions, their products with each other and with the truth, by image and window.
     kinds: list[list[FloatArray]] = [[], [], [], []]
