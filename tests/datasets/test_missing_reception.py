@@ -18,7 +18,6 @@ from wrf_mi.models import ray_tracing
 from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import train
 from wrf_mi.runs.results import read_run
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 
 DIRECT = TraceOptions(reflection=False, max_depth=0)
@@ -40,12 +39,6 @@ def silent(tmp_path: Path) -> Path:
     for name, rows in (("train_index.txt", range(TRAINED)), ("test_index.txt", range(TRAINED, ROWS))):
         (folder / name).write_text("".join(f"{row}\n" for row in rows))
     return folder
-
-
-@pytest.fixture(scope="module")
-def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flat's plan, extruded."""
-    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
 @pytest.mark.parametrize("model", ["ray-tracing", "kriging", "mri"])
