@@ -248,4 +248,5 @@ def _estimate(samples: NDArray[Any], layout: _Layout) -> NDArray[np.complex64]:
     # Estimates of the symbols share one known sequence, so their mean is the estimate from the mean symbol.
     mean = symbols.mean(axis=-3, dtype=np.float32)
     spectrum = np.fft.fft((mean[..., 0] + 1j * mean[..., 1]) / FULL_SCALE, axis=-1)
+    # Least squares: the received value of a subcarrier is the channel times the known symbol, +1 or -1, plus noise.
     return (spectrum[..., SUBCARRIERS % FFT] / TRAINING).astype(np.complex64)

@@ -31,6 +31,7 @@ from .folder_files import (
     CsvTable,
     carriers_of,
     data_folder,
+    folder_record,
     read_antenna,
     read_csv,
     refuse_runs,
@@ -88,9 +89,10 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(n_train + n_test, TAG_HEIGHT_M)
     counts = noise[COUNT].value
-    record = Record(
-        name=name or folder.resolve().name,
-        task="rssi",
+    record = folder_record(
+        folder,
+        name,
+        "rssi",
         tx_pos_m=np.column_stack([np.concatenate([part.value for part in plane]), height]),
         receivers=tuple(
             Receiver(_name(anchor), position, np.array(UPRIGHT), antenna)
@@ -99,12 +101,11 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         observation=np.concatenate([part.value for part in strengths], axis=1),
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
-        tx_heading_rad=stated["heading"].value,
-        tx_antenna=tx_antenna.value,
+        tx_heading_rad=stated["heading"],
+        tx_antenna=tx_antenna,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
-        std=noise[STD].value,
-        runs=stated[RUN].value,
-        source=str(folder),
+        std=noise[STD],
+        runs=stated[RUN],
     )
     carriers_hz = stated[FREQUENCY].value
     return record if carriers_hz is None else record.at_carriers(carriers_hz)

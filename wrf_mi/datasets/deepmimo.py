@@ -368,17 +368,19 @@ def _channels(
     for start in range(0, n, step):
         rows = slice(start, start + step)
         exist = ~np.isnan(paths["power"][rows])
+        # Matrices are padded with NaN to the most paths of a user; as zeros these places add nothing to the sums.
         power, phase, delay, *angles = (np.where(exist, paths[k][rows], 0.0).astype(float) for k in PATH_MATRICES)
         _check_delays(scenario, pair, delay, chosen)
         departure, arrival = (
             unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
             for azimuth, zenith in (angles[:2], angles[2:])
         )
-        departure = departure @ chosen.rotation
+        departure = departure @ chosen.rotation  # rows times R: from the world's frame to the array's
         with np.errstate(over="ignore", invalid="ignore"):
             gain = exist * 10 ** (power / 20) * np.exp(1j * np.radians(phase))
             for antenna, directions in zip(_antennas(chosen), (departure, arrival), strict=True):
                 gain = gain * np.linalg.norm(antenna.field(directions), axis=-1)
+            # Elements are in wavelengths, so k0 p . u is 2 pi times the product.
             at_elements = gain[..., None] * np.exp(2j * np.pi * (departure @ elements.T))
             waves = np.exp(-2j * np.pi * delay[..., None] * offsets_hz)
             channel[rows] = np.matmul(at_elements.transpose(0, 2, 1), waves)

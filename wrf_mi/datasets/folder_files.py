@@ -17,7 +17,7 @@ from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines, write_csv
 from ..core.types import IntArray
-from .faults import attempt, recoverable, refuse
+from .faults import Attempt, attempt, recoverable, refuse, stop_at_faults
 
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"
@@ -41,6 +41,17 @@ def data_folder(path: str | Path, content: str) -> Path:
     if not folder.is_dir():
         raise DataFault(folder, f"not a folder; give one that holds {content}")
     return folder
+
+
+def folder_record(folder: Path, name: str | None, task: str, **parts: Any) -> Record:
+    """The record of a folder from its attributes, values or attempted parts, once all of these have been read.
+
+    Raises:
+        InputError: the first fault of a part.
+    """
+    stop_at_faults()
+    values = {key: part.value if isinstance(part, Attempt) else part for key, part in parts.items()}
+    return Record(name=name or folder.resolve().name, task=task, source=str(folder), **values)
 
 
 def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:

@@ -18,8 +18,17 @@ from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.yaml_files import read_yaml
-from .faults import attempt, recoverable, refuse, stop_at_faults
-from .folder_files import POSITIONS, CsvTable, data_folder, finite_numbers, read_csv, read_official, shown
+from .faults import attempt, recoverable, refuse
+from .folder_files import (
+    POSITIONS,
+    CsvTable,
+    data_folder,
+    finite_numbers,
+    folder_record,
+    read_csv,
+    read_official,
+    shown,
+)
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
 NOT_RECEIVED_DBM = -100.0
@@ -43,7 +52,7 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
     info = attempt(read_yaml, folder / GATEWAYS)
-    gateways = attempt(_read_gateways, folder / GATEWAYS, info)
+    receivers = attempt(_read_gateways, folder / GATEWAYS, info)
     table = attempt(_headed, folder / POSITIONS)
     positions = attempt(_read_positions, table)
     power = attempt(_read_powers, folder / POWERS, info)
@@ -53,21 +62,19 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
             text = f"{power.value.shape[1]} rows, but {POSITIONS} has {rows.value}"
             raise DataFault(folder / POWERS, f"{text}; give one row of each per transmission")
     official = attempt(read_official, folder, rows, 0)
-    stop_at_faults()
-    return Record(
-        name=name or folder.resolve().name,
-        task="rssi",
-        tx_pos_m=positions.value,
-        receivers=tuple(Receiver(gateway, at, np.array(UPRIGHT)) for gateway, at in gateways.value.items()),
-        observation=power.value,
-        official=official.value,
+    return folder_record(
+        folder,
+        name,
+        "rssi",
+        tx_pos_m=positions,
+        receivers=receivers,
+        observation=power,
+        official=official,
         frequencies_hz=np.array([CARRIER_HZ]),
-        source=str(folder),
     )
 
 
-def _read_gateways(path: Path, info: dict[Any, Any]) -> dict[str, FloatArray]:
-    """Positions [3] of the gateways by their names."""
+def _read_gateways(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
     if not info:
         raise DataFault(path, "no gateway in it; give one line NAME: [x, y, z] for each, metres")
     for key in info:
@@ -75,7 +82,7 @@ def _read_gateways(path: Path, info: dict[Any, Any]) -> dict[str, FloatArray]:
             text = f"gateway {shown(key)} does not go into one line; call it gateway1, gateway2, ..."
             refuse(DataFault(path, text))
     places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in info.items()}
-    return {key: place.value for key, place in places.items()}
+    return tuple(Receiver(key, place.value, np.array(UPRIGHT)) for key, place in places.items())
 
 
 def _read_positions(table: CsvTable) -> FloatArray:

@@ -30,6 +30,7 @@ from .folder_files import (
     antenna_entry,
     data_folder,
     fits_single,
+    folder_record,
     numbers_of,
     read_antenna,
     read_columns,
@@ -84,19 +85,19 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     tx_antenna = attempt(read_tx_antenna, station, info)
     stop_at_faults()
     half, hz = channel.value.shape[2] // 2, frequencies.value
-    return Record(
-        name=name or folder.resolve().name,
-        task="csi",
-        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value,
+    return folder_record(
+        folder,
+        name,
+        "csi",
+        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
-        official=official.value,
+        official=official,
         frequencies_hz=None if hz is None else hz[half:],
         uplink=channel.value[:, :, :half],
         uplink_hz=None if hz is None else hz[:half],
-        truth=truth.value,
-        tx_antenna=tx_antenna.value,
-        source=str(folder),
+        truth=truth,
+        tx_antenna=tx_antenna,
     )
 
 

@@ -32,6 +32,7 @@ from .folder_files import (
     antenna_entry,
     data_folder,
     finite_numbers,
+    folder_record,
     read_antenna,
     read_official,
     read_positions,
@@ -90,22 +91,20 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     folds = attempt(parse_folds, folder / FOLDS, rows) if (folder / FOLDS).exists() else None
     tx_antenna = attempt(read_tx_antenna, gateways, info)
     stop_at_faults()
-    stated_rows = table.value
-    record = Record(
-        name=name or folder.resolve().name,
-        task="spectrum",
-        tx_pos_m=stated_rows.positions_m,
-        receivers=receivers.value,
-        observation=observation.value,
-        official=official.value,
-        folds=None if folds is None else folds.value,
-        frequencies_hz=stated.value,
-        tx_antenna=tx_antenna.value,
-        runs=stated_rows.runs,
-        source=str(folder),
+    record = folder_record(
+        folder,
+        name,
+        "spectrum",
+        tx_pos_m=table.value.positions_m,
+        receivers=receivers,
+        observation=observation,
+        official=official,
+        folds=folds,
+        frequencies_hz=stated,
+        tx_antenna=tx_antenna,
+        runs=table.value.runs,
     )
-    carriers = stated_rows.carriers_hz
-    return record if carriers is None else record.at_carriers(carriers)
+    return record if table.value.carriers_hz is None else record.at_carriers(table.value.carriers_hz)
 
 
 def write_spectrum_folder(

@@ -197,6 +197,7 @@ def position_folds(record: Record) -> IntArray:
     distinct = len(np.unique(record.tx_pos_m, axis=0))
     if distinct < FOLDS:
         raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")
+    # k-means ends in a local optimum that depends on its start, and may leave a cluster empty ("raise").
     best, folds = np.inf, None
     for attempt in range(CLUSTER_STARTS):
         try:
@@ -306,6 +307,7 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
     if count < 2:
         raise InputError(f"{record.name}: one receiver, and split receiver holds receivers out; use another split")
     order = np.arange(count)
+    # Each fold is a fit of its own: many receivers are held out by the group.
     if count > MOST_RECEIVERS:
         order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
     (rows,) = (only for below in splits_below(record, name) for only in _train_and_test(record, below, seed))

@@ -88,6 +88,7 @@ def free_positions(
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
     # A point every 2 cm or so: much less than the clearance.
     tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=seed)[0])
+    # Rejection: draws are uniform over the box, so those that stay are uniform over its free part.
     positions = np.zeros((0, 3))
     while len(positions) < count:
         drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)

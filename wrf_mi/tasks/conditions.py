@@ -39,7 +39,7 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
         raise InputError(f"uplink of row {row}, antenna {antenna} is zero or not finite; leave that row out")
     mean = h.mean(axis=-1)
     size = np.abs(mean)
-    turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)
+    turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)  # no phase to remove where the mean is zero
     divisor = rms * turn
     flat = (h / divisor[..., None]).reshape(-1, h.shape[-1])
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32), divisor
