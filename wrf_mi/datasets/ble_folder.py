@@ -141,18 +141,24 @@ def write_ble_folder(
         positions = np.stack([receiver.position_m for receiver in record.receivers])
         columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated}
         write_csv(part / ANCHORS, columns, zip(*columns.values(), strict=True))
+        of_rows = _columns(record, ids, carriers)
         for file, rows in zip((TRAINING, TEST), official, strict=True):
-            columns = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
-            of_rows = {"heading": record.tx_heading_rad, FREQUENCY: carriers, RUN: record.runs}
-            columns |= {name: values[rows].tolist() for name, values in of_rows.items() if values is not None}
-            # Where nothing was received, the number of readings is an empty field, as are strength and noise.
-            counts = None if record.n_readings is None else np.where(record.n_readings, record.n_readings, None)
-            for prefix, values in ((RSSI, record.observation), (COUNT, counts), (STD, record.std)):
-                if values is not None:
-                    columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
-            write_csv(part / file, columns, zip(*columns.values(), strict=True))
+            write_csv(part / file, of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
         write_extra(part, extra)
     return Path(path)
+
+
+def _columns(record: Record, ids: list[str], carriers_hz: FloatArray | None) -> dict[str, NDArray[Any]]:
+    """Columns of the tables of rows."""
+    columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
+    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, RUN: record.runs}
+    counts = None if record.n_readings is None else record.n_readings.astype(object)
+    if counts is not None:
+        counts[counts == 0] = None  # an empty field where nothing was received, as of strength and noise
+    for prefix, values in ((RSSI, record.observation), (COUNT, counts), (STD, record.std)):
+        if values is not None:
+            columns |= {prefix + anchor: received for anchor, received in zip(ids, values, strict=True)}
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArray], list[str]]:

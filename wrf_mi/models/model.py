@@ -17,7 +17,8 @@ from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Spl
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.settings import settings_from, with_settings
-from ..core.types import Inputs, IntArray
+from ..core.types import Inputs as Inputs
+from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..receivers.spreads import PathStatistics
 from ..training.session import FitSession
