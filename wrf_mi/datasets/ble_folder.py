@@ -116,12 +116,8 @@ def write_ble_folder(
 ) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
-    Args:
-        path: path of the new folder.
-        record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
-            of that split.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    The official split assigns rows to the files, so they are read in the order of that split. ``extra`` is the content
+    of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.

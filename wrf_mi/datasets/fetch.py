@@ -38,14 +38,10 @@ MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
 
 
 def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> Path:
-    """Download a known data set atomically, or check an existing copy.
+    """Download a known data set atomically, or check an existing copy; ``base_url`` is that of a mirror.
 
-    Every file, or the arrays of a converted file, must have the published SHA-256.
-
-    Args:
-        name: name of a known data set.
-        base_url: URL of a mirror of the public original.
-        progress: show a progress bar, and the note of the data set, on standard error.
+    Every file, or the arrays of a converted file, must have the published SHA-256. With ``progress`` a bar and the note
+    of the data set are shown on standard error.
 
     Returns:
         The folder of the data set, ``<name>/`` below ``WRF_MI_DATA`` or else in the user's cache.

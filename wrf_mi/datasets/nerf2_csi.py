@@ -52,11 +52,8 @@ FEWEST = 2
 def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's channel coefficients (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
-        frequencies_hz: frequencies of all subcarriers, uplink and downlink, in Hz, in place of those of
-            ``base-station.yml``.
+    The record has the folder's name unless another is given. ``frequencies_hz`` of all subcarriers, uplink and
+    downlink, replace those of ``base-station.yml``.
 
     Returns:
         A record with ``task="csi"`` and one receiver at the middle of the antennas: ``observation``
@@ -106,12 +103,8 @@ def write_nerf2_csi(
 ) -> Path:
     """Write a record atomically in the layout of NeRF2's channel coefficients.
 
-    Args:
-        path: path of the new folder.
-        record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
-            the downlink.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    The record has one receiver with antennas (``array_m``), and an uplink of as many subcarriers as the downlink.
+    ``extra`` is the content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.

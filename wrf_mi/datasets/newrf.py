@@ -49,11 +49,7 @@ PLAIN = (int, float, complex, type(None))
 
 
 def read_newrf(path: str | Path, name: str | None = None) -> Record:
-    """Read and check one room.
-
-    Args:
-        path: path of ``<room>.npz``, or of a folder with such a file.
-        name: name of the record; by default that of the file without its ending.
+    """Read and check one room: ``<room>.npz``, or a folder with such a file, after which the record is named.
 
     Returns:
         A record with ``task="csi"``: ``observation`` [1, n, 1] complex64, ``tx_pos_m`` the file's ``rx_pos``.

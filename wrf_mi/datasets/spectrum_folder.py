@@ -116,12 +116,8 @@ def write_spectrum_folder(
 ) -> Path:
     """Write a record atomically in the NeRF2 spectrum layout.
 
-    Args:
-        path: path of the new folder.
-        record: record with ``observation`` [n_rx, n, height, width] in 0..1, which is rounded to grey levels.
-        bits: bits per pixel, 8 or 16.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    ``observation`` [n_rx, n, height, width] in 0..1 is rounded to grey levels of 8 or 16 ``bits``. ``extra`` is the
+    content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record holds no spectra in 0..1 or values that the

@@ -71,18 +71,10 @@ def free_positions(
     station_m: FloatArray | None = None,
     from_station_m: float = 0.0,
 ) -> FloatArray:
-    """Positions [count, 3] in metres, uniform over the free part of a box, to 0.1 mm.
+    """Positions [count, 3] in metres, uniform over the free part of a box in a ``sionna.rt.Scene``, to 0.1 mm.
 
-    Args:
-        scene: a ``sionna.rt.Scene``.
-        low_m: lower corner of the box [3], metres.
-        high_m: upper corner, likewise.
-        count: number of positions.
-        clear_m: least distance from surfaces, metres.
-        rng: generator of the positions.
-        seed: seed of the points by which distances from surfaces are judged.
-        station_m: position [3], or positions [k, 3], to keep away from, metres; None: none.
-        from_station_m: least distance from these, metres.
+    The box has the corners ``low_m`` and ``high_m`` [3]. Positions are more than ``clear_m`` away from surfaces, judged
+    by points on these that are drawn with ``seed``, and than ``from_station_m`` from ``station_m``, [3] or [k, 3].
     """
     surfaces = scene_surfaces(scene)
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
