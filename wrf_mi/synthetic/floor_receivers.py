@@ -171,10 +171,10 @@ def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[t
     bounds, rng = scene.mi_scene.bbox(), np.random.default_rng([floor.seed, 0])
     (x0, y0), (x1, y1) = ([corner.x, corner.y] for corner in (bounds.min, bounds.max))
 
-    def free(low_m: float, high_m: float, count: int, *apart: Any) -> FloatArray:
+    def free(low_m: float, high_m: float, count: int, apart: tuple[FloatArray, float] | None = None) -> FloatArray:
         """Free positions, twice as many as needed, but for those within a body."""
-        box = np.array([x0, y0, low_m]), np.array([x1, y1, high_m])
-        drawn = free_positions(scene, *box, 2 * count, floor.clear_m, rng, floor.seed, *apart)
+        box_m = np.array([[x0, y0, low_m], [x1, y1, high_m]])
+        drawn = free_positions(scene, box_m, 2 * count, floor.clear_m, rng, floor.seed, apart)
         # Large bodies, such as the core, count as rooms there.
         closed = [mesh.triangles for _, mesh in plan.parts.values() if mesh.is_watertight]
         inside = np.any([winding_number(triangles, drawn) > 0.5 for triangles in closed], axis=0)
@@ -187,7 +187,7 @@ def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[t
     receivers_m = places[cKDTree(places[:, :2]).query(wanted)[1]]
     receivers = tuple(Receiver(f"anchor{k}", place, np.array(UPRIGHT)) for k, place in enumerate(receivers_m, start=1))
     count = floor.train + floor.test
-    return receivers, free(floor.low_m, floor.high_m, count, receivers_m, floor.from_receiver_m)
+    return receivers, free(floor.low_m, floor.high_m, count, (receivers_m, floor.from_receiver_m))
 
 
 def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:

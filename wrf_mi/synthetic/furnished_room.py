@@ -185,10 +185,9 @@ def transmitters(scene: Any, room: TracedRoom, stations_m: FloatArray = RECEIVER
 
     They keep the distance ``from_array_m`` from ``stations_m`` [3] or [k, 3].
     """
-    low, high = np.array([0, 0, room.low_m]), np.array([LENGTH, WIDTH, room.high_m])
-    rng = np.random.default_rng([room.seed, 0])
-    apart = room.seed, stations_m, room.from_array_m
-    return free_positions(scene, low, high, room.train + room.test, room.clear_m, rng, *apart)
+    box_m = np.array([[0, 0, room.low_m], [LENGTH, WIDTH, room.high_m]])
+    rng, apart = np.random.default_rng([room.seed, 0]), (stations_m, room.from_array_m)
+    return free_positions(scene, box_m, room.train + room.test, room.clear_m, rng, room.seed, apart)
 
 
 def opaque_parts() -> list[str]:

@@ -62,19 +62,18 @@ class Searches:
 
 def free_positions(
     scene: Any,
-    low_m: FloatArray,
-    high_m: FloatArray,
+    box_m: FloatArray,
     count: int,
     clear_m: float,
     rng: np.random.Generator,
     seed: int,
-    station_m: FloatArray | None = None,
-    from_station_m: float = 0.0,
+    apart: tuple[FloatArray, float] | None = None,
 ) -> FloatArray:
     """Positions [count, 3] in metres, uniform over the free part of a box in a ``sionna.rt.Scene``, to 0.1 mm.
 
-    The box has the corners ``low_m`` and ``high_m`` [3]. Positions are more than ``clear_m`` away from surfaces, judged
-    by points on these that are drawn with ``seed``, and than ``from_station_m`` from ``station_m``, [3] or [k, 3].
+    ``box_m`` [2, 3] are its lower and upper corner. Positions are more than ``clear_m`` away from surfaces, judged by
+    points on these that are drawn with ``seed``, and lie ``apart`` from other positions, [3] or [k, 3], by more than a
+    distance; all in metres.
     """
     surfaces = scene_surfaces(scene)
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
@@ -83,11 +82,11 @@ def free_positions(
     # Rejection: draws are uniform over the box, so those that stay are uniform over its free part.
     positions = np.zeros((0, 3))
     while len(positions) < count:
-        drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
+        drawn = np.round(rng.uniform(box_m[0], box_m[1], (count, 3)), 4)
         free = tree.query(drawn)[0] > clear_m
-        if station_m is not None:
-            apart = np.linalg.norm(drawn[:, None] - np.atleast_2d(station_m), axis=-1)
-            free &= apart.min(axis=1) > from_station_m
+        if apart is not None:
+            others_m, distance_m = apart
+            free &= np.linalg.norm(drawn[:, None] - np.atleast_2d(others_m), axis=-1).min(axis=1) > distance_m
         free &= solid_around(surfaces, drawn) < 0
         positions = np.concatenate([positions, drawn[free]])
     return positions[:count]
@@ -100,6 +99,7 @@ def trace_channels(
     frequencies_hz: FloatArray,
     options: Sequence[TraceOptions],
     opaque: Sequence[str] = (),
+    *,
     chunk_size: int = CHUNK_SIZE,
     progress: str | None = None,
 ) -> NDArray[np.complex128]:
