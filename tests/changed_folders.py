@@ -36,6 +36,14 @@ def write(name: str, content: bytes | str) -> Change:
     return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def append(name: str, line: str) -> Change:
+    def change(folder: Path) -> None:
+        with (folder / name).open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
+
+    return change
+
+
 def remove(name: str) -> Change:
     return lambda folder: (folder / name).unlink()
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from wrf_mi.core import Receiver, Record
@@ -56,6 +59,17 @@ def _elements() -> np.ndarray:
 def _plane(directions: np.ndarray) -> np.ndarray:
     """Components [2, n] of directions in the plane of the array."""
     return directions[:, :2].T
+
+
+def with_images(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
+    """The record with changed observations."""
+    return replace(record, observation=np.ascontiguousarray(change(record.observation)))
+
+
+def with_orientations(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
+    """The record with changed orientations of its receivers."""
+    turned = (replace(receiver, orientation_xyzw=change(receiver.orientation_xyzw)) for receiver in record.receivers)
+    return replace(record, receivers=tuple(turned))
 
 
 def strengths(rows: int = 120, receivers: int = 4, seed: int = 0, noise_db: float = 4.0) -> Record:

@@ -96,6 +96,14 @@ def flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flat's plan, extruded: concrete and boards, whose conductivity goes with frequency."""
+    from wrf_mi.scene.make import make_scene
+
+    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
+
+
+@pytest.fixture(scope="session")
 def plain_flat_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same without headings, with heights that differ and anchors that have names."""
     return write_plain_flat(tmp_path_factory.mktemp("data") / "plain")

@@ -81,8 +81,8 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
     scene = open_scene(true.parent, CARRIER_HZ)
     station = np.array(room.station_m)
     count, rng = survey.train + survey.test, np.random.default_rng([seed, 1])
-    bounds = np.array([0.0, 0.0, LOW_M]), np.array([*room.size_m[:2], HIGH_M])
-    positions = free_positions(scene, *bounds, count, CLEAR_M, rng, seed, station, FROM_STATION_M)
+    bounds = np.array([[0.0, 0.0, LOW_M], [*room.size_m[:2], HIGH_M]])
+    positions = free_positions(scene, bounds, count, CLEAR_M, rng, seed, (station, FROM_STATION_M))
     record = Record(
         f"random-room-{seed}",
         "csi",
@@ -94,7 +94,7 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
     )
     channel = RayTracer(true.parent, ChannelInstrument(record.receivers, SUBCARRIERS_HZ), OPTIONS)(positions)[0]
     noisy = with_noise(channel[:, None], SNR_DB, np.random.default_rng([seed, 2]))[:, 0]
-    poses = free_positions(scene, *bounds, POSES, SCANNER_CLEAR_M, rng, seed)
+    poses = free_positions(scene, bounds, POSES, SCANNER_CLEAR_M, rng, seed)
     scan = write_arrays(folder / "scan.npz", {"points": _scan(true, poses, seed, survey).astype(np.float32)})
     measured = make_scene(scan, folder / "measured", replace=True).folder
     observed = noisy.astype(np.complex64)[None]

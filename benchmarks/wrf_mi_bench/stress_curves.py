@@ -13,7 +13,7 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.tasks.ssim import ssim as similarity
+from wrf_mi.tasks.losses import ssim as similarity
 
 from .stress_fields import SIZE, SMALL, Field, Rng, cases, gradient, image, layers, made, placed, reference
 from .stress_rows import DOUBLE, relative

@@ -24,7 +24,7 @@ from wrf_mi.runs.api import train
 from wrf_mi.runs.results import Observations, Results, read_run
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
-from wrf_mi.synthetic.room_bands import NAME as BANDS
+from wrf_mi.synthetic.furnished_room import BANDS
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
 

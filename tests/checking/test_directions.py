@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from checked_records import WALL, spectra
+from checked_records import WALL, spectra, with_images, with_orientations
 from scipy.spatial.transform import Rotation
 
 from wrf_mi.checking.directions import brightness, reversed_share, spectrum_axes
@@ -20,17 +19,6 @@ POSE = (Rotation.from_quat(WALL) * Rotation.from_euler("zx", [20, 30], degrees=T
 @pytest.fixture(scope="module")
 def hall() -> Record:
     return spectra(orientation=POSE)
-
-
-def images(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
-    return replace(record, observation=np.ascontiguousarray(change(record.observation)))
-
-
-def turned(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
-    return replace(
-        record,
-        receivers=tuple(replace(one, orientation_xyzw=change(one.orientation_xyzw)) for one in record.receivers),
-    )
 
 
 def test_the_stated_reading_is_not_suspected(hall: Record) -> None:
@@ -50,7 +38,7 @@ def test_lobes_of_reflectors_suggest_no_other_reading(seed: int, spread_m: float
 
 def test_rows_from_the_zenith_are_suspected(hall: Record) -> None:
     for record in (hall, spectra(30, direct=0.0, reflectors=4)):  # a line of sight is not needed
-        reversed_rows = images(record, lambda s: s[:, :, ::-1])
+        reversed_rows = with_images(record, lambda s: s[:, :, ::-1])
         assert reversed_share(reversed_rows.observation) > 0.7
         ((name, text),) = spectrum_axes(reversed_rows)
         assert name == "spectrum-axes"
@@ -66,27 +54,27 @@ def test_rows_from_the_zenith_are_suspected(hall: Record) -> None:
     ],
 )
 def test_columns_with_another_origin_or_order_are_suspected(hall: Record, change, what: str) -> None:
-    ((name, text),) = spectrum_axes(images(hall, change))
+    ((name, text),) = spectrum_axes(with_images(hall, change))
     assert (name, text.partition(":")[0]) == ("spectrum-axes", what)
     assert "of the hemisphere is then darker than the direction of the transmitter, as stated" in text
-    both = [text for _, text in spectrum_axes(images(hall, lambda s: change(s)[:, :, ::-1]))]
+    both = [text for _, text in spectrum_axes(with_images(hall, lambda s: change(s)[:, :, ::-1]))]
     assert [text.partition(":")[0] for text in both] == ["image rows count from the zenith", what]
 
 
 def test_transposed_images_are_suspected(hall: Record) -> None:
-    ((name, text),) = spectrum_axes(images(hall, lambda s: s.swapaxes(2, 3)))
+    ((name, text),) = spectrum_axes(with_images(hall, lambda s: s.swapaxes(2, 3)))
     assert name == "spectrum-axes"
     assert text.startswith("images have 120 rows and 30 columns")
 
 
 def test_orientations_in_another_order_are_suspected(hall: Record) -> None:
-    ((name, text),) = spectrum_axes(turned(hall, lambda q: np.roll(q, 1)))
+    ((name, text),) = spectrum_axes(with_orientations(hall, lambda q: np.roll(q, 1)))
     assert name == "orientation"
     assert text.startswith("orientations are in the order w, x, y, z: ")
 
 
 def test_an_array_that_looks_away_is_suspected(hall: Record) -> None:
-    ((name, text),) = spectrum_axes(turned(hall, lambda q: np.array([0.5, -0.5, -0.5, 0.5])))
+    ((name, text),) = spectrum_axes(with_orientations(hall, lambda q: np.array([0.5, -0.5, -0.5, 0.5])))
     assert name == "orientation"
     assert text.startswith("all transmitters are behind the array of receiver gateway1, outside the hemisphere of ")
 
@@ -105,7 +93,7 @@ def test_transmitters_in_another_plan_are_suspected(matrix: list[list[int]], wha
 
 
 def test_few_rows_and_few_places_are_no_evidence(hall: Record) -> None:
-    wrong = images(hall, lambda s: np.roll(s, 60, axis=-1))
+    wrong = with_images(hall, lambda s: np.roll(s, 60, axis=-1))
     few = replace(wrong, tx_pos_m=wrong.tx_pos_m[:30], observation=wrong.observation[:, :30], official=None)
     assert list(spectrum_axes(few)) == []
     places = wrong.tx_pos_m[np.arange(200) % 10]

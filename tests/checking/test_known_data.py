@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from changed_folders import DATA, needs
+from checked_records import with_images, with_orientations
 from PIL import Image
 
 from wrf_mi.checking import check_data
@@ -67,14 +68,11 @@ Change = Callable[[Any], Any]
 
 
 def images(change: Change) -> Callable[[Record], Record]:
-    return lambda record: replace(record, observation=np.ascontiguousarray(change(record.observation)))
+    return lambda record: with_images(record, change)
 
 
 def orientation(change: Change) -> Callable[[Record], Record]:
-    return lambda record: replace(
-        record,
-        receivers=tuple(replace(one, orientation_xyzw=change(one.orientation_xyzw)) for one in record.receivers),
-    )
+    return lambda record: with_orientations(record, change)
 
 
 def transmitters(change: Change) -> Callable[[Record], Record]:

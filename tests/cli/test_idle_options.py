@@ -10,17 +10,10 @@ from calling import call, refused
 
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.options import without_effect
 
 DIRECT = {"reflection": False, "depth": 0}
-
-
-@pytest.fixture(scope="module")
-def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flat's plan, extruded."""
-    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
 @pytest.mark.parametrize(

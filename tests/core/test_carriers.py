@@ -22,7 +22,6 @@ from wrf_mi.models import MODELS
 from wrf_mi.runs.api import open_run, plan_run, train
 from wrf_mi.runs.evaluate import reference_predictions
 from wrf_mi.runs.results import read_run
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks import CARRIER, TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace
 from wrf_mi.tracing.paths.result import join_traces, recompute
@@ -179,12 +178,6 @@ def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsy
     with np.load(run.folder / "predictions.npz") as stored:
         assert flat.carriers_hz is not None
         np.testing.assert_array_equal(stored["frequency_hz"], flat.carriers_hz[stored["row"]])
-
-
-@pytest.fixture(scope="module")
-def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flat's plan, extruded: concrete and boards, whose conductivity goes with frequency."""
-    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
 def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:

@@ -216,14 +216,6 @@ WRONG: dict[str, tuple[Change, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_scenario_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
-    folder = scenario(tmp_path)
-    change, message = WRONG[case]
-    change(folder)
-    assert refusal(load, folder, message).startswith(str(folder))
-
-
 WRONG_PARAMS: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"antenna": {}}, "setting antenna: unknown; known here: .*base_stations"),
     "unknown part": ({"bs_antenna": {"fov": 90}}, r"bs_antenna\.fov: unknown; known here: bs_antenna\.shape"),
@@ -245,12 +237,18 @@ WRONG_PARAMS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG_PARAMS)
-def test_wrong_parameters_are_refused_in_one_line(tmp_path: Path, case: str) -> None:
+WRONG |= {
+    f"parameters: {name}": (write(CHANNEL_PARAMS, json.dumps(values)), rf"street/{CHANNEL_PARAMS}.*{message}")
+    for name, (values, message) in WRONG_PARAMS.items()
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_scenario_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
     folder = scenario(tmp_path)
-    given, message = WRONG_PARAMS[case]
-    (folder / CHANNEL_PARAMS).write_text(json.dumps(given))
-    assert refusal(load, folder, message).startswith(str(folder / CHANNEL_PARAMS))
+    change, message = WRONG[case]
+    change(folder)
+    assert refusal(load, folder, message).startswith(str(folder))
 
 
 def test_scenario_before_version_4_and_users_who_differ_are_refused(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changed_folders import refusal, remove, text, write
+from changed_folders import remove, text, write
 
 from wrf_mi.datasets import load, make_splits, read_nerf2_ble
 
@@ -49,52 +49,55 @@ def test_rows_that_no_gateway_received_are_in_no_split(folder: Path) -> None:
     assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1], [3])
 
 
-def test_columns_are_assigned_by_name_or_else_by_order(folder: Path) -> None:
-    expected = read_nerf2_ble(folder).observation
-    path = folder / "gateway_rssi.csv"
-    swapped = "\n".join(",".join(reversed(line.split(","))) for line in POWERS.splitlines())
-    path.write_text(swapped)
-    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected)
-    path.write_text(POWERS.replace("gateway1,gateway2", "0,b"))
-    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected)
-    (folder / "tx_pos.csv").write_text(POSITIONS.replace("x,y,z", "east,north,up"))
-    np.testing.assert_array_equal(read_nerf2_ble(folder).tx_pos_m[1], [0.25, 1.75, 1])
-    (folder / "tx_pos.csv").write_text(POSITIONS.replace("x,y,z", "y,x,z"))
-    np.testing.assert_array_equal(read_nerf2_ble(folder).tx_pos_m[1], [1.75, 0.25, 1])
+SWAPPED = "\n".join(",".join(reversed(line.split(","))) for line in POWERS.splitlines())
 
 
-def test_numbered_headers_of_pandas_are_read(folder: Path) -> None:
-    expected = read_nerf2_ble(folder)
-    (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "0,1"))
-    (folder / "tx_pos.csv").write_text(POSITIONS.replace("x,y,z", "0,1,2"))
-
-    def same() -> None:
-        found = read_nerf2_ble(folder)
-        np.testing.assert_array_equal(found.observation, expected.observation)
-        np.testing.assert_array_equal(found.tx_pos_m, expected.tx_pos_m)
-
-    same()
-    # Names like these numbers: one of them says nothing of the order, all of them do.
-    (folder / "gateway_position.yml").write_text(GATEWAYS.replace("gateway1", "1").replace("gateway2", "2"))
-    same()
-    (folder / "gateway_position.yml").write_text(GATEWAYS.replace("gateway1", "1").replace("gateway2", "0"))
-    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected.observation[::-1])
+def renamed(content: str, *names: tuple[str, str]) -> str:
+    for old, new in names:
+        content = content.replace(old, new)
+    return content
 
 
-def test_unnamed_columns_follow_the_order_of_gateways(folder: Path) -> None:
-    expected = read_nerf2_ble(folder).observation
-    (folder / "gateway_rssi.csv").write_text(POWERS.replace("gateway1,gateway2", "dBm,dBm"))
-    np.testing.assert_array_equal(read_nerf2_ble(folder).observation, expected)
+@pytest.mark.parametrize(
+    ("gateways", "powers", "positions", "gateway_order", "axes"),
+    [
+        (GATEWAYS, SWAPPED, POSITIONS, [0, 1], [0, 1, 2]),
+        (GATEWAYS, renamed(POWERS, ("gateway1,gateway2", "0,b")), POSITIONS, [0, 1], [0, 1, 2]),
+        (GATEWAYS, renamed(POWERS, ("gateway1,gateway2", "dBm,dBm")), POSITIONS, [0, 1], [0, 1, 2]),
+        (GATEWAYS, POWERS, renamed(POSITIONS, ("x,y,z", "east,north,up")), [0, 1], [0, 1, 2]),
+        (GATEWAYS, POWERS, renamed(POSITIONS, ("x,y,z", "y,x,z")), [0, 1], [1, 0, 2]),
+        # Headers as pandas numbers them. Of gateways with such names one says nothing of the order, all of them do.
+        *(
+            (
+                renamed(GATEWAYS, *zip(("gateway1", "gateway2"), names, strict=True)),
+                renamed(POWERS, ("gateway1,gateway2", "0,1")),
+                renamed(POSITIONS, ("x,y,z", "0,1,2")),
+                order,
+                [0, 1, 2],
+            )
+            for names, order in ((("gateway1", "gateway2"), [0, 1]), (("1", "2"), [0, 1]), (("1", "0"), [1, 0]))
+        ),
+    ],
+)
+def test_columns_are_assigned_by_name_or_else_by_order(
+    gateways: str, powers: str, positions: str, gateway_order: list[int], axes: list[int], folder: Path
+) -> None:
+    plain = read_nerf2_ble(folder)
+    for name, content in ((YML, gateways), (RSSI, powers), (POS, positions)):
+        (folder / name).write_text(content)
+    record = read_nerf2_ble(folder)
+    np.testing.assert_array_equal(record.observation, plain.observation[gateway_order])
+    np.testing.assert_array_equal(record.tx_pos_m, plain.tx_pos_m[:, axes])
 
 
 def test_blank_lines_are_skipped(folder: Path) -> None:
-    expected = read_nerf2_ble(folder)
+    plain = read_nerf2_ble(folder)
     for name in ("gateway_rssi.csv", "tx_pos.csv"):
         lines = (folder / name).read_text().splitlines()
         (folder / name).write_text("\n".join(["", lines[0], "", lines[1], "  ", *lines[2:], "", ""]))
-    found = read_nerf2_ble(folder)
-    np.testing.assert_array_equal(found.observation, expected.observation)
-    np.testing.assert_array_equal(found.tx_pos_m, expected.tx_pos_m)
+    record = read_nerf2_ble(folder)
+    np.testing.assert_array_equal(record.observation, plain.observation)
+    np.testing.assert_array_equal(record.tx_pos_m, plain.tx_pos_m)
 
 
 YML, POS, RSSI = "gateway_position.yml", "tx_pos.csv", "gateway_rssi.csv"
@@ -106,7 +109,7 @@ def one_row(folder: Path) -> None:
     (folder / RSSI).write_text("gateway1,gateway2\n-50,-60\n")
 
 
-WRONG = {
+WRONG = {  # each is refused, see test_faults.py
     "no gateways file": (remove(YML), YML, "missing"),
     "no positions file": (remove(POS), POS, "missing"),
     "no powers file": (remove(RSSI), RSSI, "missing"),
@@ -117,7 +120,7 @@ WRONG = {
     "date that is none": (text(YML, r"\[4, 5, 6\]", "2021-99-99"), YML, "month must be in 1..12.*line 2, column 11"),
     "gateway of 400 digits": (text(YML, "3.0", "9" * 400), YML, "no int .*too large to convert.*line 1, column 22"),
     "gateway too far": (text(YML, "3.0", "1.0e+39"), YML, "gateway1: position is .*; give a list of 3 finite numbers"),
-    "deep YAML": (write(YML, "a: " + "[" * 3000), YML, "not YAML"),
+    "deep YAML": (write(YML, "a: " + "[" * 1000), YML, "not YAML"),
     "gateway of two lines": (
         write(YML, '"gate\\nway": [1, 2, 3]\n'),
         YML,
@@ -159,11 +162,3 @@ WRONG = {
     "index in both": (text("test_index.txt", "1", "3"), "test_index.txt", "row 3 is in train_index.txt as well"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
 }
-
-
-@pytest.mark.filterwarnings("error")  # a number that overflows on its way is refused without a warning
-@pytest.mark.parametrize("case", WRONG)
-def test_bad_folders_are_refused_with_one_line(folder: Path, case: str) -> None:
-    change, name, message = WRONG[case]
-    change(folder)
-    assert refusal(load, folder, message).startswith(f"{folder / name}: ")

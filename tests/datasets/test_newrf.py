@@ -57,7 +57,7 @@ def cut(values: Any, **at: Any) -> Any:
     return values
 
 
-WRONG = {
+WRONG = {  # each is refused, see test_faults.py
     "array missing": ({k: v for k, v in room().items() if k != "csi"}, "no array .*csi.*; a room needs tx_pos"),
     "positions of two numbers": (changed(rx_pos=np.zeros((10, 2))), r"rx_pos has shape \[10, 2\], expected \[10, 3\]"),
     "another number of rows": (changed(csi=np.zeros(9, complex)), r"csi has shape \[9\], expected \[10\]"),
@@ -70,13 +70,6 @@ WRONG = {
     "too few rows": (room(4), "rx_pos has 4 rows"),
     "no rows": (room(0), "rx_pos has 0 rows"),
 }
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_arrays_are_refused_in_one_line(tmp_path: Path, case: str):
-    arrays, message = WRONG[case]
-    np.savez(tmp_path / "hall.npz", **arrays)
-    assert str(tmp_path / "hall.npz") in refusal(read_newrf, tmp_path / "hall.npz", message)
 
 
 def test_damaged_and_missing_files_are_refused(tmp_path: Path):

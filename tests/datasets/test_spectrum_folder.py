@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changed_folders import DATA, needs, refusal, remove, text, write
+import yaml
+from changed_folders import DATA, append, needs, remove, text, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -91,29 +92,6 @@ def test_carrier_and_array_are_optional(folder: Path, tmp_path: Path):
     assert [r.name for r in read.receivers] == ["gateway1"]
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
-        ("frequency_hz: .inf", "frequency_hz is inf"),
-        ("frequency_hz: fast", "frequency_hz is 'fast'"),
-        ("frequency_hz: [1, x]", r"frequency_hz is \[1, 'x'\]"),
-        ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
-        ("array: {rows: 4, columns: 4}", "array is .*; give rows, columns and spacing_m"),
-        ("array: {rows: 4.5, columns: 4, spacing_m: 1}", "array is"),
-        ("array: {rows: 0, columns: 4, spacing_m: 1}", "array is"),
-        ("array: {rows: 4, columns: 4, spacing_m: .nan}", "array is"),
-        ("array: {elements_m: [[0, 1], [0, 2]]}", "array is"),
-        ("array: {elements_m: [[0, 1, .nan]]}", "array is"),
-        ("array: {elements_m: []}", "array is"),
-    ],
-)
-def test_wrong_carrier_or_array_is_refused_in_one_line(folder: Path, line: str, message: str):
-    with (folder / "gateway_info.yml").open("a") as file:
-        file.write(f"{line}\n")
-    assert refusal(read_spectrum_folder, folder, message).startswith(f"{folder / 'gateway_info.yml'}: ")
-
-
 def image(name: str, pixels: np.ndarray):
     return lambda folder: Image.fromarray(pixels).save(folder / name)
 
@@ -127,7 +105,9 @@ def cut(name: str):
 
 
 GREY = np.zeros((5, 8), np.uint8)
-WRONG = {
+SEVERAL = "several carriers.*column frequency_hz, or make a folder for each"
+ANTENNA = "gateway9:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n  antenna: "
+WRONG = {  # each is refused, see test_faults.py
     "no poses": (remove("gateway_info.yml"), "gateway_info.yml", "missing"),
     "no positions file": (remove("tx_pos.csv"), "tx_pos.csv", "missing"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
@@ -170,14 +150,46 @@ WRONG = {
     "fold without rows": (text("blocked_folds.txt", r"^2", "4"), "blocked_folds.txt", "fold 3 has no row"),
     "fold far away": (text("blocked_folds.txt", r"^2", "9" * 15), "blocked_folds.txt", "fold 3 has no row"),
     "one fold": (write("blocked_folds.txt", "0\n" * 12), "blocked_folds.txt", "one fold only"),
+    **{
+        line: (append("gateway_info.yml", line), "gateway_info.yml", message)
+        for line, message in (
+            ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
+            ("frequency_hz: .inf", "frequency_hz is inf"),
+            ("frequency_hz: fast", "frequency_hz is 'fast'"),
+            ("frequency_hz: [1, x]", r"frequency_hz is \[1, 'x'\]"),
+            ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
+            ("array: {rows: 4, columns: 4}", "array is .*; give rows, columns and spacing_m"),
+            ("array: {rows: 4.5, columns: 4, spacing_m: 1}", "array is"),
+            ("array: {rows: 0, columns: 4, spacing_m: 1}", "array is"),
+            ("array: {rows: 4, columns: 4, spacing_m: .nan}", "array is"),
+            ("array: {elements_m: [[0, 1], [0, 2]]}", "array is"),
+            ("array: {elements_m: [[0, 1, .nan]]}", "array is"),
+            ("array: {elements_m: []}", "array is"),
+            ("frequency_hz: [915e6, 2.4e9]", SEVERAL),
+            ("frequencies_hz: [915e6, 2.4e9]", SEVERAL),
+            ("frequency_hz: 915e6\ncarrier_hz: 868e6", SEVERAL),
+            ("tx_antenna: {frame: array}", "tx_antenna is .*; give some of pattern, polarization"),
+            (f"{ANTENNA}V", "gateway9: antenna is 'V'; give some of pattern, polarization, frame"),
+            (f"{ANTENNA}{{polarisation: V}}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
+            (f"{ANTENNA}{{polarization: vertical}}", "polarization is 'vertical'; choose from V, H"),
+            (f"{ANTENNA}{{pattern: tr38901}}", "state frame array"),
+        )
+    },
+    **{
+        f"carrier {row}": (
+            write("tx_pos.csv", "\n".join(["x,y,z,frequency_hz", "1,2,3,9e8", row, *["1,2,3,9e8"] * 10])),
+            "tx_pos.csv",
+            message,
+        )
+        for row, message in (
+            ("1,2,3,0", "row 2: frequency_hz is 0; give the carrier in Hz"),
+            ("1,2,3,-1", "row 2: frequency_hz is -1"),
+            ("1,2,3,nan", "row 2: frequency_hz is 'nan'; give a finite"),
+            ("1,2,3", "row 2: 3 fields, but the header has 4"),
+            ("1,2,3,many", "row 2: frequency_hz is 'many'; give a finite number"),
+        )
+    },
 }
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_refused_with_file_and_row(folder: Path, case: str):
-    change, file, message = WRONG[case]
-    change(folder)
-    assert file in refusal(read_spectrum_folder, folder, message)
 
 
 @pytest.mark.parametrize(("w", "unit"), [("0.8005", True), ("0.8025", False)])
@@ -258,28 +270,6 @@ def test_antennas_are_read_and_written(tmp_path: Path):
     assert {one.antenna for one in plain.receivers} | {plain.tx_antenna} == {Antenna()}
 
 
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ("antenna: V", "gateway9: antenna is 'V'; give some of pattern, polarization, frame"),
-        ("antenna: {polarisation: V}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
-        ("antenna: {polarization: vertical}", "polarization is 'vertical'; choose from V, H"),
-        ("antenna: {pattern: tr38901}", "state frame array"),
-    ],
-)
-def test_wrong_antenna_is_refused_in_one_line(folder: Path, entry: str, message: str):
-    with (folder / "gateway_info.yml").open("a") as file:
-        file.write(f"gateway9:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n  {entry}\n")
-    assert "gateway_info.yml" in refusal(read_spectrum_folder, folder, message)
-
-
-def test_frame_of_a_transmitters_antenna_is_refused(folder: Path):
-    with (folder / "gateway_info.yml").open("a") as file:
-        file.write("tx_antenna: {frame: array}\n")
-    with pytest.raises(InputError, match=r"tx_antenna is .*; give some of pattern, polarization"):
-        read_spectrum_folder(folder)
-
-
 @pytest.mark.parametrize("name", ["array", "tx_antenna"])
 def test_reserved_receiver_names_are_not_written(tmp_path: Path, name: str):
     record = make_record(4)
@@ -296,3 +286,77 @@ def test_attributes_beyond_the_layout_are_not_written(tmp_path: Path, change: di
     with pytest.raises(InputError, match=f"has {name}, which this layout does not state; set Record.{name} to"):
         write_spectrum_folder(tmp_path / "a", replace(record, **{name: getattr(record, other)}))
     assert not (tmp_path / "a").exists()
+
+
+def test_several_carriers_of_receivers_are_refused_and_equal_ones_are_one(tmp_path: Path):
+    folder = write_spectrum_folder(tmp_path / "two", make_record(4, gateways=2))
+    info = yaml.safe_load((folder / "gateway_info.yml").read_text())
+    for name in ("gateway1", "gateway2"):
+        info[name]["frequency_hz"] = 915e6
+    (folder / "gateway_info.yml").write_text(yaml.safe_dump(info))
+    np.testing.assert_array_equal(read_spectrum_folder(folder).frequencies_hz, [915e6])
+    info["gateway2"]["frequency_hz"] = 2.44e9
+    (folder / "gateway_info.yml").write_text(yaml.safe_dump(info))
+    with pytest.raises(
+        InputError, match=r"gateway1: frequency_hz of 9.15e\+08 and gateway2: frequency_hz of 2.44e\+09"
+    ):
+        read_spectrum_folder(folder)
+
+
+def test_several_carriers_are_not_written(tmp_path: Path):
+    record = replace(make_record(4), frequencies_hz=np.array([915e6, 2.4e9]))
+    with pytest.raises(
+        InputError, match=r"2 carriers for all rows, and gateway_info\.yml states one; give that of each row"
+    ):
+        write_spectrum_folder(tmp_path / "a", record)
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_carrier_of_each_row_is_kept(tmp_path: Path):
+    carriers = np.array([915e6, 2.44e9, 915e6, 5.1e9])
+    folder = write_spectrum_folder(tmp_path / "a", make_record(4).at_carriers(carriers))
+    again = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(again.carriers_hz, carriers)
+    assert again.frequencies_hz is None
+    assert_same(again, make_record(4))
+    (folder / "tx_pos.csv").write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
+    one = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(one.frequencies_hz, [868e6])
+    assert one.carriers_hz is None
+    with (folder / "gateway_info.yml").open("a") as file:
+        file.write("frequency_hz: 868e6\n")
+    with pytest.raises(InputError, match=r"tx_pos.csv: line 1: column frequency_hz, but gateway_info.yml states a car"):
+        read_spectrum_folder(folder)
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_the_run_of_each_row_is_kept(tmp_path: Path, several: bool):
+    runs = np.array(["day 1", "day 1", "2", "with, comma"])
+    record = replace(make_record(4), runs=runs)
+    if several:
+        record = record.at_carriers(np.array([915e6, 2.44e9, 915e6, 5.1e9]))
+    folder = write_spectrum_folder(tmp_path / "a", record)
+    header = (folder / "tx_pos.csv").read_text().splitlines()[0]
+    assert header == ("x,y,z,frequency_hz,run" if several else "x,y,z,run")
+    again = read_spectrum_folder(folder)
+    assert again.runs is not None
+    assert again.runs.tolist() == runs.tolist()
+    np.testing.assert_array_equal(again.carriers_hz, record.carriers_hz)
+    assert_same(again, record)
+
+
+def test_wrong_runs_are_refused(tmp_path: Path):
+    folder = write_spectrum_folder(tmp_path / "a", make_record(4))
+    assert read_spectrum_folder(folder).runs is None
+    for content, message in (
+        ("x,y,z,run\n1,2,3,a\n1,2,3, \n1,2,3,b\n1,2,3,b\n", "row 2: run is empty; give the name or number"),
+        ("x,y,z,run,frequency_hz\n" + "1,2,3,a,9e8\n" * 4, "line 1: header is 'x,y,z,run,frequency_hz'; it must be"),
+    ):
+        (folder / "tx_pos.csv").write_text(content)
+        with pytest.raises(InputError, match=rf"tx_pos\.csv: {message}"):
+            read_spectrum_folder(folder)
+    for run in ("", " a", "two\nlines"):
+        record = replace(make_record(4), runs=np.array(["a", run, "a", "b"]))
+        with pytest.raises(InputError, match=r"row 1: run .* does not fit into a field; give a text of one line"):
+            write_spectrum_folder(tmp_path / "b", record)
+        assert not (tmp_path / "b").exists()

@@ -18,7 +18,6 @@ from wrf_mi.datasets import load
 from wrf_mi.exports import ExportOptions, export
 from wrf_mi.exports.paths_table import read_paths
 from wrf_mi.runs.api import train
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions, load_trace
 
 ROUNDED = 1e-14
@@ -28,11 +27,9 @@ SINGLE_M = 1e-5
 
 
 @pytest.fixture(scope="module")
-def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("traced")
-    room = make_scene(flat_folder / "layout.csv", out / "room", height_m=2.7).folder
-    options = TraceOptions(depth=2)
-    return train(flat_folder, out / "run", "ray-tracing", scene=room, settings=options).folder
+def run(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("traced") / "run"
+    return train(flat_folder, out, "ray-tracing", scene=room, settings=TraceOptions(depth=2)).folder
 
 
 def assert_same_paths(read: Paths, written: Paths) -> None:

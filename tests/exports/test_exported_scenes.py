@@ -165,8 +165,7 @@ def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: P
     np.testing.assert_array_equal(corners(scene_surfaces(again).triangles), corners(scene_surfaces(known).triangles))
 
 
-def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, tmp_path: Path) -> None:
-    room = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
+def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, room: Path, tmp_path: Path) -> None:
     run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=["depth=0"]).folder
     assert export(run, "ply", tmp_path / "room.ply")["surfaces"] == 6
     # What a calibration of materials leaves in the run folder.

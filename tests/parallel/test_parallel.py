@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from wrf_mi.backend import init
 from wrf_mi.core import InputError
 from wrf_mi.parallel import Scheduler, SchedulerFailed, open_scheduler, row_parts, run_module, scheduler, worker
 from wrf_mi.parallel.scheduler import PartsProgress
+from wrf_mi.parallel.threads import on_threads
 from wrf_mi.parallel.worker import WorkerEnvironment, worker_environment
 
 SECONDS = 60
@@ -177,3 +179,13 @@ def test_child_reports_status_and_last_line() -> None:
     status, said = run_module("wrf_mi.cli", ["predict", "--no-such-option"], quiet=True)
     assert status == 2
     assert said.startswith("wrf-mi predict: ")
+
+
+def test_parts_of_a_part_are_computed_in_its_thread() -> None:
+    """Else each of them would have as many threads as there are processors."""
+
+    def work(number: int) -> tuple[int, set[int]]:
+        return 10 * number, set(on_threads(lambda _: threading.get_ident(), range(4))) ^ {threading.get_ident()}
+
+    assert on_threads(work, range(5)) == [(10 * number, set()) for number in range(5)]
+    assert on_threads(lambda _: threading.get_ident(), [0]) == [threading.get_ident()]

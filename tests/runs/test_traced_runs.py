@@ -38,12 +38,6 @@ FLOAT32_DB = 1e-4
 
 
 @pytest.fixture(scope="module")
-def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flat's plan, extruded."""
-    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
-
-
-@pytest.fixture(scope="module")
 def run(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(
         flat_folder, tmp_path_factory.mktemp("runs") / "traced", "ray-tracing", scene=room, settings=DIRECT

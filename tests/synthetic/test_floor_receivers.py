@@ -67,20 +67,20 @@ def test_record_has_the_stated_rows_and_receivers(record: Record, folder: Path) 
     assert len(open_scene(folder / "rssi" / "floor", CARRIER_HZ).objects) == len(floor_plans.office().bare)
 
 
-def test_data_are_stored_and_reproducible(record: Record, folder: Path) -> None:
+def test_data_are_stored_and_reproducible(record: Record, traced: TraceResult, folder: Path) -> None:
     file = folder / "rssi" / "calibration_df.csv"
     before = file.stat().st_mtime_ns
     again = traced_floor_strengths(folder / "rssi", SMALL)
     assert file.stat().st_mtime_ns == before
     np.testing.assert_array_equal(again.observation, record.observation)
-    moved = traced_floor_strengths(folder / "moved", replace(SMALL, seed=2))
-    assert not np.array_equal(moved.tx_pos_m, record.tx_pos_m)
-    back = traced_floor_strengths(folder / "moved", SMALL)
-    np.testing.assert_array_equal(back.observation, record.observation)
+    np.testing.assert_array_equal(traced.tx_pos_m, record.tx_pos_m)
+    np.testing.assert_array_equal(strengths_of(traced, SMALL).observation, record.observation)
 
 
 def test_devices_are_spread_outside_of_bodies(scene_folder: Path) -> None:
-    receivers, transmitters = floor_devices(open_scene(scene_folder, CARRIER_HZ), floor_plans.office(), DEFAULT)
+    scene, plan = open_scene(scene_folder, CARRIER_HZ), floor_plans.office()
+    receivers, transmitters = floor_devices(scene, plan, DEFAULT)
+    assert not np.array_equal(floor_devices(scene, plan, replace(DEFAULT, seed=2))[1], transmitters)
     places = np.stack([receiver.position_m for receiver in receivers])
     assert (places.shape, transmitters.shape) == ((16, 3), (400, 3))
     np.testing.assert_array_equal(places[:, 2], DEFAULT.mount_m)
@@ -93,11 +93,9 @@ def test_devices_are_spread_outside_of_bodies(scene_folder: Path) -> None:
         assert not ((position[:2] > [8.6, 2.2]) & (position[:2] < [10.4, 4.0])).all()
 
 
-def test_strengths_are_the_power_of_all_paths(traced: TraceResult, folder: Path) -> None:
-    quiet = traced_floor_strengths(folder / "quiet", QUIET)
+def test_strengths_are_the_power_of_all_paths(traced: TraceResult) -> None:
     expected = rssi_dbm(traced.paths) + SMALL.power_dbm  # NaN without a path, as in the record
-    np.testing.assert_allclose(quiet.observation, expected, atol=FLOAT32_DB)
-    np.testing.assert_array_equal(quiet.tx_pos_m, traced.tx_pos_m)
+    np.testing.assert_allclose(strengths_of(traced, QUIET).observation, expected, atol=FLOAT32_DB)
     kinds = set(np.unique(traced.paths.interactions))
     assert {1, 2, 4} < kinds  # reflection, scattering, transmission
     assert 8 not in kinds

@@ -1,22 +1,40 @@
-"""The traced room: what is in it, what a model is given, and that both are made the same way each time."""
+"""The furnished room at one carrier and at several: what is in it, rows and splits, and what a model is given."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.constants import speed_of_light
+from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.furnished import furnished_parts, measured_parts
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
-from wrf_mi.core import Receiver
+from wrf_mi.core import Receiver, Record
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.datasets import make_splits
 from wrf_mi.receivers import antenna_csi
-from wrf_mi.receivers.channel import array_channels
-from wrf_mi.synthetic.furnished_room import MEASURED, TracedRoom, traced_room, transmitters
+from wrf_mi.receivers.channel import array_channels, received_power
+from wrf_mi.synthetic import load_record, traced_room_bands
+from wrf_mi.synthetic.furnished_room import (
+    DEFAULT_BANDS,
+    MEASURED,
+    RECEIVERS,
+    RoomBands,
+    TracedRoom,
+    channels_at_carriers,
+    opaque_parts,
+    traced_room,
+    transmitters,
+)
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
+from wrf_mi.synthetic.searches import searched_paths, set_scattering, trace_channels
+from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.paths.result import recompute
 from wrf_mi.tracing.search.devices import solid_around
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
@@ -57,9 +75,8 @@ def test_measured_room_lacks_furniture_and_has_errors() -> None:
     assert all(0 < abs(one) < 0.08 for one in off)  # four deviations
 
 
-def test_transmitters_are_clear_of_surfaces(tmp_path: Path) -> None:
-    write_scene(tmp_path, furnished_parts(), "test")
-    scene = open_scene(tmp_path, FREQUENCY_HZ)
+def test_transmitters_are_clear_of_surfaces(room: Path) -> None:
+    scene = open_scene(room, FREQUENCY_HZ)
     positions, surfaces = transmitters(scene, TracedRoom(train=300, test=100)), scene_surfaces(scene)
     assert positions.shape == (400, 3)
     assert (positions[:, 2] >= 0.5).all()
@@ -68,32 +85,170 @@ def test_transmitters_are_clear_of_surfaces(tmp_path: Path) -> None:
     assert (solid_around(surfaces, positions) < 0).all()
 
 
-def test_specular_signals_are_reciprocal(tmp_path: Path) -> None:
-    write_scene(tmp_path, measured_parts(0.0, 0), "test")
-    scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The room's walls without errors."""
+    work = tmp_path_factory.mktemp("bare")
+    write_scene(work, measured_parts(0.0, 0), "test")
+    return open_scene(work, FREQUENCY_HZ)
+
+
+ARRAY_M = planar_array(4, 4, 0.16)
+
+
+def test_specular_signals_are_reciprocal(bare: Any) -> None:
     tx = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7]])
     ends = [Receiver(str(i), place, np.array([0.0, 0.0, 0.0, 1.0])) for i, place in enumerate(tx)]
     options = TraceOptions(depth=2, rays=1 << 14)
     # The array's antennas are polarised along its y axis, which is up to a thousandth.
-    there = trace_paths(scene, tx, RECEIVER, options).paths
-    back = trace_paths(scene, RECEIVER.position_m, ends, TraceOptions(depth=2, rays=1 << 14)).paths
-    expected = antenna_csi(there, RECEIVER, array_m, FREQUENCY_HZ)[0, ..., 0]
-    found = array_channels(back, RECEIVER, array_m, FREQUENCY_HZ)[..., 0]
+    there = trace_paths(bare, tx, RECEIVER, options).paths
+    back = trace_paths(bare, RECEIVER.position_m, ends, options).paths
+    expected = antenna_csi(there, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
+    found = array_channels(back, RECEIVER, ARRAY_M, FREQUENCY_HZ)[..., 0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
-def test_scattered_waves_come_from_their_last_point(tmp_path: Path) -> None:
-    write_scene(tmp_path, measured_parts(0.0, 0), "test")
-    scene, array_m = open_scene(tmp_path, FREQUENCY_HZ), planar_array(4, 4, 0.16)
+def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:
     ends = [Receiver("0", np.array([2.0, 3.0, 1.2]), np.array([0.0, 0.0, 0.0, 1.0]))]
     options = TraceOptions(scattering=True, depth=1, rays=1 << 8)
-    paths = trace_paths(scene, RECEIVER.position_m, ends, options).paths
+    paths = trace_paths(bare, RECEIVER.position_m, ends, options).paths
     one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
-    found = array_channels(one, RECEIVER, array_m, FREQUENCY_HZ)[0, :, 0]
+    found = array_channels(one, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, :, 0]
     point = one.vertices_m[0, 0]
-    elements = RECEIVER.position_m + array_m @ RECEIVER.to_world.T
+    elements = RECEIVER.position_m + ARRAY_M @ RECEIVER.to_world.T
     wavenumber = 2 * np.pi * FREQUENCY_HZ / 299792458.0
     near, far = np.linalg.norm(point - elements, axis=1), np.linalg.norm(point - ends[0].position_m)
     origin = np.linalg.norm(point - RECEIVER.position_m)
     expected = one.gain[0] * origin / near * np.exp(-1j * wavenumber * (near + far))
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()  # vertices are float32
+
+
+SMALL_BANDS = RoomBands(
+    train=4,
+    test=2,
+    carriers_hz=(0.9e9, 5.8e9),
+    rows=2,
+    columns=3,
+    height=9,
+    width=36,
+    rays=1 << 10,
+    scattered_rays=1 << 8,
+    depth=2,
+    reflections=1,
+)
+POSITIONS = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7], [3.0, 5.2, 1.0], [7.6, 6.0, 1.3]])
+SINGLE = 1e-4
+"""Gains are computed in single precision, once in the search and again at each carrier."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bands") / "data"
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> Record:
+    return traced_room_bands(folder, SMALL_BANDS)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    work = tmp_path_factory.mktemp("room")
+    write_scene(work, furnished_parts(), "test")
+    return work
+
+
+def test_rows_are_positions_times_carriers(record: Record, folder: Path) -> None:
+    assert (record.name, record.task) == ("traced-room-bands", "spectrum")
+    assert record.observation.shape == (2, 12, 9, 36)
+    assert record.observation.min(axis=(2, 3)).max() == 0
+    assert record.observation.max(axis=(2, 3)).min() == 1
+    np.testing.assert_array_equal(record.carriers_hz, [0.9e9, 5.8e9] * 6)
+    assert record.frequencies_hz is None
+    np.testing.assert_array_equal(record.tx_pos_m[::2], record.tx_pos_m[1::2])
+    assert len(np.unique(record.tx_pos_m, axis=0)) == 6
+    assert [len(receiver.array_m) for receiver in record.receivers] == [6, 6]
+    assert (folder / SCAN).is_file()
+    assert len(open_scene(folder / "room", 2.4e9).objects) == 8
+
+
+def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
+    ceiling, wall = (receiver.to_world for receiver in RECEIVERS)
+    np.testing.assert_allclose(ceiling[:, 2], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(wall[:, 1:], np.array([[0, 0, 1], [-1, 0, 0]]).T, atol=1e-12)
+    assert DEFAULT_BANDS.spacing_m < speed_of_light / max(DEFAULT_BANDS.carriers_hz) / 2
+
+
+def test_data_are_stored(record: Record, folder: Path) -> None:
+    before = (folder / "tx_pos.csv").stat().st_mtime_ns
+    again = traced_room_bands(folder, SMALL_BANDS)
+    assert (folder / "tx_pos.csv").stat().st_mtime_ns == before
+    np.testing.assert_array_equal(again.observation, record.observation)
+
+
+def test_splits_keep_positions_and_carriers_apart(record: Record) -> None:
+    assert record.carriers_hz is not None
+    (official,) = make_splits(record, "official", validation_fraction=0)
+    places = [set(map(tuple, record.tx_pos_m[rows])) for rows in (official.all_train, official.test)]
+    assert [len(part) for part in places] == [4, 2]
+    assert not places[0] & places[1]
+    for split, carrier_hz in zip(make_splits(record, "frequency"), SMALL_BANDS.carriers_hz, strict=True):
+        assert (record.carriers_hz[split.test] == carrier_hz).all()
+        assert carrier_hz not in record.carriers_hz[split.all_train]
+        assert set(map(tuple, record.tx_pos_m[split.test])) == places[1]
+    assert [split.held_receivers for split in make_splits(record, "receiver")] == [(0,), (1,)]
+
+
+def test_spectra_of_a_carrier_are_those_made_at_it_alone(record: Record, tmp_path: Path) -> None:
+    for number, carrier_hz in enumerate(SMALL_BANDS.carriers_hz):
+        alone = traced_room_bands(tmp_path / str(number), replace(SMALL_BANDS, carriers_hz=(carrier_hz,)))
+        np.testing.assert_array_equal(alone.frequencies_hz, [carrier_hz])
+        np.testing.assert_array_equal(alone.tx_pos_m, record.tx_pos_m[number::2])
+        np.testing.assert_array_equal(alone.observation, record.observation[:, number::2])
+    assert not np.array_equal(record.observation[:, ::2], record.observation[:, 1::2])
+
+
+def channels(room: Path, searched_hz: float, carriers_hz: tuple[float, ...], options: tuple[Any, ...]) -> np.ndarray:
+    receiver = replace(RECEIVERS[1], array_m=planar_array(2, 2, 0.025))
+    scenes = [open_scene(room, hz) for hz in (searched_hz, *carriers_hz)]
+    return channels_at_carriers(scenes[1:], receiver, POSITIONS, scenes[0], options, opaque_parts())
+
+
+def test_channels_are_those_of_a_search_at_the_carrier(room: Path) -> None:
+    """All kinds of path at the carrier of the search; at another one those that are not drawn at random."""
+    exact, rough = replace(SMALL_BANDS, depth=3, reflections=2).options(diffraction=True)
+    receiver, opaque = replace(RECEIVERS[1], array_m=planar_array(2, 2, 0.025)), opaque_parts()
+
+    def alone(carrier_hz: float, options: tuple[Any, ...]) -> np.ndarray:
+        scene = open_scene(room, carrier_hz)
+        return trace_channels(scene, receiver, POSITIONS, np.array([carrier_hz]), options, opaque)[..., 0]
+
+    for options, carrier_hz in (((exact, rough), 2.4e9), ((replace(exact, diffraction=False),), 5.8e9)):
+        found = channels(room, 2.4e9, (carrier_hz,), options)[..., 0]
+        expected = alone(carrier_hz, options)
+        assert np.abs(found - expected).max() < SINGLE * np.abs(expected).max()
+
+
+def test_scattered_power_does_not_depend_on_the_carrier_of_the_search(tmp_path: Path) -> None:
+    """A pane is nearly transparent at 5.8 GHz, so that a search there draws few of its scattered paths."""
+    write_scene(tmp_path, {"pane": ("itu_glass", sheet(0, 0.0, (0.0, 6.0), (0.0, 3.0)))}, "test")
+    carriers, options = (2.4e9, 5.8e9), TraceOptions(scattering=True, transmission=True, depth=1, rays=1 << 17)
+    receiver = replace(RECEIVERS[1], position_m=np.array([2.0, 3.0, 1.5]))
+    scenes = [open_scene(tmp_path, carrier_hz) for carrier_hz in carriers]
+    power_db, counts = np.empty((2, 2)), []  # [search, carrier]
+    for search, searched_at in enumerate(scenes):
+        ((_, traced),) = searched_paths(searched_at, receiver, np.array([[1.5, 2.0, 1.0]] * 2), (options,))
+        counts.append(len(traced.paths))
+        for carrier, scene in enumerate(scenes):
+            set_scattering(scene, options.scattering_coefficient)
+            power_db[search, carrier] = 10 * np.log10(received_power(recompute(traced, scene).paths)[0, 0])
+    assert counts[0] > 2 * counts[1]
+    # Sums of several hundred random paths of unequal power; without the probabilities of the draw 5.2 dB.
+    assert np.abs(power_db[0] - power_db[1]).max() < 1
+
+
+def test_name_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr("wrf_mi.synthetic.traced_room_bands", lambda progress: asked.append(progress))
+    load_record("traced-room-bands", progress=True)
+    assert asked == [True]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from changed_folders import DATA, needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -16,8 +14,7 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core import InputError
-from wrf_mi.tasks.losses import spectrum_loss
-from wrf_mi.tasks.ssim import ssim
+from wrf_mi.tasks.losses import spectrum_loss, ssim
 
 Float64 = dr.float64_array_t(mi.Float)
 
@@ -81,10 +78,9 @@ def test_equals_scikit_image_at_any_level_and_contrast(height, width, level, con
     assert ours(prediction, truth) == pytest.approx(reference(prediction, truth), abs=SINGLE)
 
 
+@needs("rfid-lab")
 def test_equals_scikit_image_on_real_spectra():
-    if "WRF_MI_DATA" not in os.environ:
-        pytest.skip("WRF_MI_DATA is not set: no real spectra")
-    folder = Path(os.environ["WRF_MI_DATA"]) / "rfid-lab" / "spectrum"
+    folder = DATA / "rfid-lab" / "spectrum"
     images = np.stack([np.asarray(Image.open(folder / f"{i:05d}.png"), float) / 255 for i in range(1, 11)])
     truth = np.roll(images, 1, axis=0)
     assert ours(images, truth) == pytest.approx(reference(images, truth), abs=SINGLE)

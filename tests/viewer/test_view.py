@@ -18,7 +18,6 @@ from wrf_mi.core import InputError
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import open_run
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import load_trace, open_scene
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.viewer.content import ViewOptions
@@ -28,12 +27,6 @@ from wrf_mi.viewer.scene_layer import scene_content, surfaces_in
 
 FLOAT32 = 1e-5
 """Relative rounding of float32."""
-
-
-@pytest.fixture(scope="module")
-def room(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flat's plan, extruded."""
-    return make_scene(flat_folder / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
 
 
 @pytest.fixture(scope="module")

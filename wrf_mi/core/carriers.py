@@ -19,12 +19,9 @@ MOST_NAMED = 4
 def by_carrier(
     carriers_hz: FloatArray, of_carrier: Callable[[float, IntArray], NDArray[Any]], axis: int = 0
 ) -> NDArray[Any]:
-    """Values computed carrier by carrier, in the order of the rows.
+    """Values of rows with carriers [m], Hz, computed carrier by carrier by ``of_carrier(carrier_hz, rows)``.
 
-    Args:
-        carriers_hz: carrier of each row [m], Hz.
-        of_carrier: ``of_carrier(carrier_hz, rows)``: values of the rows with these numbers.
-        axis: axis of the values that counts rows.
+    They are in the order of the rows, which ``axis`` counts.
     """
     every = rows_of_carriers(carriers_hz)
     values = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)

@@ -33,14 +33,7 @@ def content_digest(*values: Any) -> str:
 def _add(digest: Any, value: Any) -> None:
     """Kind and size precede content, so that different values give different bytes."""
     if isinstance(value, Path):
-        if not value.exists():
-            raise InputError(f"{value}: no such file or folder; restore it")
-        files = [value] if value.is_file() else files_below(value)
-        digest.update(f"files {len(files)}\n".encode())
-        for file in files:
-            with file.open("rb") as stream:
-                content = hashlib.file_digest(stream, "sha256").hexdigest()
-            digest.update(f"{file.relative_to(value).as_posix()!r} {content}\n".encode())
+        _add_files(digest, value)
     elif isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype.str} {value.shape}\n".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
@@ -62,6 +55,17 @@ def _add(digest: Any, value: Any) -> None:
         raise TypeError(
             f"content_digest: {type(value).__name__} has no digest; give arrays, data classes or plain values"
         )
+
+
+def _add_files(digest: Any, path: Path) -> None:
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; restore it")
+    files = [path] if path.is_file() else files_below(path)
+    digest.update(f"files {len(files)}\n".encode())
+    for file in files:
+        with file.open("rb") as stream:
+            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest.update(f"{file.relative_to(path).as_posix()!r} {content}\n".encode())
 
 
 def files_below(folder: Path) -> list[Path]:

@@ -63,7 +63,5 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
         InputError: more than is free.
     """
     if needed > SMALL_BYTES and needed > (free := free_bytes()):
-        text = (
-            f"{what} takes {needed / 2**30:,.3g} GiB" if needed < 2**40 else f"{what} takes {needed / 2**30:,.0f} GiB"
-        )
-        raise InputError(f"{text}, and {free / 2**30:.3g} GiB of memory are free; {remedy}")
+        gib = f"{needed / 2**30:,.3g}" if needed < 2**40 else f"{needed / 2**30:,.0f}"
+        raise InputError(f"{what} takes {gib} GiB, and {free / 2**30:.3g} GiB of memory are free; {remedy}")

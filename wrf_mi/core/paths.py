@@ -67,7 +67,7 @@ class Paths:
         depth = self.interactions.shape[1] if self.interactions.ndim == 2 else -1
         more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
         more |= {"objects": (depth,), "vertices_m": (depth, 3)}
-        for name in _ARRAYS:
+        for name in ARRAYS:
             expected, actual = (len(self.tx), *more.get(name, ())), getattr(self, name).shape
             if actual != expected:
                 raise ValueError(f"Paths: {name} has shape {list(actual)}, expected {list(expected)}")
@@ -80,15 +80,16 @@ class Paths:
 
     def select(self, which: NDArray[Any]) -> Paths:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
-        return replace(self, **{name: getattr(self, name)[which] for name in _ARRAYS})
+        return replace(self, **{name: getattr(self, name)[which] for name in ARRAYS})
 
 
-_ARRAYS = tuple(f.name for f in fields(Paths) if f.name not in ("object_names", "n_tx", "n_rx"))
+ARRAYS = tuple(field.name for field in fields(Paths) if field.name not in ("object_names", "n_tx", "n_rx"))
+"""Attributes of `Paths` whose first axis counts paths."""
 
 
 def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None = None) -> Path:
     """Write paths, whose fields become keys, and extra arrays by other keys to a compressed ``.npz``, atomically."""
-    arrays: dict[str, Any] = {name: getattr(paths, name) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(paths, name) for name in ARRAYS}
     arrays |= {"object_names": np.asarray(paths.object_names, dtype=str), "n_tx": paths.n_tx, "n_rx": paths.n_rx}
     return write_arrays(Path(file), {"format": FORMAT, **arrays, **(extra or {})}, compressed=True)
 
@@ -112,7 +113,7 @@ def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
             names = tuple(str(name) for name in arrays.pop("object_names"))
             counts = int(arrays.pop("n_tx")), int(arrays.pop("n_rx"))
             paths = Paths(
-                **{name: arrays.pop(name) for name in _ARRAYS}, object_names=names, n_tx=counts[0], n_rx=counts[1]
+                **{name: arrays.pop(name) for name in ARRAYS}, object_names=names, n_tx=counts[0], n_rx=counts[1]
             )
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")

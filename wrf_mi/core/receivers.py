@@ -17,14 +17,6 @@ from .types import Receiver
 
 SHOWN = 20
 """Largest number of names in an error message."""
-KEYS = (
-    "receiver_name",
-    "receiver_position_m",
-    "receiver_orientation_xyzw",
-    "receiver_antenna",
-    "receiver_elements",
-    "receiver_elements_m",
-)
 UNKNOWN = -1
 """Stored number of elements of a receiver without a known array."""
 
@@ -63,10 +55,10 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
 
 
 def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
-    """Arrays of n receivers by the names `KEYS`.
+    """Arrays of n receivers by name.
 
-    Shapes: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of each array;
-    [all, 3] positions of all elements in the receivers' frames, metres.
+    Shapes, in the order below: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of
+    each array; [all, 3] positions of all elements in the receivers' frames, metres.
     """
     arrays = [receiver.array_m for receiver in receivers]
     return {
@@ -83,11 +75,12 @@ def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]
     """Receivers from the arrays of `receiver_arrays`.
 
     Raises:
-        KeyError: a key of `KEYS` is missing.
+        KeyError: an array is missing.
         InputError: an invalid antenna.
     """
     counts = arrays["receiver_elements"]
     split = np.split(arrays["receiver_elements_m"], np.cumsum(np.maximum(counts, 0))[:-1])
     elements = [None if count == UNKNOWN else array_m for count, array_m in zip(counts, split, strict=True)]
-    columns = zip(*(arrays[key] for key in KEYS[:4]), elements, strict=True)
+    names = ("name", "position_m", "orientation_xyzw", "antenna")
+    columns = zip(*(arrays[f"receiver_{name}"] for name in names), elements, strict=True)
     return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), array_m) for n, p, q, words, array_m in columns)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,36 @@ class Prediction:
 
 
 IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Known quantities of m rows to predict; never their observations.
+
+    Attributes:
+        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
+        tx_heading_rad: headings of the transmitter [m], or None.
+        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
+        first_row: number of the first row, for messages.
+        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
+    """
+
+    tx_pos_m: FloatArray
+    tx_heading_rad: FloatArray | None = None
+    uplink: NDArray[Any] | None = None
+    first_row: int = 0
+    carriers_hz: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.tx_pos_m)
+
+    def rows(self, chosen: slice | IntArray) -> Inputs:
+        """Inputs of some rows; ``first_row`` of an array is that of all rows."""
+        start = (chosen.start or 0) if isinstance(chosen, slice) else 0
+        columns = (self.tx_pos_m, self.tx_heading_rad, self.uplink, self.carriers_hz)
+        position, heading, uplink, carriers = (None if values is None else values[chosen] for values in columns)
+        return Inputs(cast(FloatArray, position), heading, uplink, self.first_row + start, carriers)
 
 
 @dataclass(frozen=True)
@@ -145,6 +175,10 @@ class Record:
         """Number of transmitter positions (rows)."""
         return len(self.tx_pos_m)
 
+    def inputs(self, rows: slice | IntArray = slice(None)) -> Inputs:
+        """Inputs of some rows."""
+        return Inputs(self.tx_pos_m, self.tx_heading_rad, self.uplink, 0, self.carriers_hz).rows(rows)
+
     @property
     def scored(self) -> NDArray[np.float32] | NDArray[np.complex64]:
         """Values that predictions are scored against: the truth where it is known, else the observation."""
@@ -169,22 +203,25 @@ class Record:
         """The record as if the receivers that a split holds out had received nothing but the rows it leaves them."""
         if not split.held_receivers:
             return self
-        hidden: dict[str, Any] = {}
         receiver, row = split.left.T
-        for name, nothing in (("observation", np.nan), ("truth", np.nan), ("std", np.nan), ("n_readings", 0)):
-            values = getattr(self, name)
-            if values is not None:
-                hidden[name] = values.copy()
-                hidden[name][list(split.held_receivers)] = nothing
-                hidden[name][receiver, row] = values[receiver, row]
-        return replace(self, **hidden)
+
+        def hidden(values: NDArray[Any]) -> NDArray[Any]:
+            visible = values.copy()
+            visible[list(split.held_receivers)] = 0 if values.dtype.kind in "iu" else np.nan  # no readings, or unknown
+            visible[receiver, row] = values[receiver, row]
+            return visible
+
+        return replace(self, **self._of_receivers(hidden))
+
+    def _of_receivers(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
+        """Results of a function of the arrays whose first axis counts receivers, by the names of the attributes."""
+        arrays = {name: getattr(self, name) for name in ("observation", "truth", "std", "n_readings")}
+        return {name: None if values is None else function(values) for name, values in arrays.items()}
 
     def at_receivers(self, receivers: Sequence[int] | IntArray) -> Record:
         """The record with some receivers alone, by their numbers."""
-        names = ("observation", "truth", "std", "n_readings")
-        parts: dict[str, Any] = {name: getattr(self, name) for name in names}
-        parts = {name: None if values is None else values[list(receivers)] for name, values in parts.items()}
-        return replace(self, receivers=tuple(self.receivers[number] for number in receivers), **parts)
+        chosen = tuple(self.receivers[number] for number in receivers)
+        return replace(self, receivers=chosen, **self._of_receivers(lambda values: values[list(receivers)]))
 
     def at_carrier(self, carrier_hz: float) -> Record:
         """The record with one carrier in Hz for every row."""
@@ -202,11 +239,8 @@ class Record:
         (median of ``std`` / ``std``)^2 where the data state ``std``, with the median over the observations received in
         these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance.
 
-        Args:
-            rows: numbers of rows [m].
-
         Returns:
-            Shape [n_rx, m], 1 where nothing was received; None where the data state neither.
+            Shape [n_rx, m] for m rows, 1 where nothing was received; None where the data state neither.
         """
         if self.std is None:
             return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)

@@ -45,9 +45,7 @@ class _Loader(yaml.SafeLoader):
             value = super().construct_object(node, deep)
             if isinstance(value, int):
                 float(value)  # hundreds of digits are no quantity, and no array takes them
-        except yaml.YAMLError:
-            raise
-        except RecursionError:
+        except (yaml.YAMLError, RecursionError):
             raise
         except Exception as error:  # PyYAML's constructors raise a dozen kinds
             text = f"no {node.tag.rpartition(':')[2]} ({one_line(error)})"

@@ -142,7 +142,40 @@ def _local(file: Path, group: Any, name: str) -> Any:
 def _open(
     file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
 ) -> tuple[_Layout, Iterator[NDArray[Any]]]:
-    """The layout, and chunks of samples [frames, users, antennas, slot, 2]."""
+    """The layout, and chunks of samples (`_chunks`)."""
+    shape = _check_samples(file, pilots)
+    asked = range(shape[0])[frames or slice(None)]
+    if not len(asked) or asked.step < 0:
+        raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
+    layout = (_sounder if len(shape) == 5 else _argos)(file, shape, attributes, start)
+    if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
+        text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
+        raise DataFault(file, f"{text}; give start")
+    needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
+    require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
+    if len(shape) == 5:
+        if cell is None and shape[1] > 1:
+            raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
+        if not 0 <= (cell or 0) < shape[1]:
+            raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
+    return layout, _chunks(pilots, layout, asked, cell or 0)
+
+
+def _chunks(pilots: Any, layout: _Layout, frames: range, cell: int) -> Iterator[NDArray[Any]]:
+    """Samples [frames, users, antennas, slot, 2] of at most `CHUNK_SIZE` bytes at a time."""
+    step = max(1, CHUNK_SIZE // int(np.prod(pilots.shape[1:]) * pilots.dtype.itemsize))
+    for first in range(0, len(frames), step):
+        chunk = frames[first : first + step]
+        rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
+        if pilots.ndim == 4:
+            values = pilots[rows][:, :, : layout.users * layout.slot]
+            yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
+        else:
+            yield pilots[rows, cell].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
+
+
+def _check_samples(file: Path, pilots: Any) -> tuple[int, ...]:
+    """The shape of the samples, which are whole numbers in the file itself."""
     shape = tuple(int(size) for size in pilots.shape)
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
@@ -152,33 +185,7 @@ def _open(
     size = file.stat().st_size
     if pilots.nbytes > MOST_DEFLATED * size:
         raise DataFault(file, f"{PILOTS} states {list(shape)} samples, and the file has {size} bytes; fetch it again")
-    asked = range(shape[0])[frames or slice(None)]
-    if not len(asked) or asked.step < 0:
-        raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
-    find = _sounder if len(shape) == 5 else _argos
-    layout = find(file, shape, attributes, start)
-    if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
-        text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
-        raise DataFault(file, f"{text}; give start")
-    needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
-    require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
-    if len(shape) == 5 and cell is None and shape[1] > 1:
-        raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
-    if len(shape) == 5 and not 0 <= (cell or 0) < shape[1]:
-        raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
-
-    def parts() -> Iterator[NDArray[Any]]:
-        step = max(1, CHUNK_SIZE // int(np.prod(shape[1:]) * pilots.dtype.itemsize))
-        for first in range(0, len(asked), step):
-            chunk = asked[first : first + step]
-            rows = slice(chunk.start, chunk[-1] + 1, chunk.step)
-            if len(shape) == 4:
-                values = pilots[rows][:, :, : layout.users * layout.slot]
-                yield values.reshape(len(chunk), layout.antennas, layout.users, layout.slot, 2).swapaxes(1, 2)
-            else:
-                yield pilots[rows, cell or 0].reshape(len(chunk), layout.users, layout.antennas, layout.slot, 2)
-
-    return layout, parts()
+    return shape
 
 
 def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
@@ -208,8 +215,7 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], sta
 
 def _check_sequence(file: Path, attributes: dict[str, Any]) -> None:
     """Refuse pilots that are not the long training symbol."""
-    found = np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))
-    word = found[0] if len(found) else ""
+    word = next(iter(np.ravel(attributes.get("PILOT_SEQ_TYPE", "lts"))), "")
     text = word.decode(errors="backslashreplace") if isinstance(word, bytes) else str(word)
     if not text or not isinstance(word, bytes | str):
         what = "empty" if not text else shown(word)
@@ -231,8 +237,8 @@ def _number(attributes: dict[str, Any], key: str) -> float | None:
 def _whole(file: Path, attributes: dict[str, Any], key: str) -> int:
     value = _number(attributes, key)
     if value is None or value < 0 or value != int(value):
-        found = f"is {shown(attributes[key])}" if key in attributes else "is missing"
-        raise DataFault(file, f"attribute {key} {found}; it must state the layout of {PILOTS}")
+        state = f"is {shown(attributes[key])}" if key in attributes else "is missing"
+        raise DataFault(file, f"attribute {key} {state}; it must state the layout of {PILOTS}")
     return int(value)
 
 
@@ -242,4 +248,5 @@ def _estimate(samples: NDArray[Any], layout: _Layout) -> NDArray[np.complex64]:
     # Estimates of the symbols share one known sequence, so their mean is the estimate from the mean symbol.
     mean = symbols.mean(axis=-3, dtype=np.float32)
     spectrum = np.fft.fft((mean[..., 0] + 1j * mean[..., 1]) / FULL_SCALE, axis=-1)
+    # Least squares: the received value of a subcarrier is the channel times the known symbol, +1 or -1, plus noise.
     return (spectrum[..., SUBCARRIERS % FFT] / TRAINING).astype(np.complex64)

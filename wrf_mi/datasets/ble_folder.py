@@ -21,7 +21,7 @@ from ..core import Antenna, DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT
 from ..core.carriers import FREQUENCY
-from ..core.files import atomic_folder, one_line
+from ..core.files import atomic_folder, one_line, write_csv
 from ..core.types import IntArray
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
@@ -31,13 +31,13 @@ from .folder_files import (
     CsvTable,
     carriers_of,
     data_folder,
+    folder_record,
     read_antenna,
     read_csv,
     refuse_runs,
     refuse_unstated,
     runs_of,
     shown,
-    write_csv,
     write_extra,
 )
 from .unknown import Table, long_columns, table_text
@@ -75,7 +75,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """
     folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
     anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
-    ids = attempt(_read_ids, anchors, whole=True)
+    ids = attempt(_read_ids, anchors, complete=True)
     anchors_m = attempt(_positions, anchors, "xyz")
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
@@ -89,9 +89,10 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(n_train + n_test, TAG_HEIGHT_M)
     counts = noise[COUNT].value
-    record = Record(
-        name=name or folder.resolve().name,
-        task="rssi",
+    record = folder_record(
+        folder,
+        name,
+        "rssi",
         tx_pos_m=np.column_stack([np.concatenate([part.value for part in plane]), height]),
         receivers=tuple(
             Receiver(_name(anchor), position, np.array(UPRIGHT), antenna)
@@ -100,12 +101,11 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         observation=np.concatenate([part.value for part in strengths], axis=1),
         official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
-        tx_heading_rad=stated["heading"].value,
-        tx_antenna=tx_antenna.value,
+        tx_heading_rad=stated["heading"],
+        tx_antenna=tx_antenna,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
-        std=noise[STD].value,
-        runs=stated[RUN].value,
-        source=str(folder),
+        std=noise[STD],
+        runs=stated[RUN],
     )
     carriers_hz = stated[FREQUENCY].value
     return record if carriers_hz is None else record.at_carriers(carriers_hz)
@@ -116,12 +116,8 @@ def write_ble_folder(
 ) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
-    Args:
-        path: path of the folder.
-        record: record with ``task="rssi"``. Its official split assigns rows to the files, so they are read in the order
-            of that split.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    The official split assigns rows to the files, so they are read in the order of that split. ``extra`` is the content
+    of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -139,21 +135,26 @@ def write_ble_folder(
             if any(antenna != ANTENNA for antenna in group)
         }
         positions = np.stack([receiver.position_m for receiver in record.receivers])
-        write_csv(part / ANCHORS, {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated})
+        columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated}
+        write_csv(part / ANCHORS, columns, zip(*columns.values(), strict=True))
+        of_rows = _columns(record, ids, carriers)
         for file, rows in zip((TRAINING, TEST), official, strict=True):
-            columns: dict[str, Any] = dict(zip("xyz", record.tx_pos_m[rows].T.tolist(), strict=True))
-            if record.tx_heading_rad is not None:
-                columns["heading"] = record.tx_heading_rad[rows].tolist()
-            if carriers is not None:
-                columns[FREQUENCY] = carriers[rows].tolist()
-            if record.runs is not None:
-                columns[RUN] = record.runs[rows].tolist()
-            for prefix, values in ((RSSI, record.observation), (COUNT, record.n_readings), (STD, record.std)):
-                if values is not None:
-                    columns |= {prefix + anchor: received[rows] for anchor, received in zip(ids, values, strict=True)}
-            write_csv(part / file, columns)
+            write_csv(part / file, of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
         write_extra(part, extra)
     return Path(path)
+
+
+def _columns(record: Record, ids: list[str], carriers_hz: FloatArray | None) -> dict[str, NDArray[Any]]:
+    """Columns of the tables of rows."""
+    columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
+    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, RUN: record.runs}
+    counts = None if record.n_readings is None else record.n_readings.astype(object)
+    if counts is not None:
+        counts[counts == 0] = None  # an empty field where nothing was received, as of strength and noise
+    for prefix, values in ((RSSI, record.observation), (COUNT, counts), (STD, record.std)):
+        if values is not None:
+            columns |= {prefix + anchor: received for anchor, received in zip(ids, values, strict=True)}
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArray], list[str]]:
@@ -190,12 +191,12 @@ def _read_ids(table: CsvTable) -> list[str]:
         logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
-        found = _id(text)
-        wrong = None if row - 1 in table.damaged else _wrong_id(found, ids)
+        anchor = _id(text)
+        wrong = None if row - 1 in table.damaged else _wrong_id(anchor, ids)
         if wrong:
             remedy = "give each anchor a number or name that no other has"
             refuse(DataFault(table.path, f"id {shown(text)} {wrong}; {remedy}", row=row))
-        ids.append(found)
+        ids.append(anchor)
     if table.damaged:
         stop_at_faults()  # an anchor without id
     return ids
@@ -224,11 +225,11 @@ def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
     entries = [
         {key: text for key, texts in stated.items() if (text := texts[row].strip())} for row in range(len(table.rows))
     ]
-    found = [
+    antennas = [
         attempt(read_antenna, table.path, f"{prefix}antenna", entry, ANTENNA_WORDS, row)
         for row, entry in enumerate(entries, start=1)
     ]
-    return [antenna.value for antenna in found]
+    return [antenna.value for antenna in antennas]
 
 
 def _id(text: str) -> str:
@@ -274,25 +275,25 @@ def _in_both(column: str, tables: list[CsvTable]) -> Any:
 
 def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
     """Columns of a table that begin with a prefix, by the anchor that they name."""
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for column in table.header:
         if column.startswith(prefix):
-            first = found.setdefault(_id(column.removeprefix(prefix)), column)
+            first = columns.setdefault(_id(column.removeprefix(prefix)), column)
             if first != column:
                 text = f"{first} and {column} name one anchor; remove one of them"
                 refuse(DataFault(table.path, text, line=1))
-    return found
+    return columns
 
 
 def _of_anchors(
     prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
     """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
-    found = [_by_anchor(prefix, table) for table in tables]
-    if not any(anchor in columns for columns in found for anchor in ids):
+    columns_by_anchor = [_by_anchor(prefix, table) for table in tables]
+    if not any(anchor in columns for columns in columns_by_anchor for anchor in ids):
         return None
     parts = []
-    for table, columns, strength in zip(tables, found, strengths, strict=True):
+    for table, columns, strength in zip(tables, columns_by_anchor, strengths, strict=True):
         if lacking := [anchor for anchor in ids if anchor not in columns]:
             text = f"no column {prefix}{lacking[0]}; give one for every anchor in both files, or none"
             refuse(DataFault(table.path, text, line=1))

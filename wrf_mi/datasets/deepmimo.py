@@ -138,7 +138,7 @@ def _antennas(chosen: _ChannelParams) -> tuple[Antenna, ...]:
     """Antenna of the base stations and of the users."""
     patterns = (chosen.bs_antenna.radiation_pattern, "array"), (chosen.ue_antenna.radiation_pattern, "world")
     # An isotropic antenna is vertical in the world, as everywhere; powers do not state another polarisation.
-    return tuple(ANTENNA if one == "isotropic" else Antenna("hw_dipole", frame=frame) for one, frame in patterns)
+    return tuple(ANTENNA if name == "isotropic" else Antenna("hw_dipole", frame=frame) for name, frame in patterns)
 
 
 def _channel_params(file: Path, stated: Mapping[str, Any]) -> _ChannelParams:
@@ -182,14 +182,15 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     bs_antenna, ue_antenna = _antennas(chosen)
     orientation = Rotation.from_matrix(chosen.rotation @ DEVICE_TO_ARRAY.T).as_quat()
     numbers = _choose(scenario, chosen)
-    found = [_of_station(scenario, scenario.stations[number], chosen) for number in numbers]
-    users = found[0][1]
-    for number, (_, others, _) in zip(numbers, found, strict=True):
+    of_stations = [_of_station(scenario, scenario.stations[number], chosen) for number in numbers]
+    users = of_stations[0][1]
+    for number, (_, others, _) in zip(numbers, of_stations, strict=True):
         if not np.array_equal(others, users):
             text = f"users of base station {number} are at other positions than those of {numbers[0]}"
             raise InputError(f"{folder}: {text}; choose one of them in {CHANNEL_PARAMS}")
-    observation = np.stack([channel for _, _, channel in found])
-    received = np.flatnonzero(np.isfinite(observation).reshape(len(found), len(users), -1).all(axis=2).any(axis=0))
+    observation = np.stack([channel for _, _, channel in of_stations])
+    finite = np.isfinite(observation).reshape(len(of_stations), len(users), -1)
+    received = np.flatnonzero(finite.all(axis=2).any(axis=0))
     if len(received) < 2:
         text = f"{len(received)} of {len(users)} users have a path to the base stations {numbers}"
         raise InputError(f"{folder}: {text}; two at least are needed, to train on and to score")
@@ -197,7 +198,7 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     several = len(array_m) > 1
     receivers = (
         Receiver(f"bs{number}", position, orientation, bs_antenna, array_m if several else None)
-        for number, (position, _, _) in zip(numbers, found, strict=True)
+        for number, (position, _, _) in zip(numbers, of_stations, strict=True)
     )
     return Record(
         name=name or folder.resolve().name,
@@ -256,8 +257,8 @@ def _read_scenario(folder: Path) -> _Scenario:
 def _mapping(file: Path, stated: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
     value = stated.get(key)
     if not isinstance(value, Mapping):
-        found = "missing" if value is None else shown(value)
-        raise InputError(f"{file}: {key} is {found}; give a scenario of DeepMIMO 4")
+        state = "missing" if value is None else shown(value)
+        raise InputError(f"{file}: {key} is {state}; give a scenario of DeepMIMO 4")
     return value
 
 
@@ -292,20 +293,20 @@ def _of_station(
     for user_set in scenario.user_sets:
         pair = f"t{station[0]:03}_tx{station[1]:03}_r{user_set:03}"
         paths = _matrices(scenario.folder, pair)
-        here, there = paths.pop("tx_pos"), paths.pop("rx_pos")
-        if here.size != 3 or not np.isfinite(here).all():
-            text = f"tx_pos_{pair} has shape {list(here.shape)} or is not finite"
+        station_m, users_m = paths.pop("tx_pos"), paths.pop("rx_pos")
+        if station_m.size != 3 or not np.isfinite(station_m).all():
+            text = f"tx_pos_{pair} has shape {list(station_m.shape)} or is not finite"
             raise InputError(f"{scenario.folder}: {text}; it must be x, y, z in metres")
-        if there.ndim != 2 or there.shape[1] != 3 or not np.isfinite(there).all():
-            text = f"rx_pos_{pair} has shape {list(there.shape)} or is not finite"
+        if users_m.ndim != 2 or users_m.shape[1] != 3 or not np.isfinite(users_m).all():
+            text = f"rx_pos_{pair} has shape {list(users_m.shape)} or is not finite"
             raise InputError(f"{scenario.folder}: {text}; it must be [users, 3] in metres")
-        expected = (len(there), *paths["power"].shape[1:2])
+        expected = (len(users_m), *paths["power"].shape[1:2])
         for key, values in paths.items():
             if values.ndim != 2 or values.shape != expected:
                 text = f"{key}_{pair} has shape {list(values.shape)}, expected {list(expected)} as rx_pos and power"
                 raise InputError(f"{scenario.folder}: {text}; fetch the scenario again")
-        positions.append(here.reshape(3).astype(float))
-        users.append(there.astype(float))
+        positions.append(station_m.reshape(3).astype(float))
+        users.append(users_m.astype(float))
         channels.append(_channels(scenario, pair, paths, chosen))
     if any(not np.array_equal(position, positions[0]) for position in positions):
         text = f"base station {station[1]} of set {station[0]} has several positions"
@@ -323,7 +324,7 @@ def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
             raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
         files[key] = file
     of_mat = _mat_arrays({key: file for key, file in files.items() if file.suffix == ".mat"})
-    found = {}
+    matrices = {}
     for key, file in files.items():
         with readable(file, "", "fetch the scenario again"):
             if file.suffix == ".mat":
@@ -335,8 +336,8 @@ def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
         if values is None or values.dtype.kind not in "fiu":
             what = f"no array {key}" if values is None else f"{key} holds {values.dtype}"
             raise InputError(f"{file}: {what}; give real numbers by the name {key}")
-        found[key] = values
-    return found
+        matrices[key] = values
+    return matrices
 
 
 def _mat_arrays(files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
@@ -367,17 +368,19 @@ def _channels(
     for start in range(0, n, step):
         rows = slice(start, start + step)
         exist = ~np.isnan(paths["power"][rows])
+        # Matrices are padded with NaN to the most paths of a user; as zeros these places add nothing to the sums.
         power, phase, delay, *angles = (np.where(exist, paths[k][rows], 0.0).astype(float) for k in PATH_MATRICES)
         _check_delays(scenario, pair, delay, chosen)
         departure, arrival = (
             unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
             for azimuth, zenith in (angles[:2], angles[2:])
         )
-        departure = departure @ chosen.rotation
+        departure = departure @ chosen.rotation  # rows times R: from the world's frame to the array's
         with np.errstate(over="ignore", invalid="ignore"):
             gain = exist * 10 ** (power / 20) * np.exp(1j * np.radians(phase))
             for antenna, directions in zip(_antennas(chosen), (departure, arrival), strict=True):
                 gain = gain * np.linalg.norm(antenna.field(directions), axis=-1)
+            # Elements are in wavelengths, so k0 p . u is 2 pi times the product.
             at_elements = gain[..., None] * np.exp(2j * np.pi * (departure @ elements.T))
             waves = np.exp(-2j * np.pi * delay[..., None] * offsets_hz)
             channel[rows] = np.matmul(at_elements.transpose(0, 2, 1), waves)

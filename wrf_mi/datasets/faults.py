@@ -10,44 +10,42 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, cast
 
 from ..core import InputError
 
 T = TypeVar("T")
 
-_found: ContextVar[list[InputError] | None] = ContextVar("faults", default=None)
-"""Faults found so far; None outside `collect_faults`."""
+_collected: ContextVar[list[InputError] | None] = ContextVar("faults", default=None)
+"""Faults so far; None outside `collect_faults`."""
 
 
 def collect_faults(read: Callable[[], T]) -> tuple[T | None, list[InputError]]:
-    """Call a reader and collect the faults of the data in place of raising the first one.
-
-    Returns:
-        What the reader returns, None if there is a fault; and the faults in the order in which they were found.
-    """
-    found: list[InputError] = []
-    token = _found.set(found)
+    """What a reader returns, None if there is a fault, and the faults of the data in the order of reading."""
+    collected: list[InputError] = []
+    token = _collected.set(collected)
     result = None
     try:
-        result = read()
-    except InputError as error:
-        _note(found, error)
+        with recoverable():
+            result = read()
     finally:
-        _found.reset(token)
-    return (None if found else result), found
+        _collected.reset(token)
+    return (None if collected else result), collected
 
 
 @contextmanager
 def recoverable() -> Iterator[None]:
     """A block that reading can go on after: its fault is collected, or raised outside `collect_faults`."""
-    found = _found.get()
+    collected = _collected.get()
     try:
         yield
     except InputError as error:
-        if found is None:
+        if collected is None:
             raise
-        _note(found, error)
+        # A part that needs another part without a value raises that part's fault again.
+        if not any(error is other for other in collected):
+            collected.append(error)
 
 
 def refuse(fault: InputError) -> None:
@@ -58,15 +56,16 @@ def refuse(fault: InputError) -> None:
 
 def stop_at_faults() -> None:
     """Raise the first collected fault, before a step that needs everything read so far to be correct."""
-    if found := _found.get():
-        raise found[0]
+    if collected := _collected.get():
+        raise collected[0]
 
 
+@dataclass
 class Attempt(Generic[T]):
-    """Result of `attempt`."""
+    """Result of `attempt`: its ``value``, or the fault that is raised where the value is needed."""
 
-    def __init__(self, value: T | None, fault: InputError | None = None) -> None:
-        self._value, self._fault = value, fault
+    result: T | None = None
+    fault: InputError | None = None
 
     @property
     def value(self) -> T:
@@ -75,41 +74,33 @@ class Attempt(Generic[T]):
         Raises:
             InputError: the fault for which there is none.
         """
-        if self._fault is not None:
-            raise self._fault
-        return cast(T, self._value)
+        if self.fault is not None:
+            raise self.fault
+        return cast(T, self.result)
 
 
-def attempt(read: Callable[..., T], *arguments: Any, whole: bool = False) -> Attempt[T]:
+def attempt(read: Callable[..., T], *arguments: Any, complete: bool = False) -> Attempt[T]:
     """Read a part of a data set; its fault is collected, or raised outside `collect_faults`.
 
     Args:
         read: function that reads the part.
         arguments: arguments of the function. An `Attempt`, also in a list, is replaced by its value; without a value
             the part is not read, and has none.
-        whole: there is no value, either, where `read` went on after a fault.
+        complete: there is no value, either, where `read` went on after a fault.
     """
-    found = _found.get()
-    before = len(found or ())
-    try:
-        value = read(*map(_value_of, arguments))
-    except InputError as error:
-        if found is None:
+    before, part = len(_collected.get() or ()), Attempt[T]()
+    with recoverable():
+        try:
+            part.result = read(*map(_value_of, arguments))
+        except InputError as error:
+            part.fault = error
             raise
-        _note(found, error)
-        return Attempt(None, error)
-    if whole and found is not None and len(found) > before:
-        return Attempt(None, found[before])
-    return Attempt(value)
+    if complete and (later := (_collected.get() or [])[before:]):
+        part.fault = later[0]
+    return part
 
 
 def _value_of(argument: Any) -> Any:
     if isinstance(argument, list):
         return [_value_of(part) for part in argument]
     return argument.value if isinstance(argument, Attempt) else argument
-
-
-def _note(found: list[InputError], error: InputError) -> None:
-    """Add a fault, unless it is there: parts that need a part without a value raise its fault again."""
-    if not any(error is other for other in found):
-        found.append(error)

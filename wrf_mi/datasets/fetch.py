@@ -38,14 +38,10 @@ MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
 
 
 def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> Path:
-    """Download a known data set atomically, or check an existing copy.
+    """Download a known data set atomically, or check an existing copy; ``base_url`` is that of a mirror.
 
-    Every file, or the arrays of a converted file, must have the published SHA-256.
-
-    Args:
-        name: name of a known data set.
-        base_url: URL of a mirror of the public original.
-        progress: show a progress bar, and the note of the data set, on standard error.
+    Every file, or the arrays of a converted file, must have the published SHA-256. With ``progress`` a bar and the note
+    of the data set are shown on standard error.
 
     Returns:
         The folder of the data set, ``<name>/`` below ``WRF_MI_DATA`` or else in the user's cache.
@@ -119,11 +115,11 @@ class _Bounded(io.FileIO):
 
 
 def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str]) -> None:
-    whole = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+    unbounded = pooch.HTTPDownloader(timeout=TIMEOUT_S)
 
     def bounded(url: str, path: str, store: pooch.Pooch, most: int) -> None:
         with _Bounded(path, most) as file:
-            whole(url, file, store)
+            unbounded(url, file, store)
 
     logger = pooch.get_logger()
     level = logger.level
@@ -140,27 +136,30 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str
             jobs[pool.submit(store.fetch, path, downloader=partial(bounded, most=most))] = path
         try:
             for job in as_completed(jobs):
-                error, url = job.exception(), store.get_url(jobs[job])
-                if isinstance(error, requests.exceptions.HTTPError):
-                    raise InputError(f"data set {name}: {one_line(error)}; try again later or give a mirror") from None
-                if isinstance(error, requests.exceptions.RequestException):
-                    remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
-                    raise InputError(f"data set {name}: {urlsplit(url).netloc} cannot be reached; {remedy}") from None
-                if isinstance(error, _TooLarge):
-                    text = f"{url} is larger than any published file, nothing was kept"
-                    raise InputError(f"data set {name}: {text}; check the mirror") from None
-                if isinstance(error, ValueError):  # raised by pooch for a wrong hash
-                    text = f"{url} has not the published SHA-256, nothing was kept"
-                    raise InputError(f"data set {name}: {text}; try again") from None
-                if isinstance(error, OSError):
-                    text = f"cannot be written ({one_line(error)})"
-                    raise InputError(f"data set {name}: {text}; choose another folder") from None
-                if error is not None:
-                    raise error
+                if (error := job.exception()) is not None:
+                    text = _failure(error, store.get_url(jobs[job]), name)
+                    raise InputError(f"data set {name}: {text}") from None
                 bar.advance(task)
         finally:
             pool.shutdown(cancel_futures=True)
             logger.setLevel(level)
+
+
+def _failure(error: BaseException, url: str, name: str) -> str:
+    """Why a download failed, and the remedy; any other error is raised."""
+    match error:
+        case requests.exceptions.HTTPError():
+            return f"{one_line(error)}; try again later or give a mirror"
+        case requests.exceptions.RequestException():
+            remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
+            return f"{urlsplit(url).netloc} cannot be reached; {remedy}"
+        case _TooLarge():
+            return f"{url} is larger than any published file, nothing was kept; check the mirror"
+        case ValueError():  # raised by pooch for a wrong hash
+            return f"{url} has not the published SHA-256, nothing was kept; try again"
+        case OSError():
+            return f"cannot be written ({one_line(error)}); choose another folder"
+    raise error
 
 
 def _is_intact(path: Path, entry: RemoteFile) -> bool:

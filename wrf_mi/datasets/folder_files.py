@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, text_lines
+from ..core.files import one_line, text_lines, write_csv
 from ..core.types import IntArray
-from .faults import attempt, recoverable, refuse
+from .faults import Attempt, attempt, recoverable, refuse, stop_at_faults
 
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"
@@ -43,15 +43,26 @@ def data_folder(path: str | Path, content: str) -> Path:
     return folder
 
 
+def folder_record(folder: Path, name: str | None, task: str, **parts: Any) -> Record:
+    """The record of a folder from its attributes, values or attempted parts, once all of these have been read.
+
+    Raises:
+        InputError: the first fault of a part.
+    """
+    stop_at_faults()
+    values = {key: part.value if isinstance(part, Attempt) else part for key, part in parts.items()}
+    return Record(name=name or folder.resolve().name, task=task, source=str(folder), **values)
+
+
 def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
     """The only file of a folder with one of some suffixes, or the path itself where it is no folder."""
     if not path.is_dir():
         return path
-    found = sorted(file for file in path.iterdir() if file.suffix in suffixes)
-    if len(found) != 1:
-        names = ", ".join(file.name for file in found) or "none"
+    candidates = sorted(file for file in path.iterdir() if file.suffix in suffixes)
+    if len(candidates) != 1:
+        names = ", ".join(file.name for file in candidates) or "none"
         raise DataFault(path, f"{what} is read at a time, found {names}; give the file itself")
-    return found[0]
+    return candidates[0]
 
 
 def finite_numbers(path: Path, what: str, value: object, count: int) -> FloatArray:
@@ -211,9 +222,9 @@ def read_columns(path: Path, *headers: str) -> FloatArray:
 
 def _read_table(path: Path, headers: tuple[str, ...]) -> CsvTable:
     table = read_csv(path)
-    found = ",".join(table.header)
-    if found.lower() not in headers:
-        raise DataFault(path, f"header is {found[:40]!r}; it must be {' or '.join(headers)}", line=1)
+    header = ",".join(table.header)
+    if header.lower() not in headers:
+        raise DataFault(path, f"header is {header[:40]!r}; it must be {' or '.join(headers)}", line=1)
     return table
 
 
@@ -288,7 +299,7 @@ def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) 
 
 
 def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
-    seen: dict[int, int] = {}
+    line_of_row: dict[int, int] = {}
     lines = text_lines(path)
     for line, text in enumerate(lines, start=1):
         with recoverable():
@@ -296,13 +307,13 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
             if not first <= row < rows + first:
                 known = f"{source} has rows {first} to {rows + first - 1}"
                 raise DataFault(path, f"row {row} is out of range; {known}", line=line)
-            if row in seen:
-                text = f"row {row} stands in line {seen[row]} already; remove one of them"
+            if row in line_of_row:
+                text = f"row {row} stands in line {line_of_row[row]} already; remove one of them"
                 raise DataFault(path, text, line=line)
-            seen[row] = line
+            line_of_row[row] = line
     if not lines:
         raise DataFault(path, "no rows in it; give one row number per line")
-    return np.array(list(seen), np.int64) - first
+    return np.array(list(line_of_row), np.int64) - first
 
 
 def refuse_unstated(path: str | Path, record: Record, *names: str) -> None:
@@ -324,22 +335,13 @@ def write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
-def write_csv(path: Path, columns: Mapping[str, Iterable[Any]]) -> None:
-    """Write columns of texts or numbers to their last digit; NaN, and a count of zero, are empty fields."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            out.writerow(["" if (isinstance(v, np.integer) and not v) or v != v else v for v in row])
-
-
 def write_positions(path: Path, stated: Positions) -> None:
     """Write positions and carriers to the last digit, and runs; `read_positions` reads them."""
     columns: dict[str, list[Any]] = dict(zip(AXES.split(","), stated.positions_m.astype(float).T.tolist(), strict=True))
     for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs)):
         if values is not None:
             columns[name] = values.tolist()
-    write_csv(path, columns)
+    write_csv(path, columns, zip(*columns.values(), strict=True))
 
 
 def write_extra(folder: Path, extra: Mapping[str, str | bytes] | None) -> None:

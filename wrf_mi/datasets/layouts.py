@@ -55,17 +55,16 @@ class Layout:
 
     def reads(self, file: Path) -> bool:
         """Whether a file has the ending and the array of this layout."""
-        return file.suffix in self.suffixes and (not self.array or self.array in array_names(file))
+        if file.suffix not in self.suffixes or not self.array:
+            return file.suffix in self.suffixes
+        try:
+            return self.array in stored_names(file)
+        except (OSError, zipfile.BadZipFile):  # no archive, which the reader of such files says
+            return False
 
 
 BUILT_IN = (
-    Layout(
-        "spectra",
-        "spectrum",
-        read_spectrum_folder,
-        (GATEWAYS,),
-        parts=(IMAGES, POSITIONS, FOLDS),
-    ),
+    Layout("spectra", "spectrum", read_spectrum_folder, (GATEWAYS,), parts=(IMAGES, POSITIONS, FOLDS)),
     Layout("nerf2-ble", "rssi", read_nerf2_ble, (POWERS, BLE_GATEWAYS)),
     Layout("nerf2-csi", "csi", read_nerf2_csi, (CHANNELS, STATION)),
     Layout("ble", "rssi", read_ble_folder, (ANCHORS,), parts=(TRAINING, TEST)),
@@ -91,29 +90,18 @@ def layout_of(path: Path) -> Layout:
     Raises:
         InputError: it has none; the message says what it holds and what is wanted.
     """
-    present = [] if path.is_file() else sorted(path.iterdir())
-    if path.is_file():
-        found = [layout for layout in layouts() if layout.reads(path)]
-    else:
-        found = _by_files(path)
-        found += [layout for layout in layouts() if any(map(layout.reads, present))]
-        found += [layout for layout in layouts() if any((path / file).exists() for file in layout.parts)]
-    if not found:
+    present = [path] if path.is_file() else sorted(path.iterdir())
+    candidates = [] if path.is_file() else _by_files(path)
+    candidates += [layout for layout in layouts() if any(map(layout.reads, present))]
+    candidates += [layout for layout in layouts() if any((path / file).exists() for file in layout.parts)]
+    if not candidates:
         raise unknown_data(path, [folder for folder in present if folder.is_dir() and _by_files(folder)])
-    return found[0]
+    return candidates[0]
 
 
 def _by_files(folder: Path) -> list[Layout]:
     """Layouts of which a folder has a file."""
     return [layout for layout in layouts() if any((folder / file).exists() for file in layout.files)]
-
-
-def array_names(file: Path) -> set[str]:
-    """Names of the arrays in an ``.npz`` file; empty where it is none, whose reader says so."""
-    try:
-        return stored_names(file)
-    except (OSError, zipfile.BadZipFile):
-        return set()
 
 
 def is_data(path: Path) -> bool:

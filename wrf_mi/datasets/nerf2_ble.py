@@ -18,12 +18,13 @@ from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.yaml_files import read_yaml
-from .faults import attempt, refuse, stop_at_faults
+from .faults import attempt, recoverable, refuse
 from .folder_files import (
     POSITIONS,
     CsvTable,
     data_folder,
     finite_numbers,
+    folder_record,
     read_csv,
     read_official,
     shown,
@@ -50,37 +51,38 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
             the row.
     """
     folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
-    found = attempt(read_yaml, folder / GATEWAYS)
-    gateways = attempt(_read_gateways, folder / GATEWAYS, found)
+    info = attempt(read_yaml, folder / GATEWAYS)
+    receivers = attempt(_read_gateways, folder / GATEWAYS, info)
     table = attempt(_headed, folder / POSITIONS)
     positions = attempt(_read_positions, table)
-    power = attempt(_read_powers, folder / POWERS, found)
+    power = attempt(_read_powers, folder / POWERS, info)
     rows = attempt(_count_rows, table)
-    attempt(_check_rows, folder / POWERS, power, rows)
+    with recoverable():
+        if power.value.shape[1] != rows.value:
+            text = f"{power.value.shape[1]} rows, but {POSITIONS} has {rows.value}"
+            raise DataFault(folder / POWERS, f"{text}; give one row of each per transmission")
     official = attempt(read_official, folder, rows, 0)
-    stop_at_faults()
-    return Record(
-        name=name or folder.resolve().name,
-        task="rssi",
-        tx_pos_m=positions.value,
-        receivers=tuple(Receiver(gateway, at, np.array(UPRIGHT)) for gateway, at in gateways.value.items()),
-        observation=power.value,
-        official=official.value,
+    return folder_record(
+        folder,
+        name,
+        "rssi",
+        tx_pos_m=positions,
+        receivers=receivers,
+        observation=power,
+        official=official,
         frequencies_hz=np.array([CARRIER_HZ]),
-        source=str(folder),
     )
 
 
-def _read_gateways(path: Path, found: dict[Any, Any]) -> dict[str, FloatArray]:
-    """Positions [3] of the gateways by their names."""
-    if not found:
+def _read_gateways(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
+    if not info:
         raise DataFault(path, "no gateway in it; give one line NAME: [x, y, z] for each, metres")
-    for key in found:
+    for key in info:
         if not str(key).isprintable():
             text = f"gateway {shown(key)} does not go into one line; call it gateway1, gateway2, ..."
             refuse(DataFault(path, text))
-    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in found.items()}
-    return {key: place.value for key, place in places.items()}
+    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in info.items()}
+    return tuple(Receiver(key, place.value, np.array(UPRIGHT)) for key, place in places.items())
 
 
 def _read_positions(table: CsvTable) -> FloatArray:
@@ -99,16 +101,9 @@ def _count_rows(table: CsvTable) -> int:
     return rows
 
 
-def _check_rows(path: Path, power: NDArray[np.float32], rows: int) -> None:
-    """Refuse another number of powers than of positions."""
-    if power.shape[1] != rows:
-        text = f"{power.shape[1]} rows, but {POSITIONS} has {rows}; give one row of each per transmission"
-        raise DataFault(path, text)
-
-
-def _read_powers(path: Path, found: dict[Any, Any]) -> NDArray[np.float32]:
+def _read_powers(path: Path, info: dict[Any, Any]) -> NDArray[np.float32]:
     """Powers [gateways, rows] in dBm, NaN where nothing was received."""
-    table, gateways = _headed(path), [str(key) for key in found]
+    table, gateways = _headed(path), [str(key) for key in info]
     if len(table.header) != len(gateways):
         text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways; give one column per gateway"
         raise DataFault(path, text, line=1)

@@ -22,7 +22,7 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_array
 from ..core.files import atomic_folder, readable
 from ..core.yaml_files import read_yaml
-from .faults import attempt, refuse, stop_at_faults
+from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import (
     AXES,
     POSITIONS,
@@ -30,6 +30,7 @@ from .folder_files import (
     antenna_entry,
     data_folder,
     fits_single,
+    folder_record,
     numbers_of,
     read_antenna,
     read_columns,
@@ -51,11 +52,8 @@ FEWEST = 2
 def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's channel coefficients (see ``docs/data.md``).
 
-    Args:
-        path: path of the folder.
-        name: name of the record; by default that of the folder.
-        frequencies_hz: frequencies of all subcarriers, uplink and downlink, in Hz, in place of those of
-            ``base-station.yml``.
+    The record has the folder's name unless another is given. ``frequencies_hz`` of all subcarriers, uplink and
+    downlink, replace those of ``base-station.yml``.
 
     Returns:
         A record with ``task="csi"`` and one receiver at the middle of the antennas: ``observation``
@@ -71,28 +69,32 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     n = attempt(_count_samples, folder / CHANNELS, channel)
     info = attempt(read_yaml, station)
     receiver = attempt(_read_station, station, info)
-    attempt(_check_antennas, station, receiver, channel)
+    with recoverable():
+        _check_antennas(station, receiver.value, channel.value)
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
-    stated = attempt(_read_positions, folder / POSITIONS)
-    positions = attempt(_positions, folder / POSITIONS, stated, n)
+    stated = attempt(read_columns, folder / POSITIONS, AXES) if (folder / POSITIONS).exists() else None
+    with recoverable():
+        if stated is not None and len(stated.value) != n.value:
+            text = f"{len(stated.value)} rows, but {CHANNELS} has {n.value} samples; give one for each"
+            raise DataFault(folder / POSITIONS, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(read_official, folder, n, 0, CHANNELS)
     tx_antenna = attempt(read_tx_antenna, station, info)
     stop_at_faults()
     half, hz = channel.value.shape[2] // 2, frequencies.value
-    return Record(
-        name=name or folder.resolve().name,
-        task="csi",
-        tx_pos_m=positions.value,
+    return folder_record(
+        folder,
+        name,
+        "csi",
+        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
-        official=official.value,
+        official=official,
         frequencies_hz=None if hz is None else hz[half:],
         uplink=channel.value[:, :, :half],
         uplink_hz=None if hz is None else hz[:half],
-        truth=truth.value,
-        tx_antenna=tx_antenna.value,
-        source=str(folder),
+        truth=truth,
+        tx_antenna=tx_antenna,
     )
 
 
@@ -101,12 +103,8 @@ def write_nerf2_csi(
 ) -> Path:
     """Write a record atomically in the layout of NeRF2's channel coefficients.
 
-    Args:
-        path: path of the folder.
-        record: record with ``task="csi"``, one receiver, antennas (``array_m``) and an uplink of as many subcarriers as
-            the downlink.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    The record has one receiver with antennas (``array_m``), and an uplink of as many subcarriers as the downlink.
+    ``extra`` is the content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -172,10 +170,10 @@ def _count_samples(path: Path, channel: NDArray[np.complex64]) -> int:
 
 
 def _frequencies(
-    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], given: FloatArray | None
+    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], of_call: FloatArray | None
 ) -> FloatArray | None:
-    """Frequencies of all subcarriers: those given, or else those of ``base-station.yml``, if any."""
-    stated = info.get("frequencies_hz") if given is None else given
+    """Frequencies of all subcarriers: those of the call, or else those of ``base-station.yml``, if any."""
+    stated = info.get("frequencies_hz") if of_call is None else of_call
     if stated is None:
         return None
     frequencies, subcarriers = numbers_of(stated), channel.shape[2]
@@ -185,20 +183,6 @@ def _frequencies(
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
         raise DataFault(path, f"{text}; give one for each, the uplink's first")
     return frequencies
-
-
-def _read_positions(path: Path) -> FloatArray | None:
-    """Positions [rows, 3], None where there is no file."""
-    return read_columns(path, AXES) if path.exists() else None
-
-
-def _positions(path: Path, stated: FloatArray | None, n: int) -> FloatArray:
-    """Positions [n, 3] of all samples, NaN where they are not stated."""
-    if stated is None:
-        return np.full((n, 3), np.nan)
-    if len(stated) != n:
-        raise DataFault(path, f"{len(stated)} rows, but {CHANNELS} has {n} samples; give one for each")
-    return stated
 
 
 def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.complex64] | None:

@@ -49,11 +49,7 @@ PLAIN = (int, float, complex, type(None))
 
 
 def read_newrf(path: str | Path, name: str | None = None) -> Record:
-    """Read and check one room.
-
-    Args:
-        path: path of ``<room>.npz``, or of a folder with such a file.
-        name: name of the record; by default that of the file without its ending.
+    """Read and check one room: ``<room>.npz``, or a folder with such a file, after which the record is named.
 
     Returns:
         A record with ``task="csi"``: ``observation`` [1, n, 1] complex64, ``tx_pos_m`` the file's ``rx_pos``.
@@ -169,9 +165,9 @@ class _Named:
     state: Any
 
     def __new__(cls, *args: Any, **_: Any) -> _Named:
-        made = super().__new__(cls)
-        made.args, made.state = args, None
-        return made
+        inert = super().__new__(cls)
+        inert.args, inert.state = args, None
+        return inert
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -240,8 +236,8 @@ def _names(described: Any) -> list[Any]:
         return list(_array(described))
     kind, count, _, first, buffers, *_ = _named(described.state["_pa_array"], "_restore_array").args[0]
     (alias,) = _arguments(_named(kind, "type_for_alias"), 1)
-    held = (_arguments(_named(buffer, "py_buffer"), 1)[0] for buffer in buffers[1:3])
-    bounds, text = (one.args[0] if _is(one, "bytearray") else one for one in held)
+    contents = (_arguments(_named(buffer, "py_buffer"), 1)[0] for buffer in buffers[1:3])
+    bounds, text = (content.args[0] if _is(content, "bytearray") else content for content in contents)
     at = np.frombuffer(bounds, {"string": "<i4", "large_string": "<i8"}[alias])[first : first + count + 1].tolist()
     if len(at) != count + 1:
         raise ValueError(f"{count} names with {len(at)} bounds")

@@ -25,7 +25,7 @@ def rows_received(record: Record, rows: IntArray) -> IntArray:
 
     Of rows at several carriers the largest number at one of them, as some models are fitted to each carrier alone.
     """
-    received = np.stack([~_states(one, rows)[0] for one in record.observation])
+    received = np.stack([~_states(observed, rows)[0] for observed in record.observation])
     if record.carriers_hz is None or not len(rows):
         return np.asarray(received.sum(axis=1), np.int64)
     carriers = np.unique(record.carriers_hz[rows])
@@ -70,12 +70,9 @@ def warn_of_left_out(record: Record, left_out: Mapping[str, int]) -> None:
 def check_observations(record: Record, split: Split, complete: bool = False) -> None:
     """Refuse training rows that cannot be learned from, and uplinks that nothing can be predicted from.
 
-    Observations of test rows are not checked: those that are not finite are not scored (`scorable`).
-
-    Args:
-        record: record with NaN throughout an observation where the receiver received nothing in that row.
-        split: rows of the record.
-        complete: refuse rows without reception too, for a model that is trained at every receiver on every row.
+    NaN throughout an observation is a row without reception, which is refused only if the data must be ``complete``,
+    for a model that is trained at every receiver on every row. Observations of test rows are not checked: those that
+    are not finite are not scored (`scorable`).
 
     Raises:
         InputError: a receiver without any training row; an observation of a training row that

@@ -18,17 +18,17 @@ FAULT = "fault/"
 
 def main(out: str, *stated: str) -> int:
     """Write the array ``KEY`` of each file, if it is there and holds no objects, or a message why it cannot be read."""
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for each in stated:
         key, _, file = each.partition("=")
         try:
             values = loadmat(file).get(key)
         except Exception as error:  # a dozen kinds on damaged files
-            found[f"{FAULT}{key}"] = np.asarray(f"{error}"[:300])
+            arrays[f"{FAULT}{key}"] = np.asarray(f"{error}"[:300])
             continue
         if values is not None:
-            found[key] = np.asarray(values) if not np.asarray(values).dtype.hasobject else np.asarray("objects")
-    np.savez(Path(out), **found)
+            arrays[key] = np.asarray(values) if not np.asarray(values).dtype.hasobject else np.asarray("objects")
+    np.savez(Path(out), **arrays)
     return 0
 
 

@@ -19,7 +19,7 @@ from ..core.files import readable
 from .folder_files import single_file
 
 VERSION, FORMAT = "record_format", 1
-OPTIONAL = tuple(one.name for one in fields(Record) if one.default is None and one.name != "official")
+OPTIONAL = tuple(field.name for field in fields(Record) if field.default is None and field.name != "official")
 """Attributes of a record that may be None."""
 
 
@@ -53,7 +53,7 @@ def read_record_file(path: str | Path, name: str | None = None) -> Record:
         if (version := int(arrays[VERSION])) != FORMAT:
             raise DataFault(file, f"format {version}, this version reads {FORMAT}; use the version that wrote it")
         official = (arrays["train"], arrays["test"]) if "train" in arrays else None
-        given: dict[str, Any] = {key: arrays[key] for key in OPTIONAL if key in arrays}
+        optional: dict[str, Any] = {key: arrays[key] for key in OPTIONAL if key in arrays}
         record = Record(
             name=name or str(arrays["name"]),
             task=str(arrays["task"]),
@@ -63,7 +63,7 @@ def read_record_file(path: str | Path, name: str | None = None) -> Record:
             official=official,
             tx_antenna=Antenna(*map(str, arrays["tx_antenna"])),
             source=str(file),
-            **given,
+            **optional,
         )
         rows = {len(record.tx_pos_m), record.observation.shape[1]}
     if len(rows) > 1 or len(record.receivers) != len(record.observation):

@@ -32,6 +32,7 @@ from .folder_files import (
     antenna_entry,
     data_folder,
     finite_numbers,
+    folder_record,
     read_antenna,
     read_official,
     read_positions,
@@ -75,34 +76,35 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     folder = data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
     info = attempt(read_yaml, gateways)
-    poses = attempt(_poses, gateways, info, whole=True)
+    poses = attempt(_poses, gateways, info, complete=True)
     array = attempt(_array, gateways, info, "array")
     receivers = attempt(_receivers, gateways, poses, array)
     table = attempt(read_positions, folder / POSITIONS)
     stated = attempt(_frequency, gateways, info)
-    attempt(_one_carrier, folder / POSITIONS, table, stated)
+    with recoverable():
+        if stated.value is not None and table.value.carriers_hz is not None:
+            text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
+            raise DataFault(folder / POSITIONS, text, line=1)
     rows = attempt(lambda read: len(read.positions_m), table)
     observation = attempt(_read_images, folder / IMAGES, poses, rows)
     official = attempt(read_official, folder, rows, 1)
     folds = attempt(parse_folds, folder / FOLDS, rows) if (folder / FOLDS).exists() else None
     tx_antenna = attempt(read_tx_antenna, gateways, info)
     stop_at_faults()
-    stated_rows = table.value
-    record = Record(
-        name=name or folder.resolve().name,
-        task="spectrum",
-        tx_pos_m=stated_rows.positions_m,
-        receivers=receivers.value,
-        observation=observation.value,
-        official=official.value,
-        folds=None if folds is None else folds.value,
-        frequencies_hz=stated.value,
-        tx_antenna=tx_antenna.value,
-        runs=stated_rows.runs,
-        source=str(folder),
+    record = folder_record(
+        folder,
+        name,
+        "spectrum",
+        tx_pos_m=table.value.positions_m,
+        receivers=receivers,
+        observation=observation,
+        official=official,
+        folds=folds,
+        frequencies_hz=stated,
+        tx_antenna=tx_antenna,
+        runs=table.value.runs,
     )
-    carriers = stated_rows.carriers_hz
-    return record if carriers is None else record.at_carriers(carriers)
+    return record if table.value.carriers_hz is None else record.at_carriers(table.value.carriers_hz)
 
 
 def write_spectrum_folder(
@@ -114,12 +116,8 @@ def write_spectrum_folder(
 ) -> Path:
     """Write a record atomically in the NeRF2 spectrum layout.
 
-    Args:
-        path: path of the folder.
-        record: record with ``observation`` [n_rx, n, height, width] in 0..1, which is rounded to grey levels.
-        bits: bits per pixel, 8 or 16.
-        replace: replace an existing folder.
-        extra: content of further files by their paths in the folder.
+    ``observation`` [n_rx, n, height, width] in 0..1 is rounded to grey levels of 8 or 16 ``bits``. ``extra`` is the
+    content of further files by their paths in the folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record holds no spectra in 0..1 or values that the
@@ -127,6 +125,26 @@ def write_spectrum_folder(
     """
     if bits not in (8, 16):
         raise InputError(f"{path}: {bits} bits per pixel; choose 8 or 16")
+    _check_writable(path, record)
+    grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
+    several = len(record.receivers) > 1
+    with atomic_folder(Path(path), replace) as part:
+        for receiver, spectra in zip(record.receivers, grey, strict=True):
+            images = part / IMAGES / receiver.name if several else part / IMAGES
+            images.mkdir(parents=True)
+            for row, image in enumerate(spectra, start=1):
+                Image.fromarray(image).save(images / f"{row:05d}.png")
+        info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
+        (part / GATEWAYS).write_text(info, encoding="utf-8")
+        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
+        write_official(part, record.official, first=1, digits=5)
+        if record.folds is not None:
+            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
+        write_extra(part, extra)
+    return Path(path)
+
+
+def _check_writable(path: str | Path, record: Record) -> None:
     if (
         record.observation.ndim != 4
         or np.iscomplexobj(record.observation)
@@ -140,34 +158,22 @@ def write_spectrum_folder(
         raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
     refuse_runs(path, record)
     refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
-    grey = np.rint(record.observation * (2**bits - 1)).astype(np.uint8 if bits == 8 else np.uint16)
-    with atomic_folder(Path(path), replace) as part:
-        several = len(record.receivers) > 1
-        for receiver, spectra in zip(record.receivers, grey, strict=True):
-            images = part / IMAGES / receiver.name if several else part / IMAGES
-            images.mkdir(parents=True)
-            for row, image in enumerate(spectra, start=1):
-                Image.fromarray(image).save(images / f"{row:05d}.png")
-        content: dict[str, Any] = {"dataset_name": record.name}
-        for rx in record.receivers:
-            entry = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
-            if antenna := antenna_entry(rx.antenna):
-                entry["antenna"] = antenna
-            if rx.array_m is not None:
-                entry["array"] = {"elements_m": rx.array_m.tolist()}
-            content[rx.name] = entry
-        if antenna := antenna_entry(record.tx_antenna):
-            content[TX_ANTENNA] = antenna
-        if record.frequencies_hz is not None:
-            content["frequency_hz"] = float(record.frequencies_hz[0])
-        info = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-        (part / GATEWAYS).write_text(info, encoding="utf-8")
-        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
-        write_official(part, record.official, first=1, digits=5)
-        if record.folds is not None:
-            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
-        write_extra(part, extra)
-    return Path(path)
+
+
+def _gateway_info(record: Record) -> dict[str, Any]:
+    """Content of `GATEWAYS`."""
+    content: dict[str, Any] = {"dataset_name": record.name}
+    for rx in record.receivers:
+        content[rx.name] = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
+        if antenna := antenna_entry(rx.antenna):
+            content[rx.name]["antenna"] = antenna
+        if rx.array_m is not None:
+            content[rx.name]["array"] = {"elements_m": rx.array_m.tolist()}
+    if antenna := antenna_entry(record.tx_antenna):
+        content[TX_ANTENNA] = antenna
+    if record.frequencies_hz is not None:
+        content["frequency_hz"] = float(record.frequencies_hz[0])
+    return content
 
 
 def parse_folds(path: Path, rows: int) -> IntArray:
@@ -189,13 +195,6 @@ def parse_folds(path: Path, rows: int) -> IntArray:
         what = f"fold {missing[0]} has no row" if len(missing) else "there is one fold only"
         raise DataFault(path, f"{what}; number the folds 0, 1, ... without gaps, two at least")
     return folds
-
-
-def _one_carrier(path: Path, table: Positions, stated: FloatArray | None) -> None:
-    """Refuse a carrier for all rows beside one for each row."""
-    if stated is not None and table.carriers_hz is not None:
-        text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
-        raise DataFault(path, text, line=1)
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
@@ -244,8 +243,8 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        found = shown(array if isinstance(array, dict) else str(array))
-        raise DataFault(path, f"{one_line(name)} is {found}; {remedy}")
+        text = f"{one_line(name)} is {shown(array if isinstance(array, dict) else str(array))}"
+        raise DataFault(path, f"{text}; {remedy}")
     return elements
 
 
@@ -262,16 +261,16 @@ def _poses(path: Path, info: dict[Any, Any]) -> dict[str, dict[Any, Any]]:
 
 def _receivers(path: Path, poses: dict[str, dict[Any, Any]], array_m: FloatArray | None) -> tuple[Receiver, ...]:
     """Receivers of the entries; ``array_m`` is the array of those that state none."""
-    found = []
+    receivers = []
     for name, pose in poses.items():
         position = attempt(finite_numbers, path, f"{name}: position", pose.get("position"), 3)
         orientation = attempt(unit_quaternion, path, name, pose.get("orientation"))
         antenna = attempt(read_antenna, path, f"{name}: antenna", pose.get("antenna"))
         array = attempt(_array, path, pose, f"{name}: array")
         with recoverable():
-            own = array.value if "array" in pose else array_m
-            found.append(Receiver(name, position.value, orientation.value, antenna.value, own))
-    return tuple(found)
+            elements_m = array.value if "array" in pose else array_m
+            receivers.append(Receiver(name, position.value, orientation.value, antenna.value, elements_m))
+    return tuple(receivers)
 
 
 def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> NDArray[np.float32]:

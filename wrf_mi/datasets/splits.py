@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -94,34 +93,35 @@ def make_splits(
         raise InputError(f"validation fraction {validation_fraction}: choose one in [0, 1)")
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0")
-    splits = []
-    for label, train, test, held, left in _train_and_test(record, name, seed):
-        what = f"{record.name}, split {label}"
-        for verb, part in (("trains", train), ("scores", test)):
-            if len(part) == 0:
-                raise InputError(f"{what}: no row that was received {verb}; use another split")
-        # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it
-        # is nested in a longer one, validation rows included.
-        order = np.random.default_rng([seed, 1]).permutation(np.sort(train))
-        count = len(order)
-        if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
-            count = int(n_train)
-        elif n_train is not None:
-            count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
-        if not 1 <= count <= len(order):
-            raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
-        order = order[:count]
-        # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
-        counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
-        validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
-        parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(test)
-        pairs = rows_left(record, np.sort(order), held, left, seed)
-        for receiver in held:
-            if (has := int((pairs[:, 0] == receiver).sum())) < left:
-                who = f"{record.name}: {record.receivers[receiver].name} received {has} of the training rows"
-                raise InputError(f"{who}, and split {label} leaves it {left}; leave fewer")
-        splits.append(Split(label, seed, *parts, held, pairs))
-    return splits
+    return [_split(record, rows, seed, n_train, validation_fraction) for rows in _train_and_test(record, name, seed)]
+
+
+def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, validation_fraction: float) -> Split:
+    what = f"{record.name}, split {rows.name}"
+    for verb, part in (("trains", rows.train), ("scores", rows.test)):
+        if len(part) == 0:
+            raise InputError(f"{what}: no row that was received {verb}; use another split")
+    # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it is
+    # nested in a longer one, validation rows included.
+    order = np.random.default_rng([seed, 1]).permutation(np.sort(rows.train))
+    count = len(order)
+    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+        count = int(n_train)
+    elif n_train is not None:
+        count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
+    if not 1 <= count <= len(order):
+        raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
+    order = order[:count]
+    # Validation rows among the first i + 1; rounding keeps 30 * 0.1 from counting as 4.
+    counts = np.ceil(np.round(np.arange(len(order) + 1) * validation_fraction, 9))
+    validates = np.diff(np.concatenate([[0], counts[:-1]])) > 0
+    parts = np.sort(order[~validates]), np.sort(order[validates]), np.sort(rows.test)
+    left = rows_left(record, np.sort(order), rows.held_receivers, rows.left, seed)
+    for receiver in rows.held_receivers:
+        if (count_left := int((left[:, 0] == receiver).sum())) < rows.left:
+            who = f"{record.name}: {record.receivers[receiver].name} received {count_left} of the training rows"
+            raise InputError(f"{who}, and split {rows.name} leaves it {rows.left}; leave fewer")
+    return Split(rows.name, seed, *parts, rows.held_receivers, left)
 
 
 def splits_below(record: Record, name: str) -> tuple[str, ...]:
@@ -133,12 +133,12 @@ def splits_below(record: Record, name: str) -> tuple[str, ...]:
 def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: int, seed: int) -> IntArray:
     """Pairs [q, 2] of each of some receivers and up to ``count`` of the ``rows`` that it received, a seeded draw."""
     received = np.asarray(np.isfinite(record.observation[:, rows]).reshape(len(record.receivers), len(rows), -1).all(2))
-    found = [np.zeros((0, 2), np.int64)]
+    pairs = [np.zeros((0, 2), np.int64)]
     for receiver in receivers:
         order = np.random.default_rng([seed, 7, receiver]).permutation(rows[received[receiver]])
         chosen = np.sort(order[:count])
-        found.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
-    return np.concatenate(found)
+        pairs.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
+    return np.concatenate(pairs)
 
 
 def save_split(path: str | Path, split: Split) -> None:
@@ -165,7 +165,7 @@ def load_split(path: str | Path) -> Split:
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
         arrays = stored_arrays(Path(path))
         content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
-    held = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
+    held_receivers = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
     left = arrays.get("left", np.zeros((0, 2), np.int64))
     if content["format"] != SPLIT_FORMAT:
         raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
@@ -176,10 +176,11 @@ def load_split(path: str | Path) -> Split:
         raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
     if len(np.unique(rows)) != len(rows):
         raise InputError(f"{path}: a row is in the split twice; make the split again")
-    train, validation, test = (part.astype(np.int64) for part in parts)
-    if not (np.isin(left[:, 0], held).all() and np.isin(left[:, 1], np.concatenate([train, validation])).all()):
+    train, validation, test, left = (part.astype(np.int64) for part in (*parts, left))
+    split = Split(str(content["name"]), int(content["seed"]), train, validation, test, held_receivers, left)
+    if not (np.isin(left[:, 0], held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
         raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
-    return Split(str(content["name"]), int(content["seed"]), train, validation, test, held, left.astype(np.int64))
+    return split
 
 
 def position_folds(record: Record) -> IntArray:
@@ -196,6 +197,7 @@ def position_folds(record: Record) -> IntArray:
     distinct = len(np.unique(record.tx_pos_m, axis=0))
     if distinct < FOLDS:
         raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")
+    # k-means ends in a local optimum that depends on its start, and may leave a cluster empty ("raise").
     best, folds = np.inf, None
     for attempt in range(CLUSTER_STARTS):
         try:
@@ -225,8 +227,8 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
     received = np.asarray(~missing.all(axis=(0, 2)))
     rows = np.flatnonzero(received)
-    whole, colon, _ = name.partition(":")
-    kind, plus, left = whole.partition("+")
+    rule, colon, _ = name.partition(":")
+    kind, plus, left = rule.partition("+")
     leaves = kind == "receiver" and left.isascii() and left.isdecimal() and int(left) > 0
     if kind not in SPLIT_NAMES or (colon and kind not in FOLDED) or (plus and not leaves):
         known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
@@ -239,13 +241,15 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
     if kind == "receiver":
         return _receivers_held_out(record, name, seed, int(left or 0))
     if kind in FOLDED:
-        found = {"blocked": position_folds, "other-run": _run_numbers}.get(kind, partial(_carrier_numbers, kind=kind))
-        of_row = found(record)[rows]
-        by_carrier = kind.startswith("frequency")
-        held = _held_out_positions(record, seed)[rows] if by_carrier else np.ones(len(rows), bool)
-        trains = np.ones(len(rows), bool) if kind != "frequency" else ~held
-        chosen = _folds(record, name, int(of_row.max(initial=0)) + 1)
-        return [_Rows(f"{kind}:{k}", rows[(of_row != k) & trains], rows[(of_row == k) & held]) for k in chosen]
+        if kind.startswith("frequency"):
+            fold, tested = _carrier_numbers(record, kind)[rows], _held_out_positions(record, seed)[rows]
+        else:
+            fold = (position_folds if kind == "blocked" else _run_numbers)(record)[rows]
+            tested = np.ones(len(rows), bool)
+        # Held-out positions are new to the model: with "frequency-known" they are known at the other carriers.
+        trains = ~tested if kind == "frequency" else np.ones(len(rows), bool)
+        chosen = _folds(record, name, int(fold.max(initial=0)) + 1)
+        return [_Rows(f"{kind}:{k}", rows[(fold != k) & trains], rows[(fold == k) & tested]) for k in chosen]
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
@@ -280,11 +284,11 @@ def _held_out_positions(record: Record, seed: int) -> NDArray[np.bool_]:
     distinct, number = np.unique(record.tx_pos_m, axis=0, return_inverse=True)
     number = number.reshape(-1)
     if record.official is not None:
-        held = np.unique(number[record.official[1]])
+        held_out = np.unique(number[record.official[1]])
     else:
         order = np.random.default_rng([seed, 2]).permutation(len(distinct))
-        held = order[round(TRAIN_FRACTION * len(distinct)) :]
-    return np.isin(number, held)
+        held_out = order[round(TRAIN_FRACTION * len(distinct)) :]
+    return np.isin(number, held_out)
 
 
 def _folds(record: Record, name: str, count: int) -> range:
@@ -303,18 +307,19 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
     if count < 2:
         raise InputError(f"{record.name}: one receiver, and split receiver holds receivers out; use another split")
     order = np.arange(count)
+    # Each fold is a fit of its own: many receivers are held out by the group.
     if count > MOST_RECEIVERS:
         order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
     (rows,) = (only for below in splits_below(record, name) for only in _train_and_test(record, below, seed))
     received = np.asarray(np.isfinite(record.observation).reshape(count, len(record), -1).all(axis=2), bool)
-    found = []
+    splits = []
     for k in _folds(record, name, int(order.max()) + 1):
-        held = np.asarray(order == k)
+        held_out = np.asarray(order == k)
         train, test = (
-            part[received[who][:, part].any(axis=0)] for who, part in ((~held, rows.train), (held, rows.test))
+            part[received[who][:, part].any(axis=0)] for who, part in ((~held_out, rows.train), (held_out, rows.test))
         )
         # A receiver without test rows cannot be scored; the others can.
         if len(test) or ":" in name:
             label = f"{name.partition(':')[0]}:{k}"
-            found.append(_Rows(label, train, test, tuple(np.flatnonzero(held).tolist()), left))
-    return found
+            splits.append(_Rows(label, train, test, tuple(np.flatnonzero(held_out).tolist()), left))
+    return splits

@@ -13,8 +13,8 @@ from scipy.constants import speed_of_light
 from ..core import InputError, Paths, Receiver
 from ..core.angles import FloatArray, azimuth_elevation, unit_vectors
 from ..core.antenna import UPRIGHT
-from ..core.files import atomic_file
-from ..datasets.folder_files import CsvTable, read_csv, write_csv
+from ..core.files import write_csv
+from ..datasets.folder_files import CsvTable, read_csv
 from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
 from ..tracing.options import stated_kinds, without_effect
 from .format import ExportOptions
@@ -88,8 +88,8 @@ def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     traced = _traced(source, options)
     if not len(traced.paths):
         raise InputError(f"{source.name}: no path from {traced.paths.n_tx} transmitters; nothing to write")
-    with atomic_file(out) as part:
-        write_csv(part, path_columns(traced))
+    columns = path_columns(traced)
+    write_csv(out, columns, zip(*columns.values(), strict=True))
     return {"paths": len(traced.paths), "transmitters": traced.paths.n_tx, "receivers": traced.paths.n_rx}
 
 

@@ -17,6 +17,7 @@ from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Spl
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.settings import settings_from, with_settings
+from ..core.types import Inputs as Inputs
 from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..receivers.spreads import PathStatistics
@@ -26,46 +27,11 @@ Kind = TypeVar("Kind")
 Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
 UNUSED_UPLINK = "its model does not predict from the uplink; omit uplink"
-PER_ROW = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz")
-"""Attributes that `Inputs` and `wrf_mi.core.Record` share."""
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Known quantities of m rows to predict; never their observations.
-
-    Attributes:
-        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
-        tx_heading_rad: headings of the transmitter [m], or None.
-        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
-        first_row: number of the first row, for messages.
-        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
-    """
-
-    tx_pos_m: FloatArray
-    tx_heading_rad: FloatArray | None = None
-    uplink: NDArray[Any] | None = None
-    first_row: int = 0
-    carriers_hz: FloatArray | None = None
-
-    def __len__(self) -> int:
-        """Number of rows."""
-        return len(self.tx_pos_m)
-
-    def rows(self, chosen: slice | IntArray) -> Inputs:
-        """Inputs of some rows; ``first_row`` of an array is that of all rows."""
-        start = (chosen.start or 0) if isinstance(chosen, slice) else 0
-        return Inputs(**_chosen(self, chosen), first_row=self.first_row + start)
 
 
 def inputs_of(record: Record, rows: IntArray) -> Inputs:
     """Inputs of some rows of a record."""
-    return Inputs(**_chosen(record, rows))
-
-
-def _chosen(source: Inputs | Record, rows: slice | IntArray) -> dict[str, Any]:
-    every = {name: getattr(source, name) for name in PER_ROW}
-    return {name: None if values is None else values[rows] for name, values in every.items()}
+    return record.inputs(rows)
 
 
 @dataclass

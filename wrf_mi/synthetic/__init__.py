@@ -12,12 +12,10 @@ from .floor_channels import PLACES, PREFIX, walked_channels
 from .floor_receivers import CHANNELS as FLOOR_CHANNELS
 from .floor_receivers import NAME as FLOOR_STRENGTHS
 from .floor_receivers import traced_floor_channels, traced_floor_strengths
+from .furnished_room import BANDS, traced_room, traced_room_bands
 from .furnished_room import NAME as ROOM
-from .furnished_room import traced_room
 from .laboratory import NAME as LABORATORY
 from .laboratory import laboratory_record
-from .room_bands import NAME as BANDS
-from .room_bands import traced_room_bands
 
 __all__ = [
     "laboratory_record",

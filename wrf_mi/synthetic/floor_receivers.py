@@ -8,7 +8,7 @@ reflections nor diffuse scattering reach.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,10 @@ from scipy.spatial import cKDTree
 from wrf_mi_scenes import floor_plans
 from wrf_mi_scenes.floor_plans import FloorPlan
 
-from ..core import Paths, Receiver, Record
+from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from ..core.paths import ARRAYS
 from ..datasets import read_ble_folder, read_deepmimo, write_ble_folder
 from ..datasets.ble_folder import CARRIER_HZ
 from ..datasets.deepmimo import CHANNEL_PARAMS
@@ -41,22 +42,9 @@ CHANNELS = f"{NAME}-csi"
 FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 CANDIDATES = 1000
 """Free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2."""
-SCANNER_M = tuple(
-    (x, y, 1.5)
-    for x, y in (
-        (1.6, 2.7),
-        (5.4, 4.85),
-        (8.2, 0.8),
-        (11.5, 3.0),
-        (14.5, 4.8),
-        (3.65, 6.2),
-        (14.5, 6.2),
-        (1.6, 7.7),
-        (6.2, 7.7),
-        (10.6, 7.7),
-        (15.0, 7.7),
-    )
-)
+SCANNER_X_M = (1.6, 5.4, 8.2, 11.5, 14.5, 3.65, 14.5, 1.6, 6.2, 10.6, 15.0)
+SCANNER_Y_M = (2.7, 4.85, 0.8, 3.0, 4.8, 6.2, 6.2, 7.7, 7.7, 7.7, 7.7)
+SCANNER_M = tuple((x, y, 1.5) for x, y in zip(SCANNER_X_M, SCANNER_Y_M, strict=True))
 """Positions of the LiDAR, metres: five in the open plan, two in the corridor, one in each room."""
 
 
@@ -154,10 +142,7 @@ def _made(
     write: Callable[[Path, TraceResult, Files], None],
     read: Callable[[Path, str], Record],
 ) -> Record:
-    """The record of a folder, after tracing and writing it unless it is there.
-
-    ``write`` takes the folder, the trace and further files, of which the parameters come last.
-    """
+    """As `made_on_floor`; ``write`` takes the folder, the trace and further files, the parameters last."""
     plan = floor_plans.office()
 
     def write_traced(folder: Path, scene_folder: Path, extra: Files) -> None:
@@ -186,10 +171,10 @@ def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[t
     bounds, rng = scene.mi_scene.bbox(), np.random.default_rng([floor.seed, 0])
     (x0, y0), (x1, y1) = ([corner.x, corner.y] for corner in (bounds.min, bounds.max))
 
-    def free(low_m: float, high_m: float, count: int, *apart: Any) -> FloatArray:
+    def free(low_m: float, high_m: float, count: int, apart: tuple[FloatArray, float] | None = None) -> FloatArray:
         """Free positions, twice as many as needed, but for those within a body."""
-        box = np.array([x0, y0, low_m]), np.array([x1, y1, high_m])
-        drawn = free_positions(scene, *box, 2 * count, floor.clear_m, rng, floor.seed, *apart)
+        box_m = np.array([[x0, y0, low_m], [x1, y1, high_m]])
+        drawn = free_positions(scene, box_m, 2 * count, floor.clear_m, rng, floor.seed, apart)
         # Large bodies, such as the core, count as rooms there.
         closed = [mesh.triangles for _, mesh in plan.parts.values() if mesh.is_watertight]
         inside = np.any([winding_number(triangles, drawn) > 0.5 for triangles in closed], axis=0)
@@ -202,7 +187,7 @@ def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[t
     receivers_m = places[cKDTree(places[:, :2]).query(wanted)[1]]
     receivers = tuple(Receiver(f"anchor{k}", place, np.array(UPRIGHT)) for k, place in enumerate(receivers_m, start=1))
     count = floor.train + floor.test
-    return receivers, free(floor.low_m, floor.high_m, count, receivers_m, floor.from_receiver_m)
+    return receivers, free(floor.low_m, floor.high_m, count, (receivers_m, floor.from_receiver_m))
 
 
 def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:
@@ -213,8 +198,7 @@ def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:
         return np.concatenate([getattr(part, name) for part in of])
 
     order = np.lexsort([rows(parts, name) for name in ("length_m", "tx", "rx")])
-    names = [field.name for field in fields(Paths) if field.name not in ("object_names", "n_tx", "n_rx")]
-    arrays: dict[str, Any] = {name: rows(parts, name)[order] for name in names}
+    arrays: dict[str, Any] = {name: rows(parts, name)[order] for name in ARRAYS}
     primitives, probability = (rows(traces, name)[order] for name in ("primitives", "probability"))
     return replace(scattered, paths=replace(parts[0], **arrays), primitives=primitives, probability=probability)
 

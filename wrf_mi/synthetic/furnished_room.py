@@ -1,35 +1,47 @@
-"""The traced room: spectra of transmitters anywhere in a furnished room, and its bare walls as input of models.
+"""The furnished room: spectra of transmitters anywhere in it, at one carrier or at several, and its bare walls.
 
-``docs/data.md`` describes both. The furniture is `wrf_mi_scenes.furnished`, layout and array are those of the
-laboratory (`wrf_mi.synthetic.laboratory`). Transmitters stand anywhere in the room's free volume between 0.5 and 2 m
-height, including the space behind the array and the inner room.
+``docs/data.md`` describes both data sets. The furniture is `wrf_mi_scenes.furnished`. Transmitters stand anywhere in
+the room's free volume between 0.5 and 2 m height, including the space behind the array and the inner room. The walls
+are input of models. ``traced-room`` has layout and array of the laboratory (`wrf_mi.synthetic.laboratory`),
+``traced-room-bands`` two arrays of 8 x 8 elements, on the ceiling and on a wall.
+
+For several carriers paths are searched for once, at ``searched_at_hz``, and evaluated at every carrier with its
+materials. Specular paths do not depend on the carrier of the search. Sionna RT draws paths with scattering or
+diffraction by the reflection coefficients at the carrier of the search; scattered fields are divided by the
+probabilities of the draw, so that their power at another carrier has the same expectation as by a search there, and all
+carriers have the same patches of rough wall. Which paths with both diffraction and reflections are found depends on the
+draw, at any carrier.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from wrf_mi_scenes.build_laboratory import LENGTH, WIDTH
 from wrf_mi_scenes.furnished import furnished_parts, measured_parts
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
-from ..core import Record
+from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import read_spectrum_folder, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum
+from ..receivers.channel import array_channels
 from ..receivers.reports import minmax_scale
+from ..tracing.options import TraceOptions
+from ..tracing.paths.result import recompute
 from ..tracing.sionna.scenes import open_scene
 from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, SCANNER_M, SPACING_M
-from .searches import Searches, free_positions, trace_channels
+from .searches import Searches, free_positions, searched_paths, set_scattering
 from .stored import Files, scan_file, scene_files, stored
 
-NAME = "traced-room"
+NAME, BANDS = "traced-room", "traced-room-bands"
 MEASURED = "room"  # folder beside the spectra with the measured scene, the input of models
 FORMAT = 3  # version of the files, to be raised when they change for equal parameters
 
@@ -56,7 +68,40 @@ class TracedRoom(Searches):
     scattered_rays: int = 1 << 12
 
 
-DEFAULT = TracedRoom()
+@dataclass(frozen=True)
+class RoomBands(TracedRoom):
+    """Parameters of the furnished room at several carriers.
+
+    Further parameters are those of `TracedRoom`.
+
+    Attributes:
+        train, test: numbers of training and test positions, each with a row for every carrier.
+        carriers_hz: carriers, Hz.
+        searched_at_hz: carrier of the search for paths, Hz.
+        rows, columns, spacing_m: numbers of elements of both arrays, and distance of neighbours, metres: below half a
+            wavelength at the highest carrier.
+        height, width: pixels of a spectrum: 2 degrees, a sixth of the narrowest beam.
+    """
+
+    train: int = 240
+    test: int = 60
+    carriers_hz: tuple[float, ...] = (0.9e9, 1.8e9, 2.4e9, 3.5e9, 5.8e9)
+    searched_at_hz: float = 2.4e9
+    rows: int = 8
+    columns: int = 8
+    spacing_m: float = 0.025
+    height: int = 45
+    width: int = 180
+
+
+DEFAULT, DEFAULT_BANDS = TracedRoom(), RoomBands()
+RECEIVERS = (
+    # Array's x = x of the world, y = -y, boresight z = -z: straight down.
+    Receiver("ceiling", np.array([3.6, 3.4, 2.9]), np.array([1.0, 0.0, 0.0, 0.0])),
+    # Array's x = -y of the world, y = up, boresight z = -x: from the east wall into the room.
+    Receiver("wall", np.array([8.9, 3.5, 1.8]), np.array([0.5, -0.5, -0.5, 0.5])),
+)
+"""Poses of the arrays, 0.1 m before ceiling and wall."""
 OPAQUE = "itu_metal"
 """Material of the edges that diffract. Sionna RT treats every sheet as opaque at its edges, and so overestimates the
 diffraction of thin boards, through which most of the wave passes."""
@@ -75,7 +120,45 @@ def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, pr
         progress: show progress bars on standard error.
     """
     facts = {"frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
-    return made_in_room(folder, NAME, facts, room, lambda scene_folder: _trace(scene_folder, room, progress))
+
+    def trace(scene_folder: Path) -> Record:
+        scene, receiver = (
+            open_scene(scene_folder, FREQUENCY_HZ),
+            replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),
+        )
+        return _spectra(NAME, room, (receiver,), scene, {FREQUENCY_HZ: scene}, (90, 360), progress)
+
+    return made_in_room(folder, NAME, facts, room, trace)
+
+
+def traced_room_bands(
+    folder: str | Path | None = None, bands: RoomBands = DEFAULT_BANDS, progress: bool = False
+) -> Record:
+    """Spectra of the furnished room at several carriers: read from an earlier call, or traced now and stored.
+
+    Rows are ordered by position, then by carrier. The official split holds out the last ``test`` positions with all
+    their rows; positions are drawn independently. The folder holds the measured room and a simulated LiDAR scan, as
+    that of `wrf_mi.synthetic.traced_room`.
+
+    Args:
+        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room-bands/`` below ``WRF_MI_DATA`` if
+            it exists, else in the user's cache.
+        bands: parameters.
+        progress: show progress bars on standard error.
+
+    Returns:
+        A record with ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1.
+    """
+    poses = {rx.name: [*rx.position_m.tolist(), *rx.orientation_xyzw.tolist()] for rx in RECEIVERS}
+
+    def trace(scene_folder: Path) -> Record:
+        scenes = {hz: open_scene(scene_folder, hz) for hz in bands.carriers_hz}
+        searched_at = open_scene(scene_folder, bands.searched_at_hz)
+        array_m = planar_array(bands.rows, bands.columns, bands.spacing_m)
+        receivers = tuple(replace(receiver, array_m=array_m) for receiver in RECEIVERS)
+        return _spectra(BANDS, bands, receivers, searched_at, scenes, (bands.height, bands.width), progress)
+
+    return made_in_room(folder, BANDS, {"receivers": poses}, bands, trace)
 
 
 def made_in_room(
@@ -83,12 +166,8 @@ def made_in_room(
 ) -> Record:
     """Spectra of the furnished room: read from a folder, or traced and stored with a scan and the measured room.
 
-    Args:
-        folder: folder of the spectra in the NeRF2 layout, see `wrf_mi.synthetic.stored.stored`.
-        name: name of the record.
-        facts: parameters of the data beside those of the room.
-        room: parameters of the room.
-        trace: function of the true scene's folder that traces the record.
+    As `wrf_mi.synthetic.stored.stored`; ``facts`` are parameters of the data beside those of the room, ``trace`` makes
+    the record, of the folder of the true scene.
     """
 
     def write(folder: Path, recipe: Files) -> None:
@@ -106,10 +185,9 @@ def transmitters(scene: Any, room: TracedRoom, stations_m: FloatArray = RECEIVER
 
     They keep the distance ``from_array_m`` from ``stations_m`` [3] or [k, 3].
     """
-    low, high = np.array([0, 0, room.low_m]), np.array([LENGTH, WIDTH, room.high_m])
-    rng = np.random.default_rng([room.seed, 0])
-    apart = room.seed, stations_m, room.from_array_m
-    return free_positions(scene, low, high, room.train + room.test, room.clear_m, rng, *apart)
+    box_m = np.array([[0, 0, room.low_m], [LENGTH, WIDTH, room.high_m]])
+    rng, apart = np.random.default_rng([room.seed, 0]), (stations_m, room.from_array_m)
+    return free_positions(scene, box_m, room.train + room.test, room.clear_m, rng, room.seed, apart)
 
 
 def opaque_parts() -> list[str]:
@@ -117,21 +195,58 @@ def opaque_parts() -> list[str]:
     return [name for name, (material, _) in furnished_parts().items() if material == OPAQUE]
 
 
-def _trace(scene_folder: Path, room: TracedRoom, progress: bool) -> Record:
-    scene, array_m = open_scene(scene_folder, FREQUENCY_HZ), planar_array(4, 4, SPACING_M)
-    receiver, frequency_hz = replace(RECEIVER, array_m=array_m), np.array([FREQUENCY_HZ])
-    positions = transmitters(scene, room)
-    how = room.options(diffraction=True), opaque_parts()
-    text = "tracing the furnished room" if progress else None
-    signals = trace_channels(scene, receiver, positions, frequency_hz, *how, progress=text)[..., 0]
-    spectra = [minmax_scale(bartlett_spectrum(signal, array_m, FREQUENCY_HZ, 90, 360)) for signal in signals]
-    rows = np.arange(len(positions))
-    return Record(
-        name=NAME,
+def channels_at_carriers(
+    scenes: Sequence[Any],
+    receiver: Receiver,
+    positions: FloatArray,
+    searched_at: Any,
+    options: Sequence[TraceOptions],
+    opaque: Sequence[str] = (),
+    progress: str | None = None,
+) -> NDArray[np.complex128]:
+    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, at the carriers of f scenes.
+
+    Paths are those of `wrf_mi.synthetic.searches.searched_paths` in the scene ``searched_at``, which may be one of
+    ``scenes``.
+    """
+    assert receiver.array_m is not None
+    channel = np.zeros((len(positions), len(receiver.array_m), len(scenes)), complex)
+    for scene in scenes:
+        set_scattering(scene, options[0].scattering_coefficient)
+    for rows, traced in searched_paths(searched_at, receiver, positions, options, opaque, progress=progress):
+        for number, scene in enumerate(scenes):
+            paths = (traced if scene is searched_at else recompute(traced, scene)).paths
+            channel[rows, :, number] += array_channels(paths, receiver, receiver.array_m, scene.frequency)[..., 0]
+    return channel
+
+
+def _spectra(
+    name: str,
+    room: TracedRoom,
+    receivers: tuple[Receiver, ...],
+    searched_at: Any,
+    scenes: Mapping[float, Any],
+    size: tuple[int, int],
+    progress: bool,
+) -> Record:
+    """Spectra of ``size`` (height, width); ``scenes`` by their carriers, Hz; rows by position, then by carrier."""
+    positions = transmitters(searched_at, room, np.stack([receiver.position_m for receiver in receivers]))
+    how = positions, searched_at, room.options(diffraction=True), opaque_parts()
+    spectra = np.empty((len(receivers), len(positions), len(scenes), *size), np.float32)
+    for index, receiver in enumerate(receivers):
+        assert receiver.array_m is not None
+        text = "tracing the furnished room" + (f" to the {receiver.name}" if len(receivers) > 1 else "")
+        signals = channels_at_carriers([*scenes.values()], receiver, *how, progress=text if progress else None)
+        for number, hz in enumerate(scenes):
+            for row, signal in enumerate(signals[..., number]):
+                spectra[index, row, number] = minmax_scale(bartlett_spectrum(signal, receiver.array_m, hz, *size))
+    first_test, rows = room.train * len(scenes), np.arange(len(positions) * len(scenes))
+    record = Record(
+        name=name,
         task="spectrum",
-        tx_pos_m=positions,
-        receivers=(receiver,),
-        observation=np.asarray(spectra, np.float32)[None],
-        official=(rows[: room.train], rows[room.train :]),
-        frequencies_hz=frequency_hz,
+        tx_pos_m=np.repeat(positions, len(scenes), axis=0),
+        receivers=receivers,
+        observation=spectra.reshape(len(receivers), len(rows), *size),
+        official=(rows[:first_test], rows[first_test:]),
     )
+    return record.at_carriers(np.tile([*scenes], len(positions)))

@@ -62,42 +62,34 @@ class Searches:
 
 def free_positions(
     scene: Any,
-    low_m: FloatArray,
-    high_m: FloatArray,
+    box_m: FloatArray,
     count: int,
     clear_m: float,
     rng: np.random.Generator,
     seed: int,
-    station_m: FloatArray | None = None,
-    from_station_m: float = 0.0,
+    apart: tuple[FloatArray, float] | None = None,
 ) -> FloatArray:
-    """Positions [count, 3] in metres, uniform over the free part of a box, to 0.1 mm.
+    """Positions [count, 3] in metres, uniform over the free part of a box in a ``sionna.rt.Scene``, to 0.1 mm.
 
-    Args:
-        scene: a ``sionna.rt.Scene``.
-        low_m: lower corner of the box [3], metres.
-        high_m: upper corner, likewise.
-        count: number of positions.
-        clear_m: least distance from surfaces, metres.
-        rng: generator of the positions.
-        seed: seed of the points by which distances from surfaces are judged.
-        station_m: position [3], or positions [k, 3], to keep away from, metres; None: none.
-        from_station_m: least distance from these, metres.
+    ``box_m`` [2, 3] are its lower and upper corner. Positions are more than ``clear_m`` away from surfaces, judged by
+    points on these that are drawn with ``seed``, and lie ``apart`` from other positions, [3] or [k, 3], by more than a
+    distance; all in metres.
     """
     surfaces = scene_surfaces(scene)
     mesh = trimesh.Trimesh(surfaces.triangles.reshape(-1, 3), np.arange(3 * len(surfaces.triangles)).reshape(-1, 3))
     # A point every 2 cm or so: much less than the clearance.
     tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 4e-4), seed=seed)[0])
-    found = np.zeros((0, 3))
-    while len(found) < count:
-        drawn = np.round(rng.uniform(low_m, high_m, (count, 3)), 4)
+    # Rejection: draws are uniform over the box, so those that stay are uniform over its free part.
+    positions = np.zeros((0, 3))
+    while len(positions) < count:
+        drawn = np.round(rng.uniform(box_m[0], box_m[1], (count, 3)), 4)
         free = tree.query(drawn)[0] > clear_m
-        if station_m is not None:
-            apart = np.linalg.norm(drawn[:, None] - np.atleast_2d(station_m), axis=-1)
-            free &= apart.min(axis=1) > from_station_m
+        if apart is not None:
+            others_m, distance_m = apart
+            free &= np.linalg.norm(drawn[:, None] - np.atleast_2d(others_m), axis=-1).min(axis=1) > distance_m
         free &= solid_around(surfaces, drawn) < 0
-        found = np.concatenate([found, drawn[free]])
-    return found[:count]
+        positions = np.concatenate([positions, drawn[free]])
+    return positions[:count]
 
 
 def trace_channels(
@@ -107,6 +99,7 @@ def trace_channels(
     frequencies_hz: FloatArray,
     options: Sequence[TraceOptions],
     opaque: Sequence[str] = (),
+    *,
     chunk_size: int = CHUNK_SIZE,
     progress: str | None = None,
 ) -> NDArray[np.complex128]:
@@ -148,11 +141,11 @@ def searched_paths(
                 # With diffraction Sionna RT searches from transmitters, so the array is the transmitter.
                 traced = trace_paths(scene, receiver.position_m, ends, search, search_from="transmitters")
                 paths = traced.paths
-                kept = (paths.interactions == SCATTERING).any(axis=1)
+                counted = (paths.interactions == SCATTERING).any(axis=1)
                 if not search.scattering:
                     names = np.array([paths.object_names.index(name) for name in opaque if name in paths.object_names])
-                    kept = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
-                yield slice(start, start + len(part)), traced.select(kept)
+                    counted = ~((paths.interactions == DIFFRACTION) & ~np.isin(paths.objects, names)).any(axis=1)
+                yield slice(start, start + len(part)), traced.select(counted)
 
 
 def set_scattering(scene: Any, coefficient: float) -> None:

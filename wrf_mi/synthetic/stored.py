@@ -50,9 +50,9 @@ def stored(
         read: reads the data, of a folder and a name.
     """
     if folder is None:
-        found = locate(name)
-        if found is not None and found.parent != user_cache():
-            return replace(load(found), name=name)
+        location = locate(name)
+        if location is not None and location.parent != user_cache():
+            return replace(load(location), name=name)
         folder = user_cache() / name
     folder = Path(folder)
     recipe = yaml.safe_dump({**facts, "sionna_rt": version("sionna-rt")}, sort_keys=False)

@@ -20,13 +20,10 @@ from . import instrument_of, task_of
 
 
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
-    """Uplink channels as features, and the complex divisor of each.
+    """Uplink channels [m, antennas, subcarriers] as features, and the complex divisor of each.
 
     Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, which
     removes the radios' amplitude and phase, equal in both links.
-
-    Args:
-        uplink: [m, antennas, subcarriers], complex and finite.
 
     Returns:
         Real parts, then imaginary ones, of each row's antennas one after the other, [m * antennas, 2 subcarriers], and
@@ -42,7 +39,7 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
         raise InputError(f"uplink of row {row}, antenna {antenna} is zero or not finite; leave that row out")
     mean = h.mean(axis=-1)
     size = np.abs(mean)
-    turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)
+    turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)  # no phase to remove where the mean is zero
     divisor = rms * turn
     flat = (h / divisor[..., None]).reshape(-1, h.shape[-1])
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32), divisor
@@ -149,11 +146,7 @@ def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> Flo
 
 
 def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
-    """The uplink of rows to predict.
-
-    Raises:
-        InputError: it is None.
-    """
+    """The uplink of rows to predict; an `InputError` if it is None."""
     if uplink is None:
         raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
     return uplink
@@ -164,7 +157,7 @@ def channel_scales(record: Record, rows: IntArray) -> FloatArray:
     task = task_of(record)
     if not task.is_complex:
         return np.ones(len(record.receivers))
-    return np.array([task.unit(seen[rows]) for seen in record.observation])
+    return np.array([task.unit(observed[rows]) for observed in record.observation])
 
 
 def truth_of(
@@ -175,15 +168,15 @@ def truth_of(
     Greys [n, pixels]; powers [n, 1] in dBm; channels, real parts and then imaginary ones, [n, 2 outputs] in units of
     the receiver's ``scales``, or [n * antennas, 2 outputs] divided as in `normalised_uplink`.
     """
-    seen = record.observation[receiver, rows]
+    observed = record.observation[receiver, rows]
     if not task_of(record).is_complex:
-        return np.asarray(seen, np.float32).reshape(len(rows), -1)
+        return np.asarray(observed, np.float32).reshape(len(rows), -1)
     if outputs.by_uplink:
         assert record.uplink is not None
         divisor = normalised_uplink(record.uplink[rows])[1]
-        channel = seen.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
+        channel = observed.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
     else:
-        channel = seen / scales[receiver]
+        channel = observed / scales[receiver]
     flat = channel.reshape(-1, outputs.count)
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
 

@@ -11,8 +11,7 @@ from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray, solid_angles
 from ..receivers.instruments import ChannelInstrument, PowerInstrument, SpectrumInstrument
 from .levels import level_of_amplitudes
-from .mixtures import MixtureScores, ssim_mixtures
-from .scores import abs_error_db, cea_db, ssim
+from .scores import MixtureScores, abs_error_db, cea_db, ssim, ssim_mixtures
 from .task import Task, carrier_hz
 
 
@@ -52,13 +51,13 @@ class Spectrum(Task):
         return level_of_amplitudes(prediction, weight / weight.sum())
 
     def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
-        """Structural similarity on windows that do not overlap (`wrf_mi.tasks.mixtures.ssim_mixtures`)."""
+        """Structural similarity on windows that do not overlap (`wrf_mi.tasks.scores.ssim_mixtures`)."""
         return ssim_mixtures(predictions, truth)
 
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Structural similarity on the device, equal to scikit-image's."""
         from ..backend.device import to_float
-        from .ssim import ssim as on_device
+        from .losses import ssim as on_device
 
         shape = np.shape(truth)
         scores = on_device(to_float(prediction), to_float(truth), shape[0], shape[1], shape[2])

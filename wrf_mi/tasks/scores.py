@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 from scipy.stats import bootstrap as resampled
@@ -14,6 +15,7 @@ from skimage.metrics import structural_similarity
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 
 EXACT = np.finfo(float).eps ** 2
 """Smallest relative squared error that float64 resolves."""
@@ -27,17 +29,12 @@ RESAMPLES = 2000
 """Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
+MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
+"""From weights [n, k] of sum 1 and numbers [n] of observations to scores [n] of weighted means of k predictions."""
 
 
 def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-    """Structural similarity of each predicted spectrum.
-
-    Args:
-        prediction: grey values, shape [..., H, W], H and W at least 7.
-        truth: the same shape, in 0..1.
-
-    Returns:
-        Shape [...].
+    """Structural similarity [...] of predicted spectra [..., H, W] to true ones in 0..1; H and W are 7 at least.
 
     Raises:
         InputError: shapes that differ, a prediction that is not finite, or an image smaller than the window.
@@ -54,11 +51,7 @@ def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 
 
 def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-    """Absolute error of received powers in dB, NaN where nothing was received.
-
-    Args:
-        prediction: power in dBm, any shape.
-        truth: the same shape; NaN where nothing was received.
+    """Absolute error of powers in dBm, dB, any shape; NaN where the truth is, as nothing was received.
 
     Raises:
         InputError: shapes that differ, or no finite prediction where something was received.
@@ -72,12 +65,7 @@ def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     """Channel estimation accuracy in dB, -10 log10(sum |prediction - truth|^2 / sum |truth|^2) over subcarriers.
 
-    Args:
-        prediction: complex coefficients, shape [..., subcarriers].
-        truth: the same shape; against noise-free values where it is synthetic.
-
-    Returns:
-        Shape [...]; NaN where the truth is zero.
+    Of complex coefficients [..., subcarriers] the accuracies [...], NaN where the truth is zero.
 
     Raises:
         InputError: shapes that differ, or a prediction that is not finite.
@@ -97,10 +85,8 @@ def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
 def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
     """Share of the known values inside the predicted 90 % intervals.
 
-    Args:
-        prediction: any shape, real or complex.
-        std: predicted standard deviation, the same shape; errors are taken to be normal (complex: circular).
-        truth: the same shape; NaN where nothing was received.
+    Values have any shape and are real or complex, NaN in the truth where nothing was received; errors are taken to be
+    normal with the standard deviation ``std``, complex ones circular.
     """
     error = np.abs(np.asarray(prediction) - np.asarray(truth))
     bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
@@ -137,6 +123,37 @@ def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:
     wrong = int(np.count_nonzero(~np.isfinite(prediction) & ~np.isnan(truth)))
     if wrong:
         raise InputError(f"prediction: {wrong} of {truth.size} values are not finite where the truth is known")
+
+
+def ssim_mixtures(predictions: NDArray[Any], truth: NDArray[Any], stride: int = WINDOW) -> MixtureScores:
+    """Structural similarity of means of grey images [k, m, H, W] to true ones [m, H, W] on some windows.
+
+    The similarity of a window depends on the weights by its first and second moments alone, which are computed once.
+    Windows are ``stride`` pixels apart along rows and columns; 1: equal to `ssim`.
+    """
+    # Moments of the truth, the predictions, their products with each other and with the truth, by image and window.
+    kinds: list[list[FloatArray]] = [[], [], [], []]
+    for row in range(len(truth)):
+        images = np.concatenate([truth[row][None], predictions[:, row]]).astype(float)
+        parts = sliding_window_view(images, (WINDOW, WINDOW), axis=(1, 2))[:, ::stride, ::stride]
+        values = parts.reshape(len(images), -1, WINDOW**2)
+        mean = values.mean(axis=2)
+        centred = values - mean[:, :, None]
+        covariance = np.einsum("iwp,jwp->ijw", centred, centred) * SSIM_SAMPLE / WINDOW**2
+        for moments, moment in zip(kinds, (mean[0], mean[1:], covariance[0], covariance[1:, 1:]), strict=True):
+            moments.append(moment)
+    mean_y, mean_x, with_y, among = map(np.stack, kinds)
+    var_y, with_y = with_y[:, 0], with_y[:, 1:]
+
+    def scores(weights: FloatArray, rows: IntArray) -> FloatArray:
+        mean, expected = np.einsum("mk,mkw->mw", weights, mean_x[rows]), mean_y[rows]
+        across = np.einsum("mk,mkw->mw", weights, with_y[rows])
+        variance = np.einsum("mk,mj,mkjw->mw", weights, weights, among[rows], optimize=True)
+        similarity = (2 * mean * expected + SSIM_C1) / (mean**2 + expected**2 + SSIM_C1)
+        similarity *= (2 * across + SSIM_C2) / (variance + var_y[rows] + SSIM_C2)
+        return np.asarray(similarity.mean(axis=1))
+
+    return scores
 
 
 def summary(values: ArrayLike) -> dict[str, float]:

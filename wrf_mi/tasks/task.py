@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..receivers.instruments import Instrument
-from .mixtures import MixtureScores, mixture_scores
+from .scores import MixtureScores
 
 UPLINK = "uplink"
 """Key of the reference that copies the uplink."""
@@ -79,12 +80,7 @@ class Task(ABC):
 
     @abstractmethod
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """Score of each observation of ``axes`` axes.
-
-        Args:
-            prediction: any shape that ends with an observation's.
-            truth: the same shape.
-        """
+        """Score of each observation, of arrays of any shape that ends with an observation's."""
 
     @abstractmethod
     def instrument(self, record: Record) -> Instrument:
@@ -161,29 +157,20 @@ class Task(ABC):
         return np.asarray(self.of_rows(np.asarray(prediction)[None], np.asarray(truth)[None])[0], float)
 
     def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
-        """Scores of weighted means of predictions, for the choice of weights: limited, and the higher the better.
+        """Scores of weighted means of predictions [k, m, ...] of finite observations [m, ...] of one receiver.
 
-        Args:
-            predictions: predictions of one receiver [k, m, ...].
-            truth: observations [m, ...], finite.
+        They serve the choice of weights: scores are limited (`limits`), and the higher the better.
         """
         sign = 1 if self.higher_is_better else -1
 
-        def limited(mean: NDArray[Any], observed: NDArray[Any]) -> FloatArray:
-            return np.asarray(sign * np.clip(self.of_rows(mean[None], observed[None])[0], *self.limits))
+        def scores(weights: FloatArray, rows: IntArray) -> FloatArray:
+            mean = np.einsum("mk,km...->m...", weights, predictions[:, rows])
+            return np.asarray(sign * np.clip(self.of_rows(mean[None], truth[rows][None])[0], *self.limits))
 
-        return mixture_scores(predictions, truth, limited)
+        return scores
 
     def of_rows(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """Score of each receiver and row.
-
-        Args:
-            prediction: [n_rx, m, ...], as in `wrf_mi.core.Record`.
-            truth: the same shape.
-
-        Returns:
-            Shape [n_rx, m].
-        """
+        """Score [n_rx, m] of each receiver and row of arrays [n_rx, m, ...], as in `wrf_mi.core.Record`."""
         predicted, expected = np.asarray(prediction), np.asarray(truth)
         if self.more_axes and expected.ndim > 2 + self.axes and predicted.shape == expected.shape:
             shape = (*expected.shape[:2], -1)
@@ -192,11 +179,7 @@ class Task(ABC):
 
 
 def carrier_hz(record: Record, stated_in: str) -> FloatArray:
-    """Frequencies of a record with known positions, as ray tracing needs.
-
-    Args:
-        record: measurements of any task.
-        stated_in: key and file of the frequency, for the message.
+    """Frequencies of a record with known positions, as ray tracing needs; ``stated_in`` names key and file of them.
 
     Raises:
         InputError: an unknown position or frequency.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...backend.device import to_float, to_tensor
 from ...core import Prediction, Split
 from ...tasks import TASKS
-from ...tasks.ssim import ssim
+from ...tasks.losses import ssim
 from ...training.session import FitSession
 from ..model import (
     Arrays,

@@ -1,0 +1,219 @@
+"""Observations that are not finite or missing: refused in training rows, not scored, receivers left out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused, stored
+from small_fits import official, settings
+
+from wrf_mi.core import InputError, Record, Split
+from wrf_mi.datasets import load
+from wrf_mi.datasets.observations import scorable
+from wrf_mi.models import ray_tracing
+from wrf_mi.runs import api as runs
+from wrf_mi.runs import sweep
+from wrf_mi.runs.api import train
+from wrf_mi.runs.compare import compare
+from wrf_mi.runs.evaluate import evaluate
+from wrf_mi.runs.results import read_run
+from wrf_mi.tracing import TraceOptions
+
+
+def changed(record: Record, *changes: tuple[Any, float]) -> Record:
+    """The record with other values at some places of its observations."""
+    observation = record.observation.copy()
+    for place, value in changes:
+        observation[place] = value
+    return replace(record, observation=observation)
+
+
+def train_field(record: Record, out: Path, split: str = "official") -> Path:
+    return train(record, out, "wrf-gs+", settings=settings("steps=2", "deterministic=true"), split=split).folder
+
+
+def train_idw(record: Record, out: Path, split: str = "official") -> Path:
+    return train(record, out, "idw", split=split).folder
+
+
+BOTH = pytest.mark.parametrize("train", [train_field, train_idw])
+
+
+@BOTH
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("part", ["train", "validation"])
+def test_training_rows_are_refused_before_anything_is_written(
+    train: Callable[..., Path], value: float, part: str, two_gateways: Record, tmp_path: Path
+) -> None:
+    row = int(getattr(official(two_gateways), part)[0])
+    name = two_gateways.receivers[1].name
+    with pytest.raises(InputError) as error:
+        train(changed(two_gateways, ((1, row, 4, 5), value)), tmp_path / "run")
+    message = f"made-here, receiver {name}, row {row}: 1 of 800 values are not finite; correct or remove the row"
+    assert str(error.value) == message
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_row_of_a_later_fold_is_refused_at_once(two_gateways: Record, tmp_path: Path) -> None:
+    folded = replace(two_gateways, folds=np.arange(len(two_gateways)) % 2)
+    with pytest.raises(InputError, match="row 2: 1 of 800"):  # it trains in the second fold alone
+        train_field(changed(folded, ((0, 2, 4, 5), np.nan)), tmp_path / "run", "blocked")
+    assert not (tmp_path / "run").exists()
+
+
+def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path: Path) -> None:
+    """Other models are fitted to the rows that a receiver received."""
+    row = int(official(two_gateways).train[0])
+    missed = changed(two_gateways, ((1, row), np.nan))
+    with pytest.raises(InputError, match=f"row {row}: 800 of 800 .*; remove the row or choose another model"):
+        train_field(missed, tmp_path / "field")
+    train_idw(missed, tmp_path / "idw")
+
+
+@BOTH
+def test_test_rows_that_are_not_finite_are_counted_and_not_scored(
+    train: Callable[..., Path], two_gateways: Record, tmp_path: Path
+) -> None:
+    a, b, c = (int(row) for row in official(two_gateways).test[:3])
+    broken = changed(two_gateways, ((0, a, 4, 5), np.nan), ((1, b), np.inf), ((1, c), np.nan))
+    whole, found = train(two_gateways, tmp_path / "whole"), train(broken, tmp_path / "broken")
+    metrics = json.loads((found / "metrics.json").read_text())
+    assert metrics["n_not_scored"] == 2
+    assert json.loads((whole / "metrics.json").read_text())["n_not_scored"] == 0
+    rows = len(official(two_gateways).test)
+    names = [receiver.name for receiver in two_gateways.receivers]
+    assert [metrics["receivers"][name]["n_test"] for name in names] == [rows - 1, rows - 2]
+    np.testing.assert_array_equal(stored(found)["prediction"], stored(whole)["prediction"])
+    assert np.isnan(stored(found)["truth"]).reshape(2, rows, -1).all(axis=2).sum(axis=1).tolist() == [1, 2]
+    assert np.isfinite(list(metrics["ssim"].values())).all()
+    compare([found, whole], tmp_path / "compare")
+
+
+def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> None:
+    split = official(two_gateways)
+    broken = changed(two_gateways, ((slice(None), split.test, 0, 0), np.nan))
+    with pytest.raises(InputError, match="split official: no test row to score is finite; use another split"):
+        evaluate(broken, split, lambda rows, receiver: broken.observation[receiver, rows])
+
+
+def test_finite_and_missing_observations_stay(two_gateways: Record) -> None:
+    missed = changed(two_gateways, ((0, 3), np.nan)).observation
+    kept, count = scorable(missed)
+    assert kept is missed
+    assert count == 0
+
+
+@pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "kriging"}], ids=str)
+def test_a_sweep_is_refused_before_its_first_run(
+    arguments: dict[str, str], two_gateways: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = int(official(two_gateways).train[0])
+    broken = changed(two_gateways, ((0, row, 0, 0), np.nan))
+    monkeypatch.setattr(sweep, "_record", lambda dataset: broken)
+    with pytest.raises(InputError, match=f"row {row}: 1 of 800 values are not finite"):
+        sweep.check_run("broken", arguments)
+
+
+DIRECT = TraceOptions(reflection=False, depth=0)
+ROWS, TRAINED = 12, 8
+GATEWAYS_M = {"near": (0.4, 0.5, 2.1), "far": (4.5, 3.4, 2.3)}
+
+
+@pytest.fixture
+def silent(tmp_path: Path) -> Path:
+    """Strengths in the flat's room, in NeRF2's layout; the second gateway received none of the training rows."""
+    folder = tmp_path / "silent"
+    folder.mkdir()
+    places = np.random.default_rng(4).uniform([0.6, 0.6, 1], [4.2, 3.2, 1.5], (ROWS, 3))
+    lines = [f"{name}: [{x}, {y}, {z}]" for name, (x, y, z) in GATEWAYS_M.items()]
+    (folder / "gateway_position.yml").write_text("\n".join([*lines, ""]))
+    np.savetxt(folder / "tx_pos.csv", places, delimiter=",", header="x,y,z", comments="")
+    powers = [f"{-50 - row},{-100 if row < TRAINED else -70 + row}" for row in range(ROWS)]
+    (folder / "gateway_rssi.csv").write_text("\n".join(["near,far", *powers, ""]))
+    for name, rows in (("train_index.txt", range(TRAINED)), ("test_index.txt", range(TRAINED, ROWS))):
+        (folder / name).write_text("".join(f"{row}\n" for row in rows))
+    return folder
+
+
+@pytest.mark.parametrize("model", ["ray-tracing", "kriging", "mri"])
+def test_a_gateway_without_training_rows_is_left_out(
+    model: str, silent: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings, scene = (DIRECT, room) if model == "ray-tracing" else ((), None)
+    left_out, alone = (
+        train(data, tmp_path / name, model, scene=scene, settings=settings)
+        for name, data in (("run", silent), ("alone", load(silent).at_receivers([0])))
+    )
+    assert left_out.metrics["receivers_left_out"] == {"far": 0}
+    assert left_out.metrics["abs_error_db"] == alone.metrics["abs_error_db"]
+    (message,) = [record.message for record in caplog.records if record.name == "wrf_mi.datasets.observations"]
+    assert (
+        message == "silent: receivers with fewer than 2 training rows are left out, with their number of rows: far (0)"
+    )
+
+
+def test_data_without_any_received_training_row_are_refused_before_anything_is_done(
+    silent: Path, room: Path, tmp_path: Path
+) -> None:
+    record = load(silent)
+    record.observation[:, :3] = np.nan
+    split = Split("mine", 0, np.arange(3), np.zeros(0, np.int64), np.arange(3, 5))
+    stages: list[str] = []
+    message = r"nothing was received in the training rows by any receiver \(near, far\); use another split"
+    for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("kriging", {})):
+        with pytest.raises(InputError, match=message):
+            train(
+                record,
+                tmp_path / "run",
+                model,
+                split=split,
+                on_progress=lambda *said: stages.append(said[0]),
+                **options,
+            )
+        assert not (tmp_path / "run").exists()
+    assert stages == []
+
+
+def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    """It is known only from the paths."""
+    nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, depth=1)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match="no training row is both received and reached by a path"):
+        train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=nothing)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("module", "stage"), [(ray_tracing, "fit_offsets"), (runs, "score_part")])
+@pytest.mark.parametrize("split", ["official", "blocked"])
+def test_a_stopped_trace_goes_on_with_its_paths(
+    module: Any,
+    stage: str,
+    split: str,
+    flat_folder: Path,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(module, stage, stopped)
+        with pytest.raises(KeyboardInterrupt):
+            train(flat_folder, out, "ray-tracing", scene=room, settings=DIRECT, split=split)
+    written = (out / "paths.npz").stat().st_mtime_ns  # an hour's work may lie there
+    again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
+    refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)
+    refused(["compare", out, "--out", tmp_path / "page"], "no metrics.json, so no finished run; finish it", capsys)
+    status, _, err = call(["train", "--resume", out], capsys)
+    assert status == 0, err
+    assert (out / "paths.npz").stat().st_mtime_ns == written
+    assert read_run(out).metrics["paths"] > 0
