@@ -347,17 +347,30 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     assert problem.opened_scene is not None
 
 
-MODEL = Model(
-    NAME,
-    None,
-    TracingSettings,
-    fit,
-    load,
-    "Hoydis et al., 'Sionna RT' (2023)",
-    scene="required",
-    several_carriers=True,
-    new_receivers=True,
-    gaps=GAPS,
-    check=check,
-    prepare=prepare,
-)
+class RayTracing(Model):
+    """Paths of a scene, optionally calibrated on the training rows."""
+
+    name, source, settings = NAME, "Hoydis et al., 'Sionna RT' (2023)", TracingSettings
+    summary, scene_summary = "Sionna RT in the scene", ""
+    scene = "required"
+    several_carriers, new_receivers = True, True
+    gaps = GAPS
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
+        """Train the calibrated parameters; or trace all rows, and fit offsets of signal strengths, see `fit`."""
+        return fit(problem, split, session)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The model that a fit's arrays describe, see `load`."""
+        return load(arrays, problem, folder)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
+        check(problem, splits)
+
+    def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
+        """Settings, with those that are chosen by convergence, see `prepare`."""
+        return prepare(problem, splits, session)
+
+
+MODEL = RayTracing()

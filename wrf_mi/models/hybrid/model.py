@@ -14,7 +14,6 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -369,33 +368,38 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
     return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts)
 
 
-def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse unknown positions, and data that no part can be fitted to."""
-    for split in splits:
-        known_positions(problem.record, split.all_train, "hybrid")
-        parts_of(problem, split)
+class Hybrid(Model):
+    """The hybrid for any task, or for data of one."""
+
+    name, source, settings = "hybrid", "docs/hybrid.md", HybridSettings
+    summary = "one fit in stages: paths of a scene, its correction, Gaussians, interpolation of the rest"
+    scene_summary = ""
+    scene, uplink, headings = "optional", "optional", True
+    several_carriers, new_receivers = True, True
+    train_arguments = ("deterministic",)
+
+    def __init__(self, gaps: tuple[str, ...] = ()) -> None:
+        self.gaps = gaps
+
+    def serving(self, task: str, with_scene: bool) -> Hybrid:
+        """The hybrid, whose arrays have the gaps of its parts' arrays."""
+        parts = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
+        gaps = {name for part in parts for name in part.serving(task, with_scene).gaps}
+        return Hybrid((*GAPS, *sorted(gaps)))
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedHybrid:
+        """Fit all parts, and choose weights and standard deviations by held-out rows, see `fit`."""
+        return fit(problem, split, session)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
+        """The hybrid that `FittedHybrid.arrays` described."""
+        return load(arrays, problem, folder)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse unknown positions, and data that no part can be fitted to."""
+        for split in splits:
+            known_positions(problem.record, split.all_train, self.name)
+            parts_of(problem, split)
 
 
-def _by_data(task: str, with_scene: bool) -> Model:
-    """The entry, whose arrays have the gaps of the parts' arrays."""
-    entries = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
-    gaps = {name for entry in entries for name in entry.serving(task, with_scene).gaps}
-    return replace(MODEL, by_data=None, gaps=(*GAPS, *sorted(gaps)))
-
-
-MODEL = Model(
-    "hybrid",
-    None,
-    HybridSettings,
-    fit,
-    load,
-    "docs/hybrid.md",
-    scene="optional",
-    uplink="optional",
-    headings=True,
-    several_carriers=True,
-    new_receivers=True,
-    given=("deterministic",),
-    check=check,
-    by_data=_by_data,
-)
+MODEL = Hybrid()

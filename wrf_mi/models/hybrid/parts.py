@@ -14,8 +14,9 @@ from ...tasks import task_of
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..model import Model, Problem, default_settings
-from . import paths, strengths
+from .paths import InScene, Paths
 from .scene_side import FIELD, RESIDUAL, STAGES, needs_scene
+from .strengths import StrengthsInScene, TracedStrengths
 
 logger = logging.getLogger(__name__)
 
@@ -61,8 +62,8 @@ class HybridSettings(CheckedSettings):
 def scene_side(record: Record) -> tuple[Model, Model]:
     """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
     if task_of(record).in_decibel and record.frequencies_hz is not None:
-        return strengths.TRACED_STRENGTHS, strengths.IN_SCENE
-    return paths.PATHS, paths.IN_SCENE
+        return TracedStrengths(), StrengthsInScene()
+    return Paths(), InScene()
 
 
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
@@ -114,8 +115,7 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
         entry, inner = _part(problem, name, scene)
         check_record(entry, problem.record)
         check_held_receivers(problem.record, split, entry, MODELS.values())
-        if entry.check is not None:
-            entry.check(inner, [split])
+        entry.check(inner, [split])
     except InputError as error:
         if scene:
             raise

@@ -11,10 +11,8 @@ from ...core.settings import with_settings
 from ...tasks import task_of
 from ...training.config import TrainConfig, calibration_config, task_settings
 from ..gaussian.model import WRF_GS_PLUS, FittedField
-from ..gaussian.model import check as check_graph
-from ..gaussian.model import fit as fit_graph
 from ..held_out import HeldOut, as_unseen
-from ..model import Arrays, Decomposition, Inputs, Problem, Session, settings_array, stored_settings
+from ..model import Arrays, Decomposition, Inputs, Model, Problem, Session, settings_array, stored_settings
 from .scene_side import CALIBRATION, CORRECTED, FIELD, SURFACES, SceneSide, StageReport, corrected, in_scene, too_few
 
 
@@ -75,24 +73,12 @@ class FittedPaths(SceneSide):
         return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held))
 
 
-def fit(problem: Problem, split: Split, session: Session) -> FittedPaths:
-    """Correct the scene, then train paths, Gaussians on surfaces and those of the field in it.
-
-    Raises:
-        Interrupted: stopped; the correction is kept, training goes on from its checkpoint.
-    """
-    inner, reports = corrected(problem, split, session)
-    paths = fit_in_scene(inner, split, session)
-    paths.stages = (*reports, *(one for one in paths.stages if one.stage != CALIBRATION or not reports))
-    return paths
-
-
 def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedPaths:
-    """`fit` without the correction."""
+    """Paths, Gaussians on surfaces and those of the field in the scene as it is."""
     settings = config_of(problem, split, problem.settings.wanted)
     if too_few(problem.record, split):  # all of them train, as none can choose
         split = replace(split, train=split.all_train, validation=split.validation[:0])
-    graph = fit_graph(replace(problem, settings=settings), split, session)
+    graph = WRF_GS_PLUS.fit(replace(problem, settings=settings), split, session)
     scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
     used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
     reports = [StageReport(CALIBRATION, True, scores[CALIBRATION])] if CALIBRATION in scores else []
@@ -102,32 +88,40 @@ def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedPath
     return FittedPaths(graph, problem, reports)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
-    """The scene's side that `fit` made in a folder."""
-    config, inner = stored_settings(TrainConfig, arrays, str(folder)), in_scene(problem, folder)
-    return FittedPaths(FittedField(arrays, config, replace(inner, settings=config), folder), inner)
+class InScene(Model):
+    """Stages 4 and 5 in a scene that is corrected already: no name of the registry."""
+
+    name, source, settings = "paths", WRF_GS_PLUS.source, object
+    tasks, gaps = WRF_GS_PLUS.tasks, WRF_GS_PLUS.gaps
+    scene, uplink = "required", "optional"
+    several_carriers, new_receivers = True, True
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedPaths:
+        """Train paths, Gaussians on surfaces and those of the field."""
+        return fit_in_scene(problem, split, session)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
+        """The scene's side that was fitted in a folder."""
+        config, inner = stored_settings(TrainConfig, arrays, str(folder)), in_scene(problem, folder)
+        return FittedPaths(FittedField(arrays, config, replace(inner, settings=config), folder), inner)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse what the training of the graph refuses."""
+        for split in splits:
+            config = config_of(problem, split, problem.settings.wanted)
+            WRF_GS_PLUS.check(replace(problem, settings=config), [split])
 
 
-def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse what the training of the graph refuses."""
-    for split in splits:
-        config = config_of(problem, split, problem.settings.wanted)
-        check_graph(replace(problem, settings=config), [split])
+class Paths(InScene):
+    """Stages 1 to 5: the scene's side for spectra and channels."""
 
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedPaths:
+        """Correct the scene, then train paths, Gaussians on surfaces and those of the field in it.
 
-PATHS = replace(
-    WRF_GS_PLUS,
-    name="paths",
-    settings=object,
-    fit=fit,
-    load=load,
-    scene="required",
-    check=check,
-    prepare=None,
-    by_data=None,
-    given=(),
-    presets={},
-)
-"""The scene's side as an entry, which no name of the registry has."""
-IN_SCENE = replace(PATHS, fit=fit_in_scene)
-"""The same in a scene that is corrected already."""
+        Raises:
+            Interrupted: stopped; the correction is kept, training goes on from its checkpoint.
+        """
+        inner, reports = corrected(problem, split, session)
+        paths = fit_in_scene(inner, split, session)
+        paths.stages = (*reports, *(one for one in paths.stages if one.stage != CALIBRATION or not reports))
+        return paths

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -66,10 +66,6 @@ class ReceiverRows:
     observation: NDArray[Any]
     tx_heading_rad: FloatArray | None
     on_progress: OnProgress
-
-
-FitSingle = Callable[[ReceiverRows], Single]
-"""From the rows of a receiver to its model."""
 
 
 def finite_positions(inputs: Inputs, name: str) -> FloatArray:
@@ -197,33 +193,37 @@ class ByReceiver(Fitted):
         return arrays
 
 
-def model_by_receiver(
-    name: str,
-    tasks: tuple[str, ...] | None,
-    settings: type,
-    fit_single: FitSingle,
-    load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
-    source: str,
-    heading: Callable[[Record, Any], bool] = lambda record, settings: False,
-    new_receivers: bool = False,
-) -> Model:
-    """Entry of the registry for a method that fits every receiver to all training rows, those of each carrier alone.
+class ByReceiverModel(Model):
+    """A method that fits every receiver by itself to all training rows, those of each carrier by themselves."""
 
-    Args:
-        name: name of the method.
-        tasks: tasks that it serves; None: all.
-        settings: class of its settings.
-        fit_single: fit of one receiver.
-        load_single: the model of a receiver from its arrays.
-        source: publication.
-        heading: ``heading(record, settings)``: whether headings count where the record has them.
-        new_receivers: whether ``fit_single`` serves receivers without training rows.
-    """
+    uplink = "optional"
+    several_carriers, headings = True, True
 
-    def fit(problem: Problem, split: Split, session: FitSession) -> ByReceiver:
+    @abstractmethod
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """The model of one receiver.
+
+        Raises:
+            InputError: rows that it cannot be fitted to.
+        """
+
+    @abstractmethod
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The model of a receiver from its arrays."""
+
+    def takes_headings(self, record: Record, settings: Any) -> bool:
+        """Whether headings count where the record has them."""
+        return False
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
+        """Models of all receivers, and of all carriers.
+
+        Raises:
+            InputError: unknown positions, or rows that the model of a receiver cannot be fitted to.
+        """
         record, rows, stated = problem.record, split.all_train, problem.record.carriers_hz
-        known_positions(record, rows, name)
-        headings = record.tx_heading_rad if heading(record, problem.settings) else None
+        known_positions(record, rows, self.name)
+        headings = record.tx_heading_rad if self.takes_headings(record, problem.settings) else None
         carriers = None if stated is None else np.unique(stated[rows])
         parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
         models: list[Single | None] = []
@@ -245,21 +245,19 @@ def model_by_receiver(
 
                 try:
                     rows_of = record.tx_pos_m[part], observed[part], turned
-                    models.append(fit_single(ReceiverRows(problem, split, receiver, *rows_of, report)))
+                    models.append(self.fit_single(ReceiverRows(problem, split, receiver, *rows_of, report)))
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-                session.report(f"{name}: receivers", len(models) / fits_in_all)
-        return ByReceiver(name, models, headings is not None, carriers)
+                session.report(f"{self.name}: receivers", len(models) / fits_in_all)
+        return ByReceiver(self.name, models, headings is not None, carriers)
 
-    def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The models that `ByReceiver.arrays` described."""
         carriers = arrays.get(CARRIERS)
         receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
         without = arrays.get(WITHOUT, np.zeros(0, np.int64))
         models = [
-            None if number in without else load_single(receiver, under(f"{number}/", arrays))
+            None if number in without else self.load_single(receiver, under(f"{number}/", arrays))
             for number, receiver in enumerate(receivers)
         ]
-        return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
-
-    how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}
-    return Model(name, tasks, settings, fit, load, source, new_receivers=new_receivers, **how)
+        return ByReceiver(self.name, models, bool(arrays[HEADING]), carriers)

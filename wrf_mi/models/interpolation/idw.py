@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError
+from ...core import InputError, Receiver
 from ...tasks import task_of
-from .by_receiver import ReceiverRows, model_by_receiver, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
 class InverseDistance:
@@ -93,19 +94,24 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def _fit(rows: ReceiverRows) -> InverseDistance:
-    settings: IdwSettings = rows.problem.settings
-    task = task_of(rows.problem.record)
-    k = task.neighbours if settings.neighbours is None else settings.neighbours
-    softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
-    return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
+class Idw(ByReceiverModel):
+    """Inverse-distance weighting of each receiver's rows."""
+
+    name, settings = "idw", IdwSettings
+    source = "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)"
+    summary = "inverse-distance weighting"
+
+    def fit_single(self, rows: ReceiverRows) -> InverseDistance:
+        """Keep the rows of a receiver."""
+        settings: IdwSettings = rows.problem.settings
+        task = task_of(rows.problem.record)
+        k = task.neighbours if settings.neighbours is None else settings.neighbours
+        softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
+        return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> InverseDistance:
+        """The rows that were kept."""
+        return InverseDistance.from_arrays(arrays)
 
 
-MODEL = model_by_receiver(
-    "idw",
-    None,
-    IdwSettings,
-    _fit,
-    lambda receiver, arrays: InverseDistance.from_arrays(arrays),
-    "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
-)
+MODEL = Idw()

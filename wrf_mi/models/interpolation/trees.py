@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError
+from ...core import InputError, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from .by_receiver import model_by_receiver, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
 @dataclass(frozen=True)
@@ -134,12 +135,26 @@ def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray
     return np.column_stack([positions, np.cos(heading), np.sin(heading)])
 
 
-MODEL = model_by_receiver(
-    "trees",
-    ("rssi",),
-    Trees,
-    lambda rows: rows.problem.settings.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed),
-    lambda receiver, arrays: GrownTrees(**arrays),
-    "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
-    lambda record, settings: settings.heading,
-)
+class TreesModel(ByReceiverModel):
+    """Extremely randomised trees of each receiver."""
+
+    name, settings = "trees", Trees
+    source = "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'"
+    summary = "extremely randomised trees"
+    tasks = ("rssi",)
+
+    def takes_headings(self, record: Record, settings: Trees) -> bool:
+        """As the settings say."""
+        return settings.heading
+
+    def fit_single(self, rows: ReceiverRows) -> GrownTrees:
+        """Grow the trees of a receiver."""
+        trees: Trees = rows.problem.settings
+        return trees.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> GrownTrees:
+        """The trees of a receiver."""
+        return GrownTrees(**arrays)
+
+
+MODEL = TreesModel()

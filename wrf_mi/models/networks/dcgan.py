@@ -321,30 +321,31 @@ def duel_loss(dcgan: Dcgan, data: Any, given: Any, s: DcganSettings) -> Any:
     return (right + fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
 
 
-def network(rows: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> Network:
-    """Generator and discriminator of a receiver, to be trained together."""
-    data = {"where": rows.where, "truth": to_float(rows.spectra)}
-    dr.make_opaque(data)
-    dcgan = Dcgan(s, rows.spectra.shape[1:], rng)
-    # The generator starts near the mean grey of the rows that it may learn from.
-    grey = float(np.clip(rows.spectra[: rows.train].mean(dtype=np.float64), 0.01, 0.99))
-    dcgan.g.layers[-1].bias += np.float32(np.log(grey / (1 - grey)))
+class DcganModel(SpectrumNetwork):
+    """A generator and a discriminator for each receiver."""
 
-    def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, len(chosen))))}
+    name, settings, summary = "dcgan", DcganSettings, "generative adversarial network"
+    source = (
+        "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), "
+        "with pix2pix's second term (2017)"
+    )
+    generator_class, generator, at_once = Generator, "g", 16
 
-    both = rows.network(KIND, dcgan, partial(duel_loss, s=s), data, draw)
-    rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), s.adversary_rate)
-    return replace(both, rates=rates, momentum=MOMENTUM)
+    def network(self, rows: ReceiverRows, settings: DcganSettings, rng: np.random.Generator) -> Network:
+        """Generator and discriminator of a receiver, to be trained together."""
+        data = {"where": rows.where, "truth": to_float(rows.spectra)}
+        dr.make_opaque(data)
+        dcgan = Dcgan(settings, rows.spectra.shape[1:], rng)
+        # The generator starts near the mean grey of the rows that it may learn from.
+        grey = float(np.clip(rows.spectra[: rows.train].mean(dtype=np.float64), 0.01, 0.99))
+        dcgan.g.layers[-1].bias += np.float32(np.log(grey / (1 - grey)))
+
+        def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (settings.noise, len(chosen))))}
+
+        both = self.trained_on(rows, dcgan, partial(duel_loss, s=settings), data, draw)
+        rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), settings.adversary_rate)
+        return replace(both, rates=rates, momentum=MOMENTUM)
 
 
-KIND = SpectrumNetwork(
-    "dcgan",
-    DcganSettings,
-    network,
-    Generator,
-    "g",
-    16,
-    "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
-)
-MODEL = KIND.model()
+MODEL = DcganModel()

@@ -301,27 +301,6 @@ FAR_M = 10.0
 """Length of rays if positions are not known: the size of a large room."""
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> Field:
-    """Fit the networks.
-
-    Raises:
-        InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
-    """
-    record, known = problem.record, split.all_train
-    outputs, settings = outputs_of(record), problem.settings
-    where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
-    known_rx = np.stack([receiver.position_m for receiver in record.receivers])
-    rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
-    if np.isfinite(where).all() and np.isfinite(known_rx).all():
-        farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
-    else:
-        where, farthest = rx, FAR_M
-    scales = channel_scales(record, known)
-    field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
-    return field
-
-
 def _fit_group(
     record: Record, split: Split, field: Field, seed: int, session: FitSession, members: tuple[int, ...]
 ) -> Nerf2Network:
@@ -371,15 +350,42 @@ def _fit_group(
     return trained
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> Field:
-    """The fields that `Field.arrays` described."""
-    settings = stored_settings(Nerf2Settings, arrays, "nerf2")
-    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
-    field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-    field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
-    return field
+class Nerf2Model(Model):
+    """NeRF2."""
+
+    name, settings = "nerf2", Nerf2Settings
+    source = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
+    summary = "neural field of voxels, marched along rays"
+    tasks = ("spectrum", "rssi", "csi")
+    uplink, headings = "optional", True
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Field:
+        """Fit the networks.
+
+        Raises:
+            InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
+        """
+        record, known = problem.record, split.all_train
+        outputs, settings = outputs_of(record), problem.settings
+        where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
+        known_rx = np.stack([receiver.position_m for receiver in record.receivers])
+        rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
+        if np.isfinite(where).all() and np.isfinite(known_rx).all():
+            farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
+        else:
+            where, farthest = rx, FAR_M
+        scales = channel_scales(record, known)
+        field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
+        field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
+        return field
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Field:
+        """The fields that `Field.arrays` described."""
+        settings = stored_settings(Nerf2Settings, arrays, "nerf2")
+        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+        field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+        return field
 
 
-SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
-TASKS = "spectrum", "rssi", "csi"
-MODEL = Model("nerf2", TASKS, Nerf2Settings, fit, load, SOURCE, uplink="optional", headings=True)
+MODEL = Nerf2Model()

@@ -124,31 +124,29 @@ def elbo_loss(vae: Vae, data: Any, given: Any, s: VaeSettings) -> Any:
     return (likelihood + (s.beta / batch) * divergence).array
 
 
-def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
-    """Encoder and decoder of a receiver, to be trained."""
-    cells, flat = pooled(rows.spectra, s.pool), rows.spectra.reshape(len(rows.spectra), -1)
-    data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
-    dr.make_opaque(data)
-    vae = Vae(s, cells.shape[1], rows.spectra.shape[1:], rng)
-    # The decoder starts at the mean spectrum of the rows that it may learn from.
-    mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
-    assert vae.p.out is not None
-    vae.p.out.bias = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
+class VaeModel(SpectrumNetwork):
+    """A variational autoencoder for each receiver."""
 
-    def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        noise, prior = rng.standard_normal((2, s.latent, len(chosen)))
-        return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+    name, settings, summary = "vae", VaeSettings, "variational autoencoder"
+    source = "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)"
+    generator_class, generator, at_once = Decoder, "p", 64
 
-    return rows.network(KIND, vae, partial(elbo_loss, s=s), data, draw)
+    def network(self, rows: ReceiverRows, settings: VaeSettings, rng: np.random.Generator) -> Network:
+        """Encoder and decoder of a receiver, to be trained."""
+        cells, flat = pooled(rows.spectra, settings.pool), rows.spectra.reshape(len(rows.spectra), -1)
+        data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
+        dr.make_opaque(data)
+        vae = Vae(settings, cells.shape[1], rows.spectra.shape[1:], rng)
+        # The decoder starts at the mean spectrum of the rows that it may learn from.
+        mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
+        assert vae.p.out is not None
+        vae.p.out.bias = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
+
+        def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            noise, prior = rng.standard_normal((2, settings.latent, len(chosen)))
+            return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+
+        return self.trained_on(rows, vae, partial(elbo_loss, s=settings), data, draw)
 
 
-KIND = SpectrumNetwork(
-    "vae",
-    VaeSettings,
-    network,
-    Decoder,
-    "p",
-    64,
-    "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
-)
-MODEL = KIND.model()
+MODEL = VaeModel()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import received_rows
+from ..model import Model, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -80,6 +80,13 @@ def principal_axes(elements_m: FloatArray) -> FloatArray:
     """Unit vectors [q, 3] of the principal axes along which an array is not flat (`FLAT`): a plane array has two."""
     _, extent, axes = np.linalg.svd(elements_m - elements_m.mean(axis=0), full_matrices=False)
     return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
+
+
+class UplinkModel(Model):
+    """A model of the downlink from the uplink of an array."""
+
+    tasks = ("csi",)
+    uplink, headings = "required", True
 
 
 def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:

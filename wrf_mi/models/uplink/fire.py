@@ -36,7 +36,6 @@ from ..model import (
     Arrays,
     Fitted,
     Inputs,
-    Model,
     Problem,
     field_arrays,
     from_field_arrays,
@@ -48,7 +47,7 @@ from ..model import (
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, bands_of, known_rows, relative_error
+from .csi_bands import Bands, UplinkModel, bands_of, known_rows, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096
@@ -185,21 +184,6 @@ def predict_samples(
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
-    """Fit a network, or two of which the better is kept."""
-    record, settings = problem.record, problem.settings
-    train, validation = known_rows(MODEL.name, record, split)
-    bands = bands_of(record, settings.spacing_hz)
-    kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
-    few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
-    unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
-    if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
-        kinds = ("antenna",)
-    fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
-    network, _, kind = max(fits, key=lambda fit: fit[1])
-    return FittedFire(kind, network, bands, settings)
-
-
 def _fit(
     problem: Problem, train: IntArray, validation: IntArray, session: FitSession, sample: str
 ) -> tuple[Fire, float]:
@@ -238,14 +222,34 @@ def _fit(
     return train_network(network, config, seeds, session)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
-    """The network that `FittedFire.arrays` described."""
-    settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
-    weights = under("network/", arrays)
-    sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
-    fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)
-    return FittedFire(str(arrays["sample"]), fire, bands, settings)
+class FireModel(UplinkModel):
+    """FIRE."""
+
+    name, settings = "fire", FireSettings
+    source = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
+    summary = "variational autoencoder from uplink to downlink"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedFire:
+        """Fit a network, or two of which the better is kept."""
+        record, settings = problem.record, problem.settings
+        train, validation = known_rows(self.name, record, split)
+        bands = bands_of(record, settings.spacing_hz)
+        kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
+        few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
+        unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
+        if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
+            kinds = ("antenna",)
+        fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
+        network, _, kind = max(fits, key=lambda fit: fit[1])
+        return FittedFire(kind, network, bands, settings)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
+        """The network that `FittedFire.arrays` described."""
+        settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
+        weights = under("network/", arrays)
+        sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
+        fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)
+        return FittedFire(str(arrays["sample"]), fire, bands, settings)
 
 
-SOURCE = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
-MODEL = Model("fire", ("csi",), FireSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = FireModel()

@@ -27,8 +27,8 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays
-from .csi_bands import known_rows, relative_error
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
+from .csi_bands import UplinkModel, known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -123,24 +123,29 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
     return PENALTIES[int(np.argmin(errors))]
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> LinearMap:
-    """Choose the penalty, then fit the map to all training rows."""
-    record, settings = problem.record, problem.settings
-    train, validation = known_rows(MODEL.name, record, split)
-    known = np.concatenate([train, validation])
-    if not len(validation):
-        picked = np.arange(len(train)) % JUDGES == 0
-        train, validation = train[~picked], train[picked]
-    penalty = settings.penalty or choose(record, train, validation, session.report)
-    matrix = Normal.of(record, known).matrix(penalty)
-    session.report(f"linear: penalty {penalty:.2g}", 1.0)
-    return LinearMap(matrix, record.observation.shape[2], penalty)
+class LinearModel(UplinkModel):
+    """The linear estimator."""
+
+    name, settings = "linear", LinearSettings
+    source = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
+    summary = "linear map from uplink to downlink"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> LinearMap:
+        """Choose the penalty, then fit the map to all training rows."""
+        record, settings = problem.record, problem.settings
+        train, validation = known_rows(self.name, record, split)
+        known = np.concatenate([train, validation])
+        if not len(validation):
+            picked = np.arange(len(train)) % JUDGES == 0
+            train, validation = train[~picked], train[picked]
+        penalty = settings.penalty or choose(record, train, validation, session.report)
+        matrix = Normal.of(record, known).matrix(penalty)
+        session.report(f"linear: penalty {penalty:.2g}", 1.0)
+        return LinearMap(matrix, record.observation.shape[2], penalty)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
+        """The map that `LinearMap.arrays` described."""
+        return from_field_arrays(LinearMap, arrays)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
-    """The map that `LinearMap.arrays` described."""
-    return from_field_arrays(LinearMap, arrays)
-
-
-SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-MODEL = Model("linear", ("csi",), LinearSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = LinearModel()

@@ -37,7 +37,6 @@ from ...training.session import FitSession
 from ..model import (
     Arrays,
     Inputs,
-    Model,
     Problem,
     field_arrays,
     from_field_arrays,
@@ -48,7 +47,7 @@ from ..model import (
 )
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
-from .csi_bands import Bands
+from .csi_bands import Bands, UplinkModel
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import ArrayWaves, Complex, Mask, Waves, waves_of
@@ -286,52 +285,57 @@ def prune(
     return theta, kept, waves.solve(theta, kept, h).residual
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
-    """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
-    settings: OptMLSettings = problem.settings
-    kind, bands = choose(MODEL.name, problem.record, split, settings, session.report)
-    waves = waves_of(kind, bands, settings.max_distance_m)
-    session.report("simulating channels", 0.0)
-    rng = np.random.default_rng(problem.seed)
-    seen, truth = simulate(waves, settings.simulation, bands, rng)
-    channels, cells = seen.shape[1:]
-    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
-    around = to_uint(waves.around)
-    # One column a map, so that a batch is a choice of columns.
-    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
-    data = flat | {"around": around}
-    dr.make_opaque(data)
+class OptMLModel(UplinkModel):
+    """OptML."""
 
-    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return opaque_rows(rows)
+    name, settings = "optml", OptMLSettings
+    source = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
+    summary = "paths fitted to the uplink, started by a network"
 
-    def chosen(maps: Any, rows: Any) -> Any:
-        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
-        return dr.reshape(x, (channels, dr.width(rows) * cells))
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> OptML:
+        """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
+        settings: OptMLSettings = problem.settings
+        kind, bands = choose(self.name, problem.record, split, settings, session.report)
+        waves = waves_of(kind, bands, settings.max_distance_m)
+        session.report("simulating channels", 0.0)
+        rng = np.random.default_rng(problem.seed)
+        seen, truth = simulate(waves, settings.simulation, bands, rng)
+        channels, cells = seen.shape[1:]
+        judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
+        around = to_uint(waves.around)
+        # One column a map, so that a batch is a choice of columns.
+        flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
+        data = flat | {"around": around}
+        dr.make_opaque(data)
 
-    def loss(network: PathMap, data: Any, rows: Any) -> Any:
-        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
-        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
+        def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            return opaque_rows(rows)
 
-    asked, wanted = side_by_side(seen[:judges]), side_by_side(truth[:judges]).numpy()
+        def chosen(maps: Any, rows: Any) -> Any:
+            x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
+            return dr.reshape(x, (channels, dr.width(rows) * cells))
 
-    def score(network: PathMap) -> float:
-        return float(np.square(network(asked, around).numpy() - wanted).mean())
+        def loss(network: PathMap, data: Any, rows: Any) -> Any:
+            x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
+            return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
 
-    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
-    maps = Network("paths", PathMap(waves, settings.width, rng), loss, data, draw, *rows, score, "mean squared error")
-    network = train_network(maps, settings, (problem.seed,), session)[0]
-    return OptML(kind, bands, settings, network)
+        asked, wanted = side_by_side(seen[:judges]), side_by_side(truth[:judges]).numpy()
+
+        def score(network: PathMap) -> float:
+            return float(np.square(network(asked, around).numpy() - wanted).mean())
+
+        rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
+        initial = PathMap(waves, settings.width, rng)
+        maps = Network("paths", initial, loss, data, draw, *rows, score, "mean squared error")
+        return OptML(kind, bands, settings, train_network(maps, settings, (problem.seed,), session)[0])
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> OptML:
+        """The model that `OptML.arrays` described."""
+        settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
+        bands = from_field_arrays(Bands, arrays)
+        waves = waves_of(kind, bands, settings.max_distance_m)
+        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
+        return OptML(kind, bands, settings, network)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> OptML:
-    """The model that `OptML.arrays` described."""
-    settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
-    bands = from_field_arrays(Bands, arrays)
-    waves = waves_of(kind, bands, settings.max_distance_m)
-    network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
-    return OptML(kind, bands, settings, network)
-
-
-SOURCE = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
-MODEL = Model("optml", ("csi",), OptMLSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = OptMLModel()

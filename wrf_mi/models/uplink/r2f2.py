@@ -37,8 +37,8 @@ from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
 from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays, keyed, under
-from .csi_bands import Bands, bands_of, known_rows, principal_axes, relative_error
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, under
+from .csi_bands import Bands, UplinkModel, bands_of, known_rows, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
 
@@ -239,14 +239,6 @@ class R2F2(Fitted):
         return {"wavefront": np.array(self.kind)} | field_arrays(self.bands) | keyed("settings/", settings)
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
-    """Choose the wave model and, where frequencies are unknown, the bands."""
-    settings, record = problem.settings, problem.record
-    with_scene = problem.scene is not None
-    chosen = choose(MODEL.name, record, split, settings, session.report, with_scene)
-    return R2F2(*chosen, settings, _scene_paths(problem, settings))
-
-
 def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
     if problem.scene is None:
         return None
@@ -254,12 +246,26 @@ def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
     return ScenePaths(problem.opened_scene, problem.record.receivers[0], problem.record.tx_antenna, options)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
-    """The model that `R2F2.arrays` described."""
-    settings = {name: value.item() for name, value in under("settings/", arrays).items()}
-    found = PathSettings(**settings)
-    return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
+class R2F2Model(UplinkModel):
+    """R2F2, from the paths of a scene where there is one."""
+
+    name, settings = "r2f2", PathSettings
+    source = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
+    summary = "paths fitted to the uplink"
+    scene = "optional"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> R2F2:
+        """Choose the wave model and, where frequencies are unknown, the bands."""
+        settings, record = problem.settings, problem.record
+        with_scene = problem.scene is not None
+        chosen = choose(self.name, record, split, settings, session.report, with_scene)
+        return R2F2(*chosen, settings, _scene_paths(problem, settings))
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
+        """The model that `R2F2.arrays` described."""
+        settings = {name: value.item() for name, value in under("settings/", arrays).items()}
+        found = PathSettings(**settings)
+        return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
 
 
-SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
-MODEL = Model("r2f2", ("csi",), PathSettings, fit, load, SOURCE, scene="optional", uplink="required", headings=True)
+MODEL = R2F2Model()
