@@ -26,8 +26,7 @@ from ...tracing.paths.solve import Prepared
 from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ...tracing.tracer import check_polarization
 from ..held_out import HeldOut, held_out_predictions, hold_out
-from ..interpolation.by_task import STOPS
-from ..interpolation.kriging import SOURCE
+from ..interpolation.by_task import STOPS, StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Inputs, Model, Problem, Session
 from .mixture import unit_means
@@ -139,7 +138,7 @@ class StrengthsInScene(Model):
         mean: mean of all receivers; None: the local mean.
     """
 
-    name, source, settings = "strengths", SOURCE, object
+    name, source, settings = "strengths", StrengthKriging.source, object
     tasks, gaps = ("rssi",), (STOPS,)
     scene, uplink, headings = "required", "optional", True
     several_carriers, new_receivers = True, True

@@ -4,72 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from ...core import InputError, Receiver, Record, Split
-from ...tasks import task_of
+from ...core import InputError, Split
 from ...training.session import FitSession
 from ..model import Arrays, Fitted, Model, Problem, known_positions
-from .by_receiver import ByReceiverModel, ReceiverRows, Single
-from .diffuse import fit_channels, load_channels
-from .kriging import SOURCE, KrigingSettings, fit_generic, load_generic
-from .spectra import SpectrumKrigingSettings, fit_spectra, load_spectra
+from .diffuse import ChannelKriging
+from .kriging import GenericKriging, KrigingSettings
+from .spectra import SpectrumKriging, SpectrumKrigingSettings
 from .strengths import Strengths, StrengthSettings, fit_strengths
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
-
-
-class GenericKriging(ByReceiverModel):
-    """Kriging of any observations, each receiver by itself."""
-
-    name, source, summary = "kriging", SOURCE, "kriging (Gaussian process)"
-    settings: type = KrigingSettings
-
-    def takes_headings(self, record: Record, settings: Any) -> bool:
-        """Whether settings and task let headings count."""
-        return bool(settings.heading and task_of(record).in_decibel)
-
-    def fit_single(self, rows: ReceiverRows) -> Single:
-        """Kriging of the observations of one receiver."""
-        return fit_generic(rows)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The kriging of one receiver."""
-        return load_generic(receiver, arrays)
-
-
-class SpectrumKriging(GenericKriging):
-    """Kriging of spectra, which do not depend on how the transmitter is turned."""
-
-    settings: type = SpectrumKrigingSettings
-    headings = False
-
-    def takes_headings(self, record: Record, settings: Any) -> bool:
-        """Never."""
-        return False
-
-    def fit_single(self, rows: ReceiverRows) -> Single:
-        """Kriging of the spectra of one receiver, see `fit_spectra`."""
-        return fit_spectra(rows)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The model of one receiver."""
-        return load_spectra(receiver, arrays)
-
-
-class ChannelKriging(SpectrumKriging):
-    """Kriging of channels, which do not depend on how the transmitter is turned."""
-
-    settings = KrigingSettings
-
-    def fit_single(self, rows: ReceiverRows) -> Single:
-        """Kriging of the channels of one receiver, see `fit_channels`."""
-        return fit_channels(rows)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The model of one receiver."""
-        return load_channels(receiver, arrays)
 
 
 class StrengthKriging(GenericKriging):
@@ -101,8 +46,12 @@ class StrengthKriging(GenericKriging):
                 raise InputError(f"split {split.name}: {text}; choose mri, or leave them rows, as receiver+20 does")
 
 
+GENERIC = GenericKriging()
+BY_TASK: Mapping[str, Model] = {"rssi": StrengthKriging(), "spectrum": SpectrumKriging(), "csi": ChannelKriging()}
+
+
 class KrigingModel(StrengthKriging):
-    """Kriging of any task; what holds of one task at least, the model states before the data are known."""
+    """Kriging of any task; of strengths it serves receivers without rows, which it states before the data are known."""
 
     def serving(self, task: str, with_scene: bool) -> Model:
         """Kriging with the covariance that suits a task."""
@@ -117,6 +66,4 @@ class KrigingModel(StrengthKriging):
         }
 
 
-GENERIC = GenericKriging()
-BY_TASK = {"rssi": StrengthKriging(), "spectrum": SpectrumKriging(), "csi": ChannelKriging()}
 MODEL = KrigingModel()

@@ -19,7 +19,7 @@ from ...core import Prediction, Receiver
 from ...core.angles import FloatArray
 from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import UncertainKriged, fit_generic, load_generic
+from .kriging import GenericKriging, UncertainKriged, kriged
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32
@@ -168,30 +168,34 @@ class KrigedChannels:
         return cls(receiver.position_m, arrays["k"], complex(arrays[GAIN]), field, arrays["like"].dtype)
 
 
-def fit_channels(rows: ReceiverRows) -> Single:
-    """Kriging of the channels of one receiver: line of sight and diffuse field where clearly better, else generic.
+class ChannelKriging(GenericKriging):
+    """Kriging of channels: line of sight and diffuse field where they are clearly better, else generic."""
 
-    Raises:
-        InputError: no row that was received, or channels that are all zero.
-    """
-    record = rows.problem.record
-    if rows.problem.settings.is_generic or record.frequencies_hz is None or rows.observation.ndim != 2:
-        return fit_generic(rows)
-    position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
-    generic = UncertainKriged.of(fit_generic(rows), observed)
-    if len(observed) < LEAST_ROWS:
-        return generic
-    k = np.broadcast_to(2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light, observed.shape[1])
-    channels = KrigedChannels.fit(position_m, observed, rows.receiver.position_m, k)
-    left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(), channels.left_out())]
-    # Of logarithms, as accuracy is scored in decibels, and so that no strong row near the receiver decides alone. A
-    # share of the power is added, below which an error no longer counts.
-    generic_log, channels_log = np.log(np.array(left) + NEGLIGIBLE * np.square(np.abs(observed)).mean())
-    gain = generic_log - channels_log
-    # Few rows prefer one of both by chance, and generic kriging, which assumes least, is then the safer one.
-    return channels if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)) else generic
+    headings = False  # antennas are isotropic
 
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the channels of one receiver.
 
-def load_channels(receiver: Receiver, arrays: Arrays) -> Single:
-    """The model of a receiver that `fit_channels` made."""
-    return KrigedChannels.from_arrays(arrays, receiver) if GAIN in arrays else load_generic(receiver, arrays)
+        Raises:
+            InputError: no row that was received, or channels that are all zero.
+        """
+        record = rows.problem.record
+        if rows.problem.settings.is_generic or record.frequencies_hz is None or rows.observation.ndim != 2:
+            return kriged(rows)
+        position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
+        generic = UncertainKriged.of(kriged(rows), observed)
+        if len(observed) < LEAST_ROWS:
+            return generic
+        k = np.broadcast_to(2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light, observed.shape[1])
+        channels = KrigedChannels.fit(position_m, observed, rows.receiver.position_m, k)
+        left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(), channels.left_out())]
+        # Of logarithms, as accuracy is scored in decibels, and so that no strong row near the receiver decides alone. A
+        # share of the power is added, below which an error no longer counts.
+        generic_log, channels_log = np.log(np.array(left) + NEGLIGIBLE * np.square(np.abs(observed)).mean())
+        gain = generic_log - channels_log
+        # Few rows prefer one of both by chance, and generic kriging, which assumes least, is then the safer one.
+        return channels if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)) else generic
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The kriging of a receiver from its arrays."""
+        return KrigedChannels.from_arrays(arrays, receiver) if GAIN in arrays else super().load_single(receiver, arrays)

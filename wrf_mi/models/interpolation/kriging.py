@@ -18,11 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver
+from ...core import InputError, Prediction, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from .by_receiver import ReceiverRows, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
@@ -330,11 +331,33 @@ class KrigingSettings(CovarianceSettings):
         return any(getattr(self, one.name) != one.default for one in only)
 
 
+class GenericKriging(ByReceiverModel):
+    """Kriging of any observations, each receiver by itself."""
+
+    name, summary = "kriging", "kriging (Gaussian process)"
+    source = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
+    settings: type = KrigingSettings
+
+    def takes_headings(self, record: Record, settings: KrigingSettings) -> bool:
+        """Whether the settings let headings count, which matter to strengths alone."""
+        return settings.heading and task_of(record).in_decibel
+
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the observations themselves, see `kriged`."""
+        return kriged(rows)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The kriging of a receiver from its arrays."""
+        if SCALE not in arrays:
+            return Kriged.from_arrays(arrays, receiver)
+        return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])
+
+
 def _trend(name: str, receiver: Receiver) -> Trend:
     return Trend(receiver.position_m if name == LOG_DISTANCE else None)
 
 
-def fit_generic(rows: ReceiverRows) -> Kriged:
+def kriged(rows: ReceiverRows) -> Kriged:
     """Kriging of the observations of one receiver.
 
     Raises:
@@ -344,19 +367,10 @@ def fit_generic(rows: ReceiverRows) -> Kriged:
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
-    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
-    given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-    kriging = Kriging(*given, _trend(name, rows.receiver), how, rows.problem.seed)
+    # The law of distance is that of the whole room: each row weighs the same in it, however dense the rows around it.
+    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
+    stated = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
+    kriging = Kriging(*stated, _trend(name, rows.receiver), how, rows.problem.seed)
     return kriging.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)
-
-
-SOURCE = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
-
-
-def load_generic(receiver: Receiver, arrays: dict[str, NDArray[Any]]) -> Kriged:
-    """The kriging of a receiver from its arrays."""
-    if SCALE not in arrays:
-        return Kriged.from_arrays(arrays, receiver)
-    return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])

@@ -39,7 +39,7 @@ from ...tasks.scores import REAL_90
 from ...training.session import OnProgress
 from ..model import Arrays, field_arrays, from_field_arrays, keyed
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import KrigingSettings, UncertainKriged, fit_generic, load_generic
+from .kriging import GenericKriging, KrigingSettings, UncertainKriged, kriged
 from .kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
@@ -159,8 +159,6 @@ class ExpectedSpectrum:
 class KrigedSpectra:
     """Fitted model of one receiver.
 
-    A spectrum has no scale on which the transmitter's pattern could act, so headings change nothing.
-
     Attributes:
         signals, nearby, report: process of the signals, kriging of the spectra, and expected spectrum of signals.
         half: c, the share of unknown variance at which the signals have half of the weight.
@@ -241,7 +239,7 @@ class KrigedSpectra:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedSpectra:
         """The model that `arrays` stored."""
-        assert receiver.array_m is not None, "see `fit_spectra`"
+        assert receiver.array_m is not None, "see `SpectrumKriging`"
         process = SignalProcess.from_arrays(arrays, "signals/")
         nearby = from_field_arrays(AnisotropicKriging, arrays, "nearby/")
         height, width = (int(v) for v in arrays["shape"])
@@ -252,36 +250,6 @@ class KrigedSpectra:
 def signal_weight(ignorance: FloatArray, half: float) -> FloatArray:
     """Weight of the signals [q] for their shares of unknown variance [q] and c."""
     return ignorance**2 / (ignorance**2 + half**2) * (1 - ignorance)
-
-
-def fit_spectra(rows: ReceiverRows) -> Single:
-    """Kriging of the spectra of one receiver.
-
-    Signals mixed with the spectra nearby where array and single carrier are known, the array's spectra determine its
-    signals, and their covariances fit into the memory. Else the generic kriging, with standard deviations where array
-    and carrier are known.
-
-    Raises:
-        InputError: no row that was received.
-    """
-    record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
-    if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
-        return fit_generic(rows)
-    position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
-    frequency_hz = float(frequencies_hz[0])
-    with one_blas_thread():
-        if len(observed) >= LEAST_ROWS:
-            try:
-                lags = Lags(receiver.array_m, frequency_hz, *observed.shape[1:])
-                if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
-                    raise InputError(f"{len(observed)} rows are too many for a process of element signals")
-                signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
-            except InputError as error:  # or a line of elements, or elements too far apart for lags
-                what = f"{record.name}, receiver {receiver.name}"
-                logger.warning("%s: the spectra themselves are kriged: %s", what, error)
-            else:
-                return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
-        return UncertainKriged.of(fit_generic(rows), observed)
 
 
 def _retrieved(observed: NDArray[Any], lags: Lags, seed: int, on_progress: OnProgress) -> ComplexArray:
@@ -321,14 +289,6 @@ def _fit_signals_and_nearby(
     _fit_weights(kriged, observed, wavelength, seed, part("weights"))
     process.forget_precision()
     return kriged
-
-
-def load_spectra(receiver: Receiver, arrays: Arrays) -> Single:
-    """The model of a receiver that `fit_spectra` made."""
-    if FREQUENCY not in arrays:
-        return load_generic(receiver, arrays)
-    with one_blas_thread():  # factors to the last digit those of the fit
-        return KrigedSpectra.from_arrays(arrays, receiver)
 
 
 def _fit_weights(
@@ -373,3 +333,45 @@ def _fit_weights(
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))
     kriged.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / REAL_90)
+
+
+class SpectrumKriging(GenericKriging):
+    """Kriging of spectra: element signals mixed with the spectra nearby where the array is known, else generic."""
+
+    settings = SpectrumKrigingSettings
+    headings = False  # a spectrum has no scale on which the transmitter's pattern could act
+
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the spectra of one receiver.
+
+        Signals are used where array and single carrier are known, the array's spectra determine its signals, and their
+        covariances fit into the memory. Generic kriging states standard deviations where array and carrier are known.
+
+        Raises:
+            InputError: no row that was received.
+        """
+        record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
+        if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
+            return kriged(rows)
+        position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
+        frequency_hz = float(frequencies_hz[0])
+        with one_blas_thread():
+            if len(observed) >= LEAST_ROWS:
+                try:
+                    lags = Lags(receiver.array_m, frequency_hz, *observed.shape[1:])
+                    if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
+                        raise InputError(f"{len(observed)} rows are too many for a process of element signals")
+                    signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
+                except InputError as error:  # or a line of elements, or elements too far apart for lags
+                    what = f"{record.name}, receiver {receiver.name}"
+                    logger.warning("%s: the spectra themselves are kriged: %s", what, error)
+                else:
+                    return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
+            return UncertainKriged.of(kriged(rows), observed)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The model of a receiver from its arrays."""
+        if FREQUENCY not in arrays:
+            return super().load_single(receiver, arrays)
+        with one_blas_thread():  # factors to the last digit those of the fit
+            return KrigedSpectra.from_arrays(arrays, receiver)
