@@ -30,8 +30,7 @@ from .model import (
     under,
 )
 
-INTERVALS, ROWS = "intervals/", "intervals_rows"
-"""Prefix of the arrays of intervals, and key of the training rows."""
+INTERVALS, ROWS = "intervals/", "intervals_rows"  # prefix of the arrays of intervals, and key of the training rows
 
 
 class FittedWithIntervals(Fitted):

@@ -53,8 +53,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
-WITHOUT_PATH = 0.05
-"""Share of measured values without a path from which on walls that nothing passes are suspected."""
+WITHOUT_PATH = 0.05  # share of measured values without a path from which on walls that nothing passes are suspected
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
 alone, a part of any size costs as much as a few hundred positions."""

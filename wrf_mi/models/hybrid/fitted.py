@@ -22,8 +22,7 @@ from .paths import by_stage
 from .residuals import Residuals
 from .scene_side import SceneSide
 
-NEGLIGIBLE = 1e-3
-"""Weight below which a part is not evaluated: its share of the prediction."""
+NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
 STATED, PREDICTED = "stated", "predicted"
 """Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
 

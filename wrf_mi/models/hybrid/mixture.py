@@ -16,8 +16,7 @@ KNOTS, KNOT_ROWS = 4, 20
 FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
 
-DOUBT = 2.0
-"""Standard errors of a difference that is clear: by chance five rows exceed one of them one time in five."""
+DOUBT = 2.0  # standard errors of a difference that is clear: by chance five rows exceed one of them one time in five
 
 RowScores = Callable[[FloatArray, IntArray], FloatArray]
 """From weights [n, k] of some held-out observations and their numbers [n] to scores [n], the higher the better."""
@@ -77,8 +76,7 @@ def by_distance(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: 
 
 FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
 """Forms of the weights, in the order of their freedom."""
-SINGLE = "single"
-"""Form before these: one prediction alone, which is named beforehand."""
+SINGLE = "single"  # form before these: one prediction alone, which is named beforehand
 
 
 def choose(

@@ -23,8 +23,7 @@ logger = logging.getLogger(__name__)
 PATHS, KRIGING = "paths", "kriging"
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
-TRACED = (PATHS, "r2f2-scene")
-"""Parts that are given the scene."""
+TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,7 @@ from .scene_side import (
     too_few,
 )
 
-OFFSET_ROWS = 400
-"""Most training rows whose traces tell the offset of a receiver."""
+OFFSET_ROWS = 400  # most training rows whose traces tell the offset of a receiver
 
 
 def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainConfig:

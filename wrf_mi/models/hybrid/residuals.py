@@ -15,8 +15,7 @@ from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Fitted, keyed, under
 
-LEAST_RESIDUALS = 3
-"""Fewest rows of a receiver whose residuals are interpolated."""
+LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
 
 
 class Residuals:

@@ -35,10 +35,8 @@ MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = (
     "field",
     "residual",
 )
-OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))
-"""Parts of a correction beyond materials and gains."""
-STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)
-"""Stages in their order."""
+OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parts of a correction beyond materials and gains
+STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)  # stages in their order
 FAST = tuple(stage for stage in STAGES if stage != FIELD)
 """Stages without the one whose training takes most of the time."""
 

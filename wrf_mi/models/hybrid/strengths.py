@@ -34,15 +34,11 @@ from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
-REACH = STRENGTHS.depth, STRENGTHS.reflections
-"""Interactions of a path at most, and reflections among them."""
+REACH = STRENGTHS.depth, STRENGTHS.reflections  # interactions of a path at most, and reflections among them
 DEFAULT = StrengthSettings()
-SEARCH_ROWS = 30
-"""Least number of rows by which hyperparameters about an exact mean are searched."""
-HELD = "held"
-"""Folder of the predictions of held-out rows."""
-NEVER = 2**31
-"""`StrengthSettings.search_rows` above any number of rows."""
+SEARCH_ROWS = 30  # least number of rows by which hyperparameters about an exact mean are searched
+HELD = "held"  # folder of the predictions of held-out rows
+NEVER = 2**31  # `StrengthSettings.search_rows` above any number of rows
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
 

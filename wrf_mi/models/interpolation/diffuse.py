@@ -25,16 +25,12 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
 """Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
-CERTAIN = 3.0
-"""Standard errors by which predictions with the field must be better than without."""
+CERTAIN = 3.0  # standard errors by which predictions with the field must be better than without
 LEAST_ROWS = 8
 """Least number of rows that may choose the line of sight: its gain, fitted to all of them, flatters them by 2 / n."""
-NEGLIGIBLE = 1e-8
-"""Share of the mean power, -80 dB, below which an error no longer counts in the choice."""
-NEAREST_M = 0.01
-"""Least distance of the line of sight: below 1 cm no antenna is a point."""
-GAIN = "gain"
-"""Key of the arrays that generic kriging has not."""
+NEGLIGIBLE = 1e-8  # share of the mean power, -80 dB, below which an error no longer counts in the choice
+NEAREST_M = 0.01  # least distance of the line of sight: below 1 cm no antenna is a point
+GAIN = "gain"  # key of the arrays that generic kriging has not
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ HEADING_LENGTH = (0.1, 100.0)
 NOISE = (1e-4, 10.0)
 """Limits of the likelihood's maximum: metres, chords of the unit circle (2 is the opposite heading), shares of the
 variance."""
-LIKELIHOOD_EVALUATIONS = 200
-"""Nelder-Mead on three logarithms settles to 0.01 in 60 to 150."""
+LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 in 60 to 150
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,7 @@ class Trend:
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-SCALE = "scale"
-"""Key of the arrays that kriging without standard deviations has not."""
+SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
 KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
 """Attributes of `Kriged` that are stored as they are."""
 

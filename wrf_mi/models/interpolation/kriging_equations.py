@@ -37,18 +37,12 @@ from ...core.types import IntArray
 
 Values = NDArray[Any]
 
-LENGTH = (0.03, 30.0)
-"""Bounds of the lengths in wavelengths."""
-NOISE = (1e-3, 1.0)
-"""Bounds of the noise as a share of the variance, at least that of 8 bits."""
-START = (0.3, 0.3, 0.3, 0.01)
-"""Three lengths and noise from which the search starts."""
-PIXELS = 4700
-"""Approximate number of pixels in the likelihood: neighbouring pixels are redundant."""
-VARIANCE = 1e-12
-"""Least variance of grey values, for equal spectra."""
-MOST_ROWS = 400
-"""Rows in the likelihood at most."""
+LENGTH = (0.03, 30.0)  # bounds of the lengths in wavelengths
+NOISE = (1e-3, 1.0)  # bounds of the noise as a share of the variance, at least that of 8 bits
+START = (0.3, 0.3, 0.3, 0.01)  # three lengths and noise from which the search starts
+PIXELS = 4700  # approximate number of pixels in the likelihood: neighbouring pixels are redundant
+VARIANCE = 1e-12  # least variance of grey values, for equal spectra
+MOST_ROWS = 400  # rows in the likelihood at most
 
 KERNELS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "exponential": lambda d: np.exp(-d),

@@ -39,22 +39,15 @@ from ..model import field_arrays, from_field_arrays
 from .kriging_equations import KrigingSystem, chosen_rows, left_out
 
 ComplexArray = NDArray[np.complex128]
-LEAST_NOISE = 3e-3
-"""Least noise as a share of a signal's power, below the resolution of 8-bit spectra."""
-NEGLIGIBLE = 1e-4
-"""Shares below this part of the greatest are dropped during the iteration."""
-TINY = 1e-100
-"""Least denominator."""
-RICH = 8
-"""Principal components with the whole dictionary; the others, some per cent of the power, have no turns."""
+LEAST_NOISE = 3e-3  # least noise as a share of a signal's power, below the resolution of 8-bit spectra
+NEGLIGIBLE = 1e-4  # shares below this part of the greatest are dropped during the iteration
+TINY = 1e-100  # least denominator
+RICH = 8  # principal components with the whole dictionary; the others, some per cent of the power, have no turns
 ROUNDS = 3
 STEPS = 25
-SWEEPS = 3
-"""Sweeps of alignment in each round: rows stop changing after two."""
-LEAST_POWER = 1e-6
-"""Least power of a component, a row's being 1: with fewer rows than elements some are only rounding."""
-MOST_ROWS = 320
-"""Rows of the fit of shares at most: its time grows with their cube."""
+SWEEPS = 3  # sweeps of alignment in each round: rows stop changing after two
+LEAST_POWER = 1e-6  # least power of a component, a row's being 1: with fewer rows than elements some are only rounding
+MOST_ROWS = 320  # rows of the fit of shares at most: its time grows with their cube
 STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
 
 

@@ -47,28 +47,20 @@ logger = logging.getLogger(__name__)
 
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Radii in wavelengths around a held-out row within which no row is used while the weights are fitted."""
-HELD_OUT = 80
-"""Held-out training rows at most."""
-INTERVAL = 0.9
-"""Share of errors that calibrated intervals cover."""
-UNSCALED_PER_CHUNK = 128
-"""Spectra whose element signals are retrieved together."""
-CHUNK = 16
-"""Transmitters predicted together, which bounds the memory of images with draws."""
+HELD_OUT = 80  # held-out training rows at most
+INTERVAL = 0.9  # share of errors that calibrated intervals cover
+UNSCALED_PER_CHUNK = 128  # spectra whose element signals are retrieved together
+CHUNK = 16  # transmitters predicted together, which bounds the memory of images with draws
 MOST_COVARIANCES = 6.4e7
 """Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
 Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
 """
-STARTS = 60
-"""Starts of the phase retrieval of one spectrum, at most."""
-LEAST_ROWS = 8
-"""Least number of spectra for a covariance of signals."""
+STARTS = 60  # starts of the phase retrieval of one spectrum, at most
+LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
-FREQUENCY = "frequency_hz"
-"""Key of the arrays that generic kriging has not."""
+FREQUENCY = "frequency_hz"  # key of the arrays that generic kriging has not
 DRAWS = 64
-COARSE = 0.1
-"""Spacing of the directions of draws as a share of a lobe's width, wavelength over aperture."""
+COARSE = 0.1  # spacing of the directions of draws as a share of a lobe's width, wavelength over aperture
 CLEAR = 100.0
 """Ratio above which the Rician's moments are taken from their series, which has six digits where differences cancel."""
 

@@ -36,31 +36,20 @@ Result = TypeVar("Result")
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
 
-THREADED_ROWS = 1000
-"""Rows of all receivers from which these are computed on threads."""
-JITTER = 1e-9
-"""Noise added to coincident inputs, as a share of the field's variance."""
-DEGREES = 4.0
-"""Degrees of freedom of the noise's Student-t distribution: fades are deep."""
-FREE_SPACE = 2.0
-"""Exponent of the distance in free space."""
+THREADED_ROWS = 1000  # rows of all receivers from which these are computed on threads
+JITTER = 1e-9  # noise added to coincident inputs, as a share of the field's variance
+DEGREES = 4.0  # degrees of freedom of the noise's Student-t distribution: fades are deep
+FREE_SPACE = 2.0  # exponent of the distance in free space
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
-BUFFER = 0.25
-"""Share of a stretch that is left out on either side of it, as consecutive rows share noise."""
-LEAST_GAIN_DB = 0.005
-"""Least reduction of the held-out error by which the search changes a parameter."""
-MOST_STEPS = 5
-"""Steps of one parameter in one direction."""
-TRUST = 500.0
-"""Number of held-out values that weigh as much as the prior in estimates from their distribution."""
-SKEW_TRUST = 2000.0
-"""The same number for the middle of their narrowest half, which is less certain than a mean."""
-RATIO = (0.5, 2.0)
-"""Bounds of the ratio of a receiver's noise to that of all."""
-COVERED = 0.9
-"""Share of residuals that calibrated intervals cover."""
+BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
+LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
+MOST_STEPS = 5  # steps of one parameter in one direction
+TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
+SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
+RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
+COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
 def _of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:

@@ -24,18 +24,14 @@ from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
 
-NEAREST_M = 0.05
-"""Least distance between antennas in the law of distance."""
+NEAREST_M = 0.05  # least distance between antennas in the law of distance
 HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
 RX_HARMONICS = 2
-GAP = 5
-"""A stop ends where so many rows of the record are not among the given rows."""
-SEARCH_STEP = 1.5
-"""Factor of one step of the search for hyperparameters."""
+GAP = 5  # a stop ends where so many rows of the record are not among the given rows
+SEARCH_STEP = 1.5  # factor of one step of the search for hyperparameters
 LEVER_STEP_M = 0.1
-NOISE = "noise"
-"""Name of both noise terms in the search."""
+NOISE = "noise"  # name of both noise terms in the search
 MOST_PAIRS = 2
 """Pairs of a distinct position and a distinct heading, relative to the poses, up to which all pairs are evaluated."""
 

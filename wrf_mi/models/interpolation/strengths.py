@@ -29,27 +29,19 @@ from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
 
-HEADINGS = 8
-"""Headings over which the prediction is averaged where the heading is unknown."""
-CHUNK = 1024
-"""Transmitters predicted together, which bounds the memory of their covariances with the rows."""
+HEADINGS = 8  # headings over which the prediction is averaged where the heading is unknown
+CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
-WIDER = 2.0
-"""Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
-SKEW_DB = 0.4
-"""Shift of predictions a priori, as fades reach deeper than peaks."""
-OFFSET_SD_DB = 10.0
-"""Standard deviation of the common offset of all receivers about the transmit power a priori."""
+WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
+SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
+OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
-TRACED_SD = (0.5, 0.2)
-"""Likewise of the factor of the traced decibels about 1."""
-BODY_PATTERN_DB = (1.0, 0.2)
-"""Likewise of the first harmonic of the transmitter's pattern."""
-RECEIVER_PATTERN_DB = 2.0
-"""Standard deviation of the first harmonic of each receiver's pattern."""
+TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
+BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
+RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
 
 
 @dataclass(frozen=True)

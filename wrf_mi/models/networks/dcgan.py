@@ -40,14 +40,10 @@ from .layers import GAIN, Linear, Module, columns, feature_count, relu
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 
-NORM_FLOOR = 1e-5
-"""Added to variances: an image may be flat."""
-LEVELS = 3
-"""Convolutions of stride two in either network."""
-leaky = nn.LeakyReLU(0.2)
-"""Activation of the discriminator (Radford et al.)."""
-MOMENTUM = 0.5
-"""Adam's decay of the first moment (Radford et al.)."""
+NORM_FLOOR = 1e-5  # added to variances: an image may be flat
+LEVELS = 3  # convolutions of stride two in either network
+leaky = nn.LeakyReLU(0.2)  # activation of the discriminator (Radford et al.)
+MOMENTUM = 0.5  # Adam's decay of the first moment (Radford et al.)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from ...gaussians.encoding import encode, encoded_size
 
 GAIN = float(np.sqrt(2.0))
 """Deviation of initial weights times the root of a layer's inputs, where a rectifier follows (He et al. 2015)."""
-LEAST_M = 1e-3
-"""Smallest extent that coordinates are divided by: all rows may lie at one height."""
+LEAST_M = 1e-3  # smallest extent that coordinates are divided by: all rows may lie at one height
 relu = nn.ReLU()
 
 

@@ -69,10 +69,8 @@ from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
 from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 
-DB_UNIT = 10.0
-"""Unit of the loss of signal strengths, dB."""
-POINTS_PER_CHUNK = 1 << 15
-"""Points whose attenuation is evaluated together in predictions."""
+DB_UNIT = 10.0  # unit of the loss of signal strengths, dB
+POINTS_PER_CHUNK = 1 << 15  # points whose attenuation is evaluated together in predictions
 PAIRS_PER_CHUNK = 1 << 18
 """Pairs of a point and a condition that are evaluated together in predictions: bounds the memory."""
 
@@ -295,10 +293,8 @@ def step_loss(network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str
     return dr.mean(error * error, axis=None).array
 
 
-SCORED_RAYS = 512
-"""Pixels of each validation spectrum by which steps are chosen."""
-FAR_M = 10.0
-"""Length of rays if positions are not known: the size of a large room."""
+SCORED_RAYS = 512  # pixels of each validation spectrum by which steps are chosen
+FAR_M = 10.0  # length of rays if positions are not known: the size of a large room
 
 
 def _fit_group(

@@ -34,8 +34,7 @@ from ...core.settings import Count, Positive
 from ...gaussians.parameters import logistic
 from .layers import Linear, Mlp, Module, feature_count, relu, with_encoding
 
-LEAK = 0.01
-"""Slope of the leaky ReLU below zero, PyTorch's default."""
+LEAK = 0.01  # slope of the leaky ReLU below zero, PyTorch's default
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,8 @@ from ...training.state import FitState
 from ..model import keyed, under
 from .layers import Module
 
-HOLD_OUT = 0.8
-"""Share of the steps with a constant rate and validation rows kept out of training."""
-FINISHED = "finished/"
-"""Prefix in ``checkpoint.npz`` of the arrays of networks whose training has ended."""
+HOLD_OUT = 0.8  # share of the steps with a constant rate and validation rows kept out of training
+FINISHED = "finished/"  # prefix in ``checkpoint.npz`` of the arrays of networks whose training has ended
 
 
 def network_adam(rate: float = 1e-3) -> AdamConfig:

@@ -50,11 +50,9 @@ from ..networks.vae import normal_divergence
 from .csi_bands import Bands, UplinkModel, bands_of, known_rows, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
-CHUNK_SIZE = 4096
-"""Samples that are predicted together: bounds the memory."""
+CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
 leaky = nn.LeakyReLU(0.1)
-WEAK = 0.3
-"""Share of the root mean square below which a sum over subcarriers has no reliable phase."""
+WEAK = 0.3  # share of the root mean square below which a sum over subcarriers has no reliable phase
 
 
 @dataclass(frozen=True)

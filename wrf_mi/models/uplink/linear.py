@@ -32,10 +32,8 @@ from .csi_bands import UplinkModel, known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
-JUDGES = 5
-"""Without validation rows, every so-many-th training row chooses the penalty."""
-CHUNK_SIZE = 256
-"""Rows whose products are added together: bounds the memory beside the data."""
+JUDGES = 5  # without validation rows, every so-many-th training row chooses the penalty
+CHUNK_SIZE = 256  # rows whose products are added together: bounds the memory beside the data
 
 
 @dataclass(frozen=True)

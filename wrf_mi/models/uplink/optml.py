@@ -52,12 +52,9 @@ from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import ArrayWaves, Complex, Mask, Waves, waves_of
 
-FLOOR_DB = 30.0
-"""Range of maps, dB: 0 is this far below the strongest path, 1 the strongest path."""
-BLUR = 1.0
-"""Width of a path in the map to be learned, in cells."""
-CHUNK_SIZE = 256
-"""Maps that are made together: bounds the memory."""
+FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
+BLUR = 1.0  # width of a path in the map to be learned, in cells
+CHUNK_SIZE = 256  # maps that are made together: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -198,8 +195,7 @@ def side_by_side(maps: NDArray[np.float32]) -> Any:
     return to_tensor(maps.transpose(1, 0, 2).reshape(maps.shape[1], -1))
 
 
-MAX_VALIDATION = 100
-"""Most maps that validate."""
+MAX_VALIDATION = 100  # most maps that validate
 
 
 @dataclass(frozen=True)

@@ -42,18 +42,13 @@ from .csi_bands import Bands, UplinkModel, bands_of, known_rows, principal_axes,
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
 
-CHUNK_SIZE = 256
-"""Positions that are traced together."""
+CHUNK_SIZE = 256  # positions that are traced together
 LENGTH_SD_M, COSINE_SD = 0.3, 0.03
 """Standard deviations of a path's length and its direction's cosines, by a mesh that is some centimetres off."""
-ALIKE_M, ALIKE_COSINE = 0.02, 0.01
-"""Paths that differ by less count as one."""
-FAINT = 10 ** (-50 / 20)
-"""Least amplitude of a path, as a share of the root mean square of all."""
-MOST = 70
-"""Most traced paths of a row, the strongest."""
-NEEDED = 1e-4
-"""Least power of a path in the uplink, as a share of the strongest path's."""
+ALIKE_M, ALIKE_COSINE = 0.02, 0.01  # paths that differ by less count as one
+FAINT = 10 ** (-50 / 20)  # least amplitude of a path, as a share of the root mean square of all
+MOST = 70  # most traced paths of a row, the strongest
+NEEDED = 1e-4  # least power of a path in the uplink, as a share of the strongest path's
 
 
 class ScenePaths:
@@ -135,8 +130,7 @@ def distinct(theta: FloatArray, strength: FloatArray) -> FloatArray:
 
 
 Kind = Literal["auto", "spherical", "plane", "free"]
-BOTH_GAPS = (1, 2)
-"""Spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown."""
+BOTH_GAPS = (1, 2)  # spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown
 
 
 @dataclass(frozen=True)

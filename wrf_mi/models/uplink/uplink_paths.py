@@ -25,17 +25,12 @@ from .uplink_waves import SINGULAR, Complex, Mask, Solved, Waves, products, stro
 
 T = TypeVar("T")
 
-PASSES = 8
-"""Passes of `expected_gains`."""
+PASSES = 8  # passes of `expected_gains`
 
-ROWS = 16
-"""Rows refined together: more leave the processor's cache."""
-FIRST_STEPS = 4
-"""Steps of refinement of a new path before all are refined."""
-ACCURACY = 1e-26
-"""Share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums."""
-CONVERGED = 1e-9
-"""Relative fall of the residual's energy below which a refinement has converged."""
+ROWS = 16  # rows refined together: more leave the processor's cache
+FIRST_STEPS = 4  # steps of refinement of a new path before all are refined
+ACCURACY = 1e-26  # share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums
+CONVERGED = 1e-9  # relative fall of the residual's energy below which a refinement has converged
 
 
 @dataclass

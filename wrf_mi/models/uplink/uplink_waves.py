@@ -26,14 +26,11 @@ from .csi_bands import Bands
 Complex = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-AXIS_POINTS = 64
-"""Most points of the first search along one axis of the array: larger arrays start from a coarser grid."""
-FINE = 4
-"""Grid points of the first search in one resolution cell of distance."""
+AXIS_POINTS = 64  # most points of the first search along one axis of the array: larger arrays start from a coarser grid
+FINE = 4  # grid points of the first search in one resolution cell of distance
 UNIFORM = 1e-9
 """Distance from a grid, in spacings, of uniform subcarriers: a phase below the rounding of a path of 100 m."""
-SINGULAR = 1e-12
-"""Added to normal matrices, of the power of one path: two equal paths then share their gain."""
+SINGULAR = 1e-12  # added to normal matrices, of the power of one path: two equal paths then share their gain
 
 
 @dataclass
