@@ -18,10 +18,8 @@ from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
+# Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
 HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
-"""Keys of the arrays: whether headings are used, and where there are several carriers these, and numbers of models that
-there are not.
-"""
 
 
 class Single(Protocol):
@@ -47,16 +45,12 @@ class Probabilistic(Single, Protocol):
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """Training rows of one receiver, some of which it may not have received, and what they belong to.
+    """Training rows of one receiver, and what they belong to.
 
     Attributes:
-        problem: data and settings.
-        split: split of the data.
-        receiver: the receiver.
         tx_pos_m: positions [n, 3], metres.
         observation: observations [n, ...]; NaN where nothing was received.
         tx_heading_rad: headings [n], or None to leave them out.
-        on_progress: progress callback.
     """
 
     problem: Problem
@@ -106,7 +100,6 @@ class ByReceiver(Fitted):
         name: name of the method, for errors.
         models: models of the receivers in turn, and so for each carrier; None: too few rows at that carrier.
         heading: whether the models use headings.
-        carriers_hz: carriers of the training rows, ascending; None: a single carrier.
     """
 
     name: str
@@ -154,6 +147,7 @@ class ByReceiver(Fitted):
         fitted, known_log = list(models.values()), np.log(self.carriers_hz[list(models)])
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
+            # Over log f, in which free-space path loss is linear; `interp` holds the outermost models beyond them.
             place = np.interp(np.log(carrier_hz), known_log, np.arange(len(known_log)))
             turned = None if heading is None else heading[rows]
 
@@ -161,6 +155,7 @@ class ByReceiver(Fitted):
                 return np.asarray(fitted[number].predict(tx_pos_m[rows], turned))
 
             below, share = int(place), place % 1
+            # At a carrier with a model no second one is evaluated, and none may exist above the last.
             return at(below) if share == 0 else (1 - share) * at(below) + share * at(below + 1)
 
         return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
@@ -168,6 +163,7 @@ class ByReceiver(Fitted):
     def _of(self, receiver: int) -> dict[int, Single]:
         """Models of a receiver by the number of the carrier."""
         carriers = 1 if self.carriers_hz is None else len(self.carriers_hz)
+        # Models run through the receivers of the first carrier, then of the next.
         models = enumerate(self.models[receiver :: len(self.models) // carriers])
         return {number: model for number, model in models if model is not None}
 
@@ -221,34 +217,37 @@ class ByReceiverModel(Model):
         Raises:
             InputError: unknown positions, or rows that the model of a receiver cannot be fitted to.
         """
-        record, rows, stated = problem.record, split.all_train, problem.record.carriers_hz
+        record, rows = problem.record, split.all_train
         known_positions(record, rows, self.name)
         headings = record.tx_heading_rad if self.takes_headings(record, problem.settings) else None
-        carriers = None if stated is None else np.unique(stated[rows])
-        parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
-        models: list[Single | None] = []
-        fits_in_all = len(parts) * len(record.receivers)
+        carriers, parts = None, [rows]
+        if record.carriers_hz is not None:
+            carriers_hz = record.carriers_hz[rows]
+            carriers = np.unique(carriers_hz)
+            parts = [rows[carriers_hz == carrier_hz] for carrier_hz in carriers]
         counts = np.stack([rows_received(record, part) for part in parts])
         # A receiver with few rows at one carrier is interpolated between its other carriers.
         enough = counts >= np.minimum(counts.max(axis=0), LEAST_ROWS)
-        for part, fits in zip(parts, enough, strict=True):
+        models: list[Single | None] = []
+        for part, has_rows in zip(parts, enough, strict=True):
             turned = None if headings is None else headings[part]
-            for receiver, observed, fit_it in zip(record.receivers, record.observation, fits, strict=True):
-                if not fit_it:
+            for receiver, observed, fits in zip(record.receivers, record.observation, has_rows, strict=True):
+                if not fits:
                     models.append(None)
                     continue
+                done, name = len(models), receiver.name
 
                 def report(
-                    stage: str, share: float, _: object = None, /, *, done: int = len(models), who: str = receiver.name
+                    stage: str, share: float, _: object = None, /, *, done: int = done, name: str = name
                 ) -> None:
-                    session.report(f"{who}: {stage}", (done + share) / fits_in_all)
+                    session.report(f"{name}: {stage}", (done + share) / enough.size)
 
+                rows_of = ReceiverRows(problem, split, receiver, record.tx_pos_m[part], observed[part], turned, report)
                 try:
-                    rows_of = record.tx_pos_m[part], observed[part], turned
-                    models.append(self.fit_single(ReceiverRows(problem, split, receiver, *rows_of, report)))
+                    models.append(self.fit_single(rows_of))
                 except InputError as error:
-                    raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-                session.report(f"{self.name}: receivers", len(models) / fits_in_all)
+                    raise InputError(f"{record.name}, receiver {name}: {error}") from None
+                session.report(f"{self.name}: receivers", len(models) / enough.size)
         return ByReceiver(self.name, models, headings is not None, carriers)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:

@@ -60,6 +60,7 @@ class DiffuseField:
         count = len(position_m)
         if self.share == 0 or len(self.position_m) <= skip:
             return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
+        # A few neighbours screen all others; the factor of all rows would cost their cube.
         near = min(NEIGHBOURS, len(self.position_m) - skip)
         distance, index = KDTree(self.position_m).query(position_m, k=list(range(1 + skip, near + skip + 1)))
         between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
@@ -94,13 +95,14 @@ def _scores(field: DiffuseField) -> FloatArray:
     """Score of each row predicted from the others [n]; robust to rows that lack a path."""
     mean, variance = field.predict(field.position_m, skip=1)
     error = np.square(np.abs(field.value - mean)).mean(axis=1)
+    # Of a Student-t-like density, whose tail a few rows without their line of sight do not dominate.
     return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
 
 
 def direct_wave(tx_pos_m: FloatArray, receiver_m: FloatArray, k: FloatArray) -> Complex:
     """Free-space channels [n, subcarriers] of unit gain at wave numbers k, rad/m; positions in metres."""
     phase = k * np.maximum(np.linalg.norm(tx_pos_m - receiver_m, axis=1), NEAREST_M)[:, None]
-    return np.asarray(np.exp(-1j * phase) / (2 * phase))
+    return np.asarray(np.exp(-1j * phase) / (2 * phase))  # Friis: wavelength / (4 pi d) = 1 / (2 k d)
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,7 @@ class KrigedChannels:
     def fit(cls, position_m: FloatArray, observed: Complex, receiver_m: FloatArray, k: FloatArray) -> KrigedChannels:
         """Gain by least squares, and the field of its residuals, from channels [n, subcarriers]."""
         direct = direct_wave(position_m, receiver_m, k)
+        # One complex gain for all subcarriers: antennas and cables are taken to be flat over the band.
         gain = complex(np.vdot(direct, observed) / np.vdot(direct, direct))
         field = fit_diffuse(position_m, observed - gain * direct, float(k.mean()))
         return cls(receiver_m, k, gain, field, observed.dtype)
@@ -148,8 +151,8 @@ class KrigedChannels:
         power_db = float(10 * np.log10(max(self.field.power, 1e-300)))
         gain_db = float(20 * np.log10(max(abs(self.gain), 1e-300)))
         gain = {"gain_db": gain_db, "gain_phase_rad": float(np.angle(self.gain))}
-        rest = {"diffuse_share": self.field.share, "rest_power_db": power_db}
-        return {"parts": "line of sight, diffuse field"} | gain | rest
+        diffuse = {"diffuse_share": self.field.share, "rest_power_db": power_db}
+        return {"parts": "line of sight, diffuse field"} | gain | diffuse
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""

@@ -58,8 +58,7 @@ class Trend:
 
 
 SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
-KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
-"""Attributes of `Kriged` that are stored as they are."""
+STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attributes of `Kriged` as they are
 
 
 @dataclass(frozen=True)
@@ -89,11 +88,7 @@ class Kriged:
     noise: float = 0.0
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Interpolate: [m, ...], in the observations' unit and type.
-
-        Args:
-            tx_pos: shape [m, 3], metres.
-            tx_heading_rad: shape [m], if and only if the fit had headings.
+        """Interpolate at positions [m, 3], metres: [m, ...], in the observations' unit and type.
 
         Raises:
             InputError: headings that the fit did not have, or the other way round.
@@ -113,14 +108,14 @@ class Kriged:
         circle = np.zeros((0, 2)) if self.circle is None else self.circle
         trend = CONSTANT if self.trend.receiver_m is None else LOG_DISTANCE
         names = {"trend": np.asarray(trend), "kernel": np.asarray(self.kernel)}
-        return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
+        return names | {"circle": circle} | {name: getattr(self, name) for name in STORED}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver, **more: Any) -> Kriged:
         """The predictions that `arrays` described, with values ``more`` of further attributes."""
         circle = arrays["circle"] if len(arrays["circle"]) else None
-        kept: dict[str, Any] = {name: arrays[name] for name in KEPT} | more
-        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **kept)
+        values: dict[str, Any] = {name: arrays[name] for name in STORED} | more
+        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,10 +203,8 @@ class Kriging(CovarianceSettings):
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriged:
         """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
 
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: shape [n, ...], real or complex; rows with NaN, where nothing was received, are left out.
-            tx_heading_rad: shape [n], or None to leave headings out.
+        Positions [n, 3] are in metres; real or complex observations [n, ...] are NaN where nothing was received; None
+        leaves headings [n] out.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
@@ -227,7 +220,7 @@ class Kriging(CovarianceSettings):
             raise InputError(f"{text}, so give more rows or a constant trend")
         field, ordinary = y, None
         if self.trend_fit == "ols":
-            # The field is the residual of the least-squares trend, which is taken as known from here on.
+            # Regression kriging: the field is the residual of the least-squares trend, known from here on.
             ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
             field, columns = y - columns @ ordinary, columns[:, :0]
         lengths, noise = self._choose(field, columns, positions, circle)
@@ -252,15 +245,15 @@ class Kriging(CovarianceSettings):
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
         positions_m, circle, columns = positions_m[rows], None if circle is None else circle[rows], columns[rows]
         extent = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
-        # Given value or None, limits, and first value of the search.
+        # Stated value or None, limits, and first value of the search.
         table = [
             (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
-        given, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
-        free = np.array([value is None for value in given])
-        value = np.array([0.0 if v is None else v for v in given])
+        stated, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
+        free = np.array([value is None for value in stated])
+        value = np.array([0.0 if v is None else v for v in stated])
         if not free.any():
             return value[:-1], float(value[-1])
         root = component_root(field[rows])
@@ -273,14 +266,15 @@ class Kriging(CovarianceSettings):
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
 
         def objective(logarithm: FloatArray) -> float:
-            """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
+            # Minus the logarithm of the restricted likelihood, the variance at its best, per component.
             value[free] = np.exp(logarithm)
             try:
                 system = self._factored(_coordinates(positions_m, circle, value[:-1]), float(value[-1]), columns)
-            except LinAlgError:
+            except LinAlgError:  # singular to rounding, as a smooth kernel is at great lengths: the search turns back
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
 
+        # Over logarithms, as lengths and noise are scales.
         start = np.log(first)[free]
         simplex = np.concatenate([start[None], start + np.eye(len(start))])
         best = minimize(
@@ -325,8 +319,8 @@ class KrigingSettings(CovarianceSettings):
     @property
     def is_generic(self) -> bool:
         """Whether `generic` or any setting that only generic kriging has differs from its default."""
-        only = [one for one in fields(KrigingSettings) if one.name != "heading"]
-        return any(getattr(self, one.name) != one.default for one in only)
+        only = [setting for setting in fields(KrigingSettings) if setting.name != "heading"]
+        return any(getattr(self, setting.name) != setting.default for setting in only)
 
 
 class GenericKriging(ByReceiverModel):

@@ -60,7 +60,7 @@ class PathLoss:
 
 def _shared_law(record: Record, rows: IntArray) -> FloatArray:
     """Power at one metre and slope that fit some rows of all receivers together."""
-    columns = np.stack([Trend(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
+    columns = np.stack([Trend(receiver.position_m)(record.tx_pos_m[rows]) for receiver in record.receivers])
     return _law(columns, record.observation[:, rows])
 
 
@@ -86,9 +86,10 @@ class Mri(ByReceiverModel):
         record, train, observed = rows.problem.record, rows.split.all_train, rows.observation
         receiver_m = rows.receiver.position_m
         columns = Trend(receiver_m)(rows.tx_pos_m)
-        if rows.problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
+        if rows.problem.settings.shared or np.isnan(observed).all():  # a receiver that is held out has no rows
             return PathLoss(receiver_m, _shared_law(record, train))
         received = ~np.isnan(observed)
+        # Where all positions coincide, the shared law has no slope either, and `_law` says so.
         if np.ptp(rows.tx_pos_m, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
             # Rows at a single distance state a level but no exponent, which is that of all receivers.
             _, slope = _shared_law(record, train)

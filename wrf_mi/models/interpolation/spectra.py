@@ -51,10 +51,9 @@ HELD_OUT = 80  # held-out training rows at most
 INTERVAL = 0.9  # share of errors that calibrated intervals cover
 UNSCALED_PER_CHUNK = 128  # spectra whose element signals are retrieved together
 CHUNK = 16  # transmitters predicted together, which bounds the memory of images with draws
+# Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
+# Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
 MOST_COVARIANCES = 6.4e7
-"""Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
-Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
-"""
 STARTS = 60  # starts of the phase retrieval of one spectrum, at most
 LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
@@ -96,6 +95,7 @@ def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, Floa
     """Mean and standard deviation of abs(z), z complex Gaussian with E z = mean, E |z - mean|^2 = variance."""
     # In double precision: the spread is the difference of two squares that may be 2 CLEAR times as large.
     mean, variance, kind = mean.astype(complex), variance.astype(float), variance.dtype
+    # E|z| = sqrt(pi v) / 2 exp(-h) ((1 + 2 h) I0(h) + 2 h I1(h)), h = |m|^2 / (2 v); i0e and i1e hold the exponential.
     power = np.abs(mean) ** 2
     # Without variance the ratio is large; without mean and variance it is 0.
     half = power / np.maximum(2 * variance, 1e-9 * power + np.finfo(power.dtype).tiny)
@@ -176,6 +176,7 @@ class KrigedSpectra:
         mean = nearby + weight * difference
         if nearby_std is None:
             return mean, None
+        # Variance of a mixture of two distributions: that within both, and that between their means.
         variance = weight * deviation**2 + (1 - weight) * nearby_std**2 + weight * (1 - weight) * difference**2
         return mean, np.sqrt(variance)
 
@@ -295,6 +296,7 @@ def _fit_weights(
     Where rows lie so close that none is beyond any gap, both keep their values.
     """
     drawn = np.sort(np.random.default_rng([seed, 2]).permutation(len(observed))[:HELD_OUT])
+    # A row that has no row beyond the gap would be predicted by the mean of all.
     farthest = cdist(kriged.nearby.tx_pos_m[drawn], kriged.nearby.tx_pos_m).max(axis=1)
     predictions: list[tuple[Image, tuple[Image, Image], FloatArray, Image, Image]] = []
     terms: list[tuple[Any, Any, Any]] = []
@@ -318,6 +320,7 @@ def _fit_weights(
     # between others and do not show the error of a process outside of them.
     shares = ignorance**2 / (ignorance**2 + grid[:, None] ** 2)
     kriged.half = float(grid[((shares**2 * square) - 2 * shares * product).sum(axis=1).argmin()])
+    # Every fifth pixel along either side: neighbours within a lobe's width have the same error.
     ratios = []
     for truth, reported, unknown, nearby, nearby_std in predictions:
         mean, std = kriged.mixed(reported, unknown, nearby, nearby_std)

@@ -68,7 +68,7 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     @property
     def hyperparameters(self) -> Hyperparameters:
         """Start of the search."""
-        return Hyperparameters(**{one.name: getattr(self, one.name) for one in fields(Hyperparameters)})
+        return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
 
 
 @dataclass(eq=False, repr=False)
@@ -101,6 +101,7 @@ class Strengths(Fitted):
         mean, std = np.empty((2, len(position_m)))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             means, variances = zip(*(self.field.predict(each, receiver) for each in poses), strict=True)
+            # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
         return Prediction(mean, std)
@@ -199,9 +200,7 @@ def fit_strengths(
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
 ) -> Strengths:
-    """Fit signal strengths to some rows of a record.
-
-    Nothing is drawn, so there is no seed.
+    """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
     Args:
         record: signal strengths with a single, known carrier.

@@ -36,11 +36,8 @@ class Trees(CheckedSettings):
     ) -> GrownTrees:
         """Grow the trees, whose cuts are random, on the rows that were observed.
 
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: real, shape [n]; NaN, where nothing was received, is left out.
-            tx_heading_rad: shape [n], or None to leave headings out.
-            seed: seed of the cuts.
+        Positions [n, 3] are in metres; real observations [n] are NaN where nothing was received; None leaves headings
+        [n] out.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, or complex observations.
@@ -80,7 +77,7 @@ class Trees(CheckedSettings):
 
 @dataclass(frozen=True)
 class GrownTrees:
-    """Trees as plain arrays, over all nodes of all trees.
+    """Trees as plain arrays, over all nodes of all trees: a run file holds arrays, not pickled objects.
 
     Attributes:
         root: first node of each tree.
@@ -111,6 +108,7 @@ class GrownTrees:
         # scikit-learn cuts features in single precision.
         single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
         rows = np.arange(len(single))
+        # All trees [trees, m] descend together, as many steps as the deepest has.
         node = np.broadcast_to(self.root[:, None], (len(self.root), len(single)))
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
