@@ -90,6 +90,8 @@ class CheckedSettings:
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
     """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
+    Settings of earlier versions that are constants now, in the mapping ``FIXED`` of the class, must have that value.
+
     ``source`` names the file or option in messages.
 
     Raises:
@@ -105,6 +107,11 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     arguments = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
+        if key in (fixed := getattr(kind, "FIXED", {})):
+            if value != fixed[key]:
+                text = f"{value!r}, where this version has {fixed[key]!r} alone; omit it, or train the run anew"
+                raise InputError(f"{source}, setting {name}: {text}")
+            continue
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")

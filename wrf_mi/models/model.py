@@ -359,6 +359,11 @@ def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
     return record.tx_pos_m[rows]
 
 
+def slices(count: int, size: int) -> list[slice]:
+    """Slices of ``size`` rows each, the last possibly of fewer, that cover so many rows."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
 def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Arrays with a prefix before their names."""
     return {f"{prefix}{name}": values for name, values in arrays.items()}

@@ -229,7 +229,8 @@ class AnisotropicKriging:
 
     def _correlation(self, tx_pos_m: FloatArray) -> FloatArray:
         # In correlation lengths along the axes, in which the correlation is isotropic.
-        return correlation(*(positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m)))
+        scaled, rows = (positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m))
+        return correlation(scaled, rows)
 
     def _weighted(self, weights: FloatArray) -> NDArray[np.float32]:
         return np.tensordot(weights.astype(np.float32), self.observed, 1)

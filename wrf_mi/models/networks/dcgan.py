@@ -22,9 +22,9 @@ layer?", 2016): `finer`. A convolution of stride two is the reverse: `coarser`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -43,6 +43,8 @@ from .training import Network, NetworkSettings, network_adam, opaque_rows
 NORM_FLOOR = 1e-5  # added to variances: an image may be flat
 LEVELS = 3  # convolutions of stride two in either network
 leaky = nn.LeakyReLU(0.2)  # activation of the discriminator (Radford et al.)
+ADVERSARY_RATE = 2e-4  # learning rate of the discriminator (Radford et al.)
+L1 = 100.0  # weight of the mean absolute difference against the adversarial term (Isola et al., pix2pix)
 MOMENTUM = 0.5  # Adam's decay of the first moment (Radford et al.)
 
 
@@ -51,26 +53,23 @@ class DcganSettings(NetworkSettings):
     """Settings of the adversarial network and of the training loop.
 
     Attributes:
-        adversary_rate: learning rate of the discriminator.
         noise: number of inputs that are drawn from -1 to 1.
         hidden: neurons before the coarse grid.
         channels: channels of the coarse grid; halved at each finer grid.
         octaves: octaves of the position's encoding.
         scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
-        l1: weight of the mean absolute difference against the adversarial term.
     """
 
     steps: int = 1875
     batch: int = 8
     validate_every: int = 188
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    adversary_rate: Positive = 2e-4
+    FIXED: ClassVar[Mapping[str, float]] = {"adversary_rate": ADVERSARY_RATE, "l1": L1}
     noise: Count = 8
     hidden: Count = 64
     channels: Annotated[int, Field(ge=2**LEVELS, description=f"{2**LEVELS} or more")] = 32
     octaves: int = 4
     scale_m: Positive = 1.0
-    l1: float = 100.0
 
 
 @dataclass(frozen=True)
@@ -294,27 +293,28 @@ def softplus(x: Any) -> Any:
     return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
 
 
-def duel_loss(dcgan: Dcgan, data: Any, given: Any, s: DcganSettings) -> Any:
+def duel_loss(dcgan: Dcgan, data: Any, drawn: Any) -> Any:
     """Sum of the losses of generator and discriminator, each with gradients of its own weights alone.
 
     Args:
         dcgan: both networks.
         data: ``truth``, spectra one after the other, and ``where`` [features, n].
-        given: ``rows`` [batch] and ``noise`` [k, batch] of the step.
-        s: settings.
+        drawn: ``rows`` [batch] and ``noise`` [k, batch] of the step.
     """
-    chosen, flat, shape = given["rows"], data["truth"], dcgan.g.shape
+    chosen, flat, shape = drawn["rows"], data["truth"], dcgan.g.shape
     pixels = shape[0] * shape[1]
     slot = dr.arange(type(chosen), dr.width(chosen) * pixels)
     index = dr.gather(type(chosen), chosen, slot // pixels) * pixels + slot % pixels
     real = type(data["where"])(dr.gather(type(flat), flat, index), (1, dr.width(slot)))
     where = columns(data["where"], chosen)
-    fake = dcgan.g(given["noise"], where)
+    fake = dcgan.g(drawn["noise"], where)
+    # -log D(real) - log (1 - D(fake)) by logits; detached, as the generator must not learn from it.
     right = dr.mean(softplus(-dcgan.d(real, where, shape)), axis=None)
     right += dr.mean(softplus(dcgan.d(dr.detach(fake), where, shape)), axis=None)
+    # -log D(fake) in place of log (1 - D(fake)), which is flat where the discriminator wins (Goodfellow et al., 2014).
     fixed = dcgan.d.with_state({path: dr.detach(weight) for path, weight in dcgan.d.state().items()})
     fooled = dr.mean(softplus(-fixed(fake, where, shape)), axis=None)
-    return (right + fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
+    return (right + fooled + L1 * dr.mean(dr.abs(fake - real), axis=None)).array
 
 
 class DcganModel(SpectrumNetwork):
@@ -339,8 +339,8 @@ class DcganModel(SpectrumNetwork):
         def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
             return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (settings.noise, len(chosen))))}
 
-        both = self.trained_on(rows, dcgan, partial(duel_loss, s=settings), data, draw)
-        rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), settings.adversary_rate)
+        both = self.trained_on(rows, dcgan, duel_loss, data, draw)
+        rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), ADVERSARY_RATE)
         return replace(both, rates=rates, momentum=MOMENTUM)
 
 

@@ -33,9 +33,9 @@ class Module:
 
     def state(self) -> dict[str, Any]:
         """All weights by path."""
-        found: dict[str, Any] = {}
-        _mapped(self, "", lambda path, weight: found.setdefault(path, weight))
-        return found
+        weights: dict[str, Any] = {}
+        _mapped(self, "", lambda path, weight: weights.setdefault(path, weight))
+        return weights
 
     def with_state(self, weights: Mapping[str, Any]) -> Self:
         """The same network with other weights, by path."""
@@ -58,9 +58,9 @@ class Module:
             InputError: a weight that is missing, of another shape, or not finite.
         """
         for path, like in self.state().items():
-            found = weights.get(path)
-            if found is None or found.shape != tuple(like.shape) or not np.isfinite(found).all():
-                text = "missing" if found is None else f"of shape {found.shape}, or not finite"
+            weight = weights.get(path)
+            if weight is None or weight.shape != tuple(like.shape) or not np.isfinite(weight).all():
+                text = "missing" if weight is None else f"of shape {weight.shape}, or not finite"
                 raise InputError(f"weight {path} is {text}, where the settings need {tuple(like.shape)}")
 
 
@@ -69,6 +69,7 @@ def _mapped(value: Any, path: str, change: Callable[[str, Any], Any]) -> Any:
     if isinstance(value, Module):
         changed, start = copy(value), f"{path}." if path else ""
         for name, inner in vars(value).items():
+            # An attribute such as ``in_`` has the underscore because Python keeps the word.
             setattr(changed, name, _mapped(inner, start + name.removesuffix("_"), change))
         return changed
     if isinstance(value, list):
@@ -106,6 +107,7 @@ class Linear(Module):
 
     def __call__(self, *hidden: Any, **parts: Any) -> Any:
         """Outputs [outputs, n] of the inputs [size, n] by name."""
+        # Matrices of named inputs spare joining them: W [a; b] = W_a a + W_b b.
         products = [getattr(self, name) @ x for name, x in [*(("hidden", x) for x in hidden), *parts.items()]]
         return sum(products[1:], products[0] + self.bias)
 

@@ -81,7 +81,7 @@ class Nerf2Network(Module):
 
 
 @dataclass
-class Seen:
+class RayPoints:
     """Everything about the points of some rays that does not depend on the transmitter.
 
     Attributes:
@@ -95,7 +95,7 @@ class Seen:
     first: Any
 
 
-def look(network: Nerf2Network, rays: Mapping[str, Any]) -> Seen:
+def look(network: Nerf2Network, rays: Mapping[str, Any]) -> RayPoints:
     """Evaluate the attenuation network on all points of some rays.
 
     Args:
@@ -132,36 +132,39 @@ def look(network: Nerf2Network, rays: Mapping[str, Any]) -> Seen:
         for w in (rays["wave_re"], rays["wave_im"])
     ]
     wave_re, wave_im = waves
+    # (D / r) exp(-j k r) times exp(-sum (a + j b) D): a turn by minus the phase that the cells before have added.
     re = amplitude * (wave_re * cosine + wave_im * sine)
     im = amplitude * (wave_im * cosine - wave_re * sine)
     seen_from: Any = dr.reshape(radiance.view @ view, (sizes.width, count, 1))
+    # The radiance network's first layer is linear in its inputs: all of it but the condition is summed here, once.
     total = dr.reshape(radiance.feature @ network.feature(hidden), (sizes.width, count, samples)) + seen_from
-    return Seen(re, im, dr.reshape(total, (sizes.width, n)) + radiance.bias)
+    return RayPoints(re, im, dr.reshape(total, (sizes.width, n)) + radiance.bias)
 
 
-def march(network: Nerf2Network, seen: Seen, condition: Any, samples: int) -> tuple[Any, Any]:
+def march(network: Nerf2Network, points: RayPoints, condition: Any, samples: int) -> tuple[Any, Any]:
     """Signal of each ray for each condition.
 
     Args:
         network: both networks.
-        seen: result of `look`.
+        points: result of `look`.
         condition: features of transmitters for the radiance network, [features, batch].
         samples: S.
 
     Returns:
         Real and imaginary part, flat arrays [outputs * batch * rays].
     """
-    width, n = seen.first.shape
-    outputs, batch = seen.weight_re.shape[0], condition.shape[1]
+    width, n = points.first.shape
+    outputs, batch = points.weight_re.shape[0], condition.shape[1]
     first, second = network.radiance.layers
     assert network.radiance.out is not None
+    # Pairs of a condition and a point: the sum of both shares of the first layer, then the rest of the network.
     sender: Any = dr.reshape(first.condition @ condition, (width, batch, 1))
-    hidden = relu(dr.reshape(dr.reshape(seen.first, (width, 1, n)) + sender, (width, batch * n)))
+    hidden = relu(dr.reshape(dr.reshape(points.first, (width, 1, n)) + sender, (width, batch * n)))
     out = network.radiance.out(relu(second(hidden)))
     amplitude: Any = dr.reshape(strength(out[:outputs, :]), (outputs, batch, n))
     angle: Any = dr.reshape(phase(out[outputs:, :]), (outputs, batch, n))
     sine, cosine = dr.sincos(angle)
-    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (seen.weight_re, seen.weight_im))
+    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (points.weight_re, points.weight_im))
     re = amplitude * (cosine * w_re - sine * w_im)
     im = amplitude * (cosine * w_im + sine * w_re)
     return dr.block_sum(re.array, samples), dr.block_sum(im.array, samples)
@@ -187,6 +190,7 @@ def constant_parts(
         triangular ones [S, S], transposed: sums over the cells before each; ``wave_re`` and ``wave_im``: parts of
         (D / r_s) exp(-j k r_s), [outputs, S]; ``extent``: unit of plain coordinates [1], metres.
     """
+    # In double precision: k r is thousands of radians, of which float32 keeps three digits behind the point at most.
     cell = (far_m - near_m) / samples
     distance = near_m + (np.arange(samples, dtype=np.float64) + 0.5) * cell
     wavenumber = 2 * np.pi * np.asarray(frequencies_hz, float)[:, None] / speed_of_light

@@ -28,6 +28,7 @@ from ..model import (
     known_positions,
     received_rows,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
@@ -131,8 +132,7 @@ class FittedNetworks(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], float32."""
         s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
-        for first in range(0, len(inputs), self.model.at_once):
-            part = slice(first, first + self.model.at_once)
+        for part in slices(len(inputs), self.model.at_once):
             where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
             with dr.suspend_grad():
                 out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)

@@ -59,7 +59,7 @@ class Network:
     Attributes:
         name: name for progress and checkpoint.
         module: network with its initial weights.
-        loss: ``loss(module, data, given)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`).
+        loss: ``loss(module, data, drawn)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`).
         data: Dr.Jit arrays that the loss needs in every step.
         draw: ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in
             ``train`` and a generator of random numbers.
@@ -110,12 +110,13 @@ class NetworkTrainer(TrainingLoop):
         rates, module = {name: special.get(name, rate) for name in self.state.adam}, self.network.module
 
         def step(
-            adam: Adam, mean: Params, data: Any, given: Any, factor: Any, decay: Any, t: Any, report: NonFiniteReport
+            adam: Adam, mean: Params, data: Any, drawn: Any, clock: Any, report: NonFiniteReport
         ) -> tuple[Params, NonFiniteReport, Any]:
+            factor, decay, t = clock
             params = rated_params(adam, rates, factor)
-            loss = loss_of(module.with_state(params), data, given)
+            loss = loss_of(module.with_state(params), data, drawn)
             mean, report, _ = guarded_step(adam, params, loss, mean, decay, t, report)
-            loss = dr.detach(loss)
+            loss = dr.detach(loss)  # the graph behind it would keep the step's arrays alive
             dr.eval(adam, mean, report, loss)
             return mean, report, loss
 
@@ -126,14 +127,15 @@ class NetworkTrainer(TrainingLoop):
         state, schedule, t = self.state, self.schedule, self.state.step
         # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
+        # Opaque, so that the recorded kernels take them as arguments instead of being compiled for each value.
+        factor, decay = (dr.opaque(mi.Float, float(values[t])) for values in (schedule.factor, schedule.decay))
+        clock = factor, decay, dr.opaque(mi.UInt32, t + 1)
         state.mean, trouble, loss = self._step(
             state.adam,
             state.mean,
             self.network.data,
             self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
-            dr.opaque(mi.Float, float(schedule.factor[t])),
-            dr.opaque(mi.Float, float(schedule.decay[t])),
-            dr.opaque(mi.UInt32, t + 1),
+            clock,
             trouble,
         )
         return loss, trouble
@@ -164,6 +166,7 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
         return network.module.on_device(under(f"{finished}/mean/", stored)), float(stored[f"{finished}/score"])
     beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
     beside["network"] = np.asarray(network.name)
+    # A checkpoint of another network of this fit says which have finished, and nothing of this one.
     begun = "network" in stored and str(stored["network"]) == network.name
     if begun:
         network.module.check(under("param/", stored))
@@ -188,4 +191,4 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
 
 def opaque_rows(rows: IntArray) -> Any:
     """Indices as an evaluated Dr.Jit array."""
-    return mi.UInt32(np.asarray(rows).tolist())
+    return mi.UInt32(np.asarray(rows).tolist())  # of a list: an array that wraps NumPy's memory is read beyond its end

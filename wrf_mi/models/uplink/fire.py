@@ -129,19 +129,19 @@ class Fire(Module):
         self.p = Mlp(hidden, Linear(s.width, outputs, rng, gain=1.0), leaky)
 
 
-def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
+def fire_loss(fire: Fire, data: Any, drawn: Any, beta: float) -> Any:
     """Relative squared error of the downlink and divergence of the latent distribution, means over the batch.
 
     Args:
         fire: network.
         data: ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
             the square of these units over the energy of their row.
-        given: ``rows`` [batch] and normal draws ``noise`` [latent, batch].
+        drawn: ``rows`` [batch] and normal draws ``noise`` [latent, batch].
         beta: weight of the divergence.
     """
-    uplink, downlink, weight = (columns(data[name], given["rows"]) for name in ("uplink", "downlink", "weight"))
+    uplink, downlink, weight = (columns(data[name], drawn["rows"]) for name in ("uplink", "downlink", "weight"))
     mean, log_variance = fire.q(uplink)
-    latent = mean + dr.exp(0.5 * log_variance) * given["noise"]
+    latent = mean + dr.exp(0.5 * log_variance) * drawn["noise"]
     error = dr.sum(dr.square(fire.p(latent) - downlink) * weight, axis=None)
     return ((error + beta * normal_divergence(mean, log_variance)) / mean.shape[1]).array
 
