@@ -41,9 +41,9 @@ class FittedWithIntervals(Fitted):
         self._distance = RowDistance(record, rows)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
-    def _stated(self, found: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
+    def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
-        return self._intervals(found.mean, expected_size(task_of(self._record), found), distance_m)
+        return self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction of the model with calibrated standard deviations, [m, ...]."""
@@ -51,13 +51,13 @@ class FittedWithIntervals(Fitted):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Stored predictions of the model with calibrated standard deviations."""
-        found = self.fitted.predict_rows(rows, receiver)
-        return None if found is None else self._stated(found, self._record.tx_pos_m[rows], receiver)
+        stored = self.fitted.predict_rows(rows, receiver)
+        return None if stored is None else self._stated(stored, self._record.tx_pos_m[rows], receiver)
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Decomposition of the model's prediction, with calibrated standard deviations."""
-        found = self.fitted.decompose(inputs, receiver, std)
-        return replace(found, whole=self._stated(found.whole, inputs.tx_pos_m, receiver))
+        decomposed = self.fitted.decompose(inputs, receiver, std)
+        return replace(decomposed, whole=self._stated(decomposed.whole, inputs.tx_pos_m, receiver))
 
     @property
     def depends_on_heading(self) -> bool:
@@ -85,12 +85,12 @@ class WithIntervals(Model):
         record = problem.record
         fitted = self.model.fit(problem, split, session)
         fold = _fold(self.model, problem, split)
-        held = HeldOut.of(record, fold, problem.seed)
+        held_out = HeldOut.of(record, fold, problem.seed)
         place = replace(session, folder=session.folder / "held_out")
-        predicted = held_out_predictions(self.model, problem, fold, held, place, self.name)
+        predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
         shutil.rmtree(place.folder)
         size = expected_size(task_of(record), predicted)
-        intervals = fit_intervals(predicted.mean, held.observed(record), size, held.distance_m, held.row)
+        intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
         return FittedWithIntervals(fitted, record, problem.rows(split), intervals)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedWithIntervals:

@@ -104,7 +104,9 @@ class Problem:
 
         record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         if self.left_out:
-            record = record.at_receivers([k for k, one in enumerate(record.receivers) if one.name not in self.left_out])
+            record = record.at_receivers(
+                [k for k, each in enumerate(record.receivers) if each.name not in self.left_out]
+            )
         return record.with_antennas(self.antennas)
 
     @cached_property
@@ -376,13 +378,13 @@ def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[
 
 def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
-    named = ((one.name, getattr(value, one.name)) for one in fields(value))
-    return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
+    named = ((field.name, getattr(value, field.name)) for field in fields(value))
+    return {f"{prefix}{name}": np.asarray(content) for name, content in named if content is not None}
 
 
 def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
     """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    names = (one.name for one in fields(cast(Any, kind)) if f"{prefix}{one.name}" in arrays)
+    names = (field.name for field in fields(cast(Any, kind)) if f"{prefix}{field.name}" in arrays)
     stored = {name: arrays[f"{prefix}{name}"] for name in names}
     return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
 

@@ -210,13 +210,13 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
         InputError: a receiver without a training row that a path reaches.
     """
     if problem.settings.calibration is not None:
-        found = fit_field(_graph_problem(problem), split, session)
+        graph = fit_field(_graph_problem(problem), split, session)
         if _changes_scene(problem):
-            scene = found.predictor.graph.scene
-            write_corrected_scene(session.folder / CORRECTED, scene, found.params, replace=True)
-        kept = load(found.arrays(), problem, session.folder)
-        kept.train_seconds = found.train_seconds
-        return kept
+            scene = graph.predictor.graph.scene
+            write_corrected_scene(session.folder / CORRECTED, scene, graph.params, replace=True)
+        calibrated = load(graph.arrays(), problem, session.folder)
+        calibrated.train_seconds = graph.train_seconds
+        return calibrated
     record, path, start = problem.record, session.run / PATHS, time.perf_counter()
     assert problem.scene is not None
     settings: TracingSettings = problem.settings
@@ -246,7 +246,9 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
 def _stored_trace(path: Path, record: Record) -> TraceResult:
     """The run's trace at the receivers of a record: a fold leaves out those with too few training rows."""
     traced, names = load_trace(path), {receiver.name for receiver in record.receivers}
-    return traced.of_receivers(np.array([k for k, one in enumerate(traced.receivers) if one.name in names], np.int64))
+    return traced.of_receivers(
+        np.array([k for k, receiver in enumerate(traced.receivers) if receiver.name in names], np.int64)
+    )
 
 
 def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None:
@@ -264,8 +266,8 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
     """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
     if problem.settings.calibration is not None:
         return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
-    here = folder / PATHS
-    return FittedTracing(problem, arrays, here if here.exists() else folder.parent / PATHS)
+    paths = folder / PATHS
+    return FittedTracing(problem, arrays, paths if paths.exists() else folder.parent / PATHS)
 
 
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
@@ -278,12 +280,12 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     if not tracer.options.sampled:
         least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
     parts = row_parts(len(tx_pos_m), scheduler.workers, least, PAIRS_TOGETHER)
-    given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
-    sizes = [len(positions) for positions, *_ in given]
+    rows_of = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
+    sizes = [len(positions) for positions, *_ in rows_of]
     options = replace(tracer.options, rays=rays)
     opener = partial(RayTracer, problem.scene, tracer.instrument, options, problem.material)
-    found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
-    return replace(join_traces(found), options=tracer.options)
+    traces = scheduler.map(_trace_part, rows_of, opener, what="tracing", sizes=sizes)
+    return replace(join_traces(traces), options=tracer.options)
 
 
 def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None]) -> TraceResult:

@@ -130,14 +130,14 @@ class FittedHybrid(Fitted):
             rows = np.flatnonzero(share)
             if not len(rows):
                 continue
-            prediction = predict(part, rows)
+            by_part = predict(part, rows)
             side = int(name in TRACED)
-            sides[side, rows] += _spread(share[rows], shape) * prediction.whole.mean
+            sides[side, rows] += _spread(share[rows], shape) * by_part.whole.mean
             totals[side, rows] += share[rows]
-            if prediction.whole.std is not None:
-                size[rows] += _spread(share[rows], shape) * prediction.whole.std
-            if paths is None and prediction.paths is not None:
-                paths = prediction.paths.placed(rows, len(tx_pos_m))
+            if by_part.whole.std is not None:
+                size[rows] += _spread(share[rows], shape) * by_part.whole.std
+            if paths is None and by_part.paths is not None:
+                paths = by_part.paths.placed(rows, len(tx_pos_m))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
         if len(rows) and self.residuals is not None:
@@ -145,12 +145,12 @@ class FittedHybrid(Fitted):
             mean[rows] += _spread(residual_weight[rows], shape) * residual
         if task_of(self._problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
-        whole = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
+        prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
         if not (totals[0].any() and totals[1].any()):
-            return Decomposition(whole, paths=paths)
+            return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
             learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
-        return Decomposition(whole, traced, learned, paths)
+        return Decomposition(prediction, traced, learned, paths)
 
     def _weights(self, distance_m: FloatArray) -> FloatArray:
         """Weights of the parts and, as the last, of the residuals, [m, k]; 0 where a part is not worth its time."""
@@ -182,8 +182,8 @@ class FittedHybrid(Fitted):
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
-        side, kept = self.parts.get(PATHS), [one["stage"] for one in self._facts["stages"] if one["kept"]]
-        return by_stage(self._problem, split, side, kept) if isinstance(side, SceneSide) and kept else {}
+        side, used = self.parts.get(PATHS), [report["stage"] for report in self._facts["stages"] if report["kept"]]
+        return by_stage(self._problem, split, side, used) if isinstance(side, SceneSide) and used else {}
 
     def facts(self) -> dict[str, Any]:
         """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""

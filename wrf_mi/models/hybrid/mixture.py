@@ -50,10 +50,10 @@ def averaged(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: Int
     Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
     Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
     """
-    scores = [score(np.broadcast_to(one, (len(rows), count)), rows) for one in np.eye(count)]
+    scores = [score(np.broadcast_to(single, (len(rows), count)), rows) for single in np.eye(count)]
     means = [unit_means(values, unit[rows]) for values in scores]
     best = max(means, key=np.mean)
-    alike = np.array([not improves(best, one, True, DOUBT) for one in means])
+    alike = np.array([not improves(best, mean, True, DOUBT) for mean in means])
     return constant(_selected(score, rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
 
 
@@ -109,17 +109,19 @@ def choose(
 
     forms = FORMS if trusted is None else {SINGLE: single, **FORMS}
     folds, every = np.unique(fold), np.arange(len(fold))
-    found = {name: np.full(len(fold), np.nan) for name in forms}
+    scores = {name: np.full(len(fold), np.nan) for name in forms}
     for done, number in enumerate(folds):
         out = fold == number
         for name, form in forms.items():
+            # A single fold has nothing to judge by; its form is then fitted to the rows that it is scored on.
             chosen = form(score, distance_m, unit, every[~out] if len(folds) > 1 else every, count)
-            found[name][out] = score(chosen(distance_m[out]), every[out])
+            scores[name][out] = score(chosen(distance_m[out]), every[out])
         on_fold((done + 1) / len(folds))
     best = next(iter(forms))
     for name in forms:
+        # Two errors to leave the trusted prediction: with few rows a mixture often gains by chance.
         errors = DOUBT if best == SINGLE else 1.0
-        if improves(unit_means(found[name], unit), unit_means(found[best], unit), True, errors):
+        if improves(unit_means(scores[name], unit), unit_means(scores[best], unit), True, errors):
             best = name
     return best, forms[best](score, distance_m, unit, every, count)
 
@@ -147,8 +149,9 @@ def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: Floa
     every = np.eye(len(weights))
     best = _mean(score, weights, rows, share)
     for step in range(begun, begun + STEPS):
+        # Each prediction in turn gets one further vote among ``step`` that are cast.
         changed = (weights * step + every) / (step + 1)
-        values = [_mean(score, one, rows, share) for one in changed]
+        values = [_mean(score, candidate, rows, share) for candidate in changed]
         if max(values) <= best:
             break
         best, weights = max(values), changed[int(np.argmax(values))]
@@ -158,12 +161,13 @@ def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: Floa
 def _best_selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
     """`_selected` from the best single prediction."""
     every = np.eye(count)
-    first = every[int(np.argmax([_mean(score, one, rows, share) for one in every]))]
+    first = every[int(np.argmax([_mean(score, single, rows, share) for single in every]))]
     return _selected(score, rows, share, first, FIRST)
 
 
 def _knots(distance_m: FloatArray) -> FloatArray:
     finite = distance_m[np.isfinite(distance_m)]
+    # Quantiles, so that each knot has as many rows; infinite distances are beyond the last.
     count = int(np.clip(len(finite) // KNOT_ROWS, 1, KNOTS))
     knots: FloatArray = np.unique(np.quantile(finite, (np.arange(count) + 0.5) / count)) if len(finite) else np.zeros(1)
     return knots

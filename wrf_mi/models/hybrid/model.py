@@ -108,7 +108,7 @@ class _Fit:
         if name == PATHS and RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier:
             self._krige_residuals(self.fold, self.held)
 
-    def _krige_residuals(self, fold: Split, held: HeldOut) -> None:
+    def _krige_residuals(self, fold: Split, held_out: HeldOut) -> None:
         """Residuals of the training rows, and predictions of held-out rows with those of the others.
 
         Both are residuals of the final parameters, which have seen the held-out rows, too: an approximation. To keep
@@ -116,34 +116,34 @@ class _Fit:
         """
         side, record, seed = self._part(PATHS), self.record, self.problem.seed
         among_known, mean = Residuals.of(side, record, fold, seed), np.array(self.predictions[PATHS].mean)
-        for receiver in np.unique(held.receiver):
-            places = held.receiver == receiver
-            mean[places] += among_known(record.tx_pos_m[held.row[places]], int(receiver), mean.shape[1:])
+        for receiver in np.unique(held_out.receiver):
+            places = held_out.receiver == receiver
+            mean[places] += among_known(record.tx_pos_m[held_out.row[places]], int(receiver), mean.shape[1:])
         self.predictions[RESIDUAL] = Prediction(np.clip(mean, 0, 1) if self.task.image else mean)
         self.residuals = Residuals.of(side, record, self.split, seed)
 
-    def _weights(self, held: HeldOut) -> tuple[str, Mixture, dict[str, float]]:
+    def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, dict[str, float]]:
         """Form of the weights, the weights, and mean held-out scores of the parts and of the hybrid."""
         means = np.stack([prediction.mean for prediction in self.predictions.values()])
-        score, every = self.task.mixtures(means, held.observed(self.record)), np.arange(len(held))
+        score, every = self.task.mixtures(means, held_out.observed(self.record)), np.arange(len(held_out))
         # Errors are independent between rows, or where receivers are held out, between these.
-        unit = held.receiver if self.split.held_receivers else held.row
+        unit = held_out.receiver if self.split.held_receivers else held_out.row
 
         def on_group(share: float) -> None:
             self.session.report("choosing weights", share)
 
-        form, mixture = choose(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
+        form, mixture = choose(score, held_out.distance_m, held_out.group, unit, len(means), on_group, trusted=0)
         sign = 1 if self.task.higher_is_better else -1
         scores = {
-            name: sign * float(score(np.broadcast_to(alone, (len(held), len(means))), every).mean())
+            name: sign * float(score(np.broadcast_to(alone, (len(held_out), len(means))), every).mean())
             for name, alone in zip(self.predictions, np.eye(len(means)), strict=True)
         }
-        scores["hybrid"] = sign * float(score(mixture(held.distance_m), every).mean())
+        scores["hybrid"] = sign * float(score(mixture(held_out.distance_m), every).mean())
         return form, mixture, scores
 
-    def _intervals(self, held: HeldOut, mixture: Mixture) -> tuple[str, Intervals]:
+    def _intervals(self, held_out: HeldOut, mixture: Mixture) -> tuple[str, Intervals]:
         """What the sizes of expected errors are (`STATED` or `PREDICTED`), and intervals calibrated by them."""
-        weights, observed = mixture(held.distance_m), held.observed(self.record)
+        weights, observed = mixture(held_out.distance_m), held_out.observed(self.record)
         mean = np.einsum("qk,kq...->q...", weights, np.stack([each.mean for each in self.predictions.values()]))
         stds = [each.std for each in self.predictions.values() if each.std is not None]
         if len(stds) == len(self.predictions):
@@ -151,9 +151,9 @@ class _Fit:
             if (std > 0).all():  # kriging of two or three rows may pass through all of them
                 # Few rows tell a factor of stated deviations, not how errors depend on them.
                 size = np.ones(mean.shape)
-                return STATED, fit_intervals(mean / std, observed / std, size, held.distance_m, held.row)
+                return STATED, fit_intervals(mean / std, observed / std, size, held_out.distance_m, held_out.row)
         size = expected_size(self.task, Prediction(mean))
-        return PREDICTED, fit_intervals(mean, observed, size, held.distance_m, held.row)
+        return PREDICTED, fit_intervals(mean, observed, size, held_out.distance_m, held_out.row)
 
 
 def _used(names: Sequence[str], mixture: Mixture) -> list[str]:

@@ -99,8 +99,8 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
         return scene_side(problem.record)[0], problem
     model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
-    given = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
-    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), given))
+    arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
+    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
 

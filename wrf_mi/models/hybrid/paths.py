@@ -64,9 +64,9 @@ def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainC
         config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.image)
         config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
     settings = problem.settings
-    own = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]
-    own += [] if settings.steps is None else [f"steps={settings.steps}"]
-    return with_settings(config, own).resolved(problem.record.tx_pos_m[split.all_train])
+    of_hybrid = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]
+    of_hybrid += [] if settings.steps is None else [f"steps={settings.steps}"]
+    return with_settings(config, of_hybrid).resolved(problem.record.tx_pos_m[split.all_train])
 
 
 class FittedPaths(SceneSide):
@@ -94,14 +94,14 @@ class FittedPaths(SceneSide):
         """Arrays of the graph, and its settings."""
         return self.graph.arrays() | {"settings": settings_array(self.graph.config)}
 
-    def held_out_at(self, held: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Reports of the rows that the stages were chosen by; None: not all held-out rows are among these."""
         reports = self.graph.held_out
         if reports is None:
             return None
         place = {pair: number for number, pair in enumerate(zip(reports.receiver, reports.row, strict=True))}
-        numbers = [place.get(pair, -1) for pair in zip(held.receiver, held.row, strict=True)]
-        return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held))
+        numbers = [place.get(pair, -1) for pair in zip(held_out.receiver, held_out.row, strict=True)]
+        return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held_out))
 
 
 def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedPaths:
@@ -113,7 +113,7 @@ def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedPath
     scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
     used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
     reports = [StageReport(CALIBRATION, True, scores[CALIBRATION])] if CALIBRATION in scores else []
-    reports += [StageReport(one, used[one], scores.get(one)) for one in used if one in scores or used[one]]
+    reports += [StageReport(stage, used[stage], scores.get(stage)) for stage in used if stage in scores or used[stage]]
     if reports:
         reports[-1] = replace(reports[-1], seconds=graph.train_seconds)
     return FittedPaths(graph, problem, reports)
@@ -154,7 +154,7 @@ class Paths(InScene):
         """
         inner, reports = corrected(problem, split, session)
         paths = fit_in_scene(inner, split, session)
-        paths.stages = (*reports, *(one for one in paths.stages if one.stage != CALIBRATION or not reports))
+        paths.stages = (*reports, *(each for each in paths.stages if each.stage != CALIBRATION or not reports))
         return paths
 
 

@@ -69,7 +69,7 @@ class SceneSide(Fitted):
     problem: Problem
     stages: tuple[StageReport, ...] = ()
 
-    def held_out_at(self, held: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of held-out rows, as large in error as if the scene had not seen them; None: a further fit has to
         make them.
         """
@@ -105,7 +105,7 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
     """
     record, path = problem.record, session.folder / STAGES_FILE
     if path.exists():
-        return in_scene(problem, session.folder), [StageReport(**one) for one in json.loads(path.read_text())]
+        return in_scene(problem, session.folder), [StageReport(**report) for report in json.loads(path.read_text())]
     reports: list[StageReport] = []
     wanted = problem.settings.wanted
     # A correction changes materials, too: it contains the calibration.
@@ -135,8 +135,9 @@ def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport
         judged = {name: score for name, score in scores.items() if of_geometry[name] == geometry}
         if judged:
             best = (max if higher_is_better else min)(judged.values())
-            kept = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
-            reports.append(StageReport(stage, kept, judged.get(correction.kept, best)))
+            # What was not kept is reported by the best that it reached.
+            gains = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
+            reports.append(StageReport(stage, gains, judged.get(correction.kept, best)))
     return [*reports[:-1], replace(reports[-1], seconds=correction.seconds)]
 
 
@@ -147,4 +148,4 @@ def write_reports(folder: Path, reports: Collection[StageReport]) -> None:
 
 def stated_reports(reports: Collection[StageReport]) -> list[dict[str, Any]]:
     """Reports as ``metrics.json`` has them."""
-    return [asdict(one) for one in reports]
+    return [asdict(report) for report in reports]

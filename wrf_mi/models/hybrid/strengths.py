@@ -65,7 +65,7 @@ class FittedStrengths(SceneSide):
         """The mean of `predict`, which takes a fraction of its time."""
         return self.strengths.predict_mean(inputs, receiver)
 
-    def held_out_at(self, held: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
         return self.unseen
 
@@ -75,19 +75,19 @@ class FittedStrengths(SceneSide):
 
 
 def _chosen(
-    stated: Problem, inner: Problem, split: Split, fold: Split, held: HeldOut, session: Session
+    stated: Problem, inner: Problem, split: Split, fold: Split, held_out: HeldOut, session: Session
 ) -> dict[str, Any]:
     """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
     record = stated.record
-    unit = held.receiver if split.held_receivers else held.row
+    unit = held_out.receiver if split.held_receivers else held_out.row
 
     def score(problem: Problem, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
         model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
-        means = held_out_predictions(model, problem, fold, held, place, "mean").mean
+        means = held_out_predictions(model, problem, fold, held_out, place, "mean").mean
         shutil.rmtree(place.folder)
-        of_row = task_of(record).mixtures(means[None], held.observed(record))
-        return float(unit_means(of_row(np.ones((len(held), 1)), np.arange(len(held))), unit).mean())
+        of_row = task_of(record).mixtures(means[None], held_out.observed(record))
+        return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())
 
     problem, best = inner, score(inner)
     if inner is not stated:
@@ -102,7 +102,7 @@ def _chosen(
         mean = exact if score(problem, exact) > best else None
     judged = _Remembering(_searched(mean), mean)
     shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
-    held_out_predictions(judged, problem, fold, held, inside(session, HELD), "paths")
+    held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
     hyperparameters = asdict(judged.fitted.strengths.field.hyperparameters)
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
 
@@ -197,12 +197,12 @@ class TracedStrengths(StrengthsInScene):
         if fold is None:
             fitted = StrengthsInScene().fit(inner, split, session)
         else:
-            held, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
+            held_out, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
             if not path.exists():
-                write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held, session)) + "\n")
+                write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held_out, session)) + "\n")
             choice = json.loads(path.read_text())
             if inner is not problem and not choice["corrected"]:
-                inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
+                inner, reports = problem, [replace(report, kept=report.stage == MEAN) for report in reports]
                 write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
                 shutil.rmtree(session.folder / SCENE)
             mean = _traced(inner) if choice["exact"] else None
@@ -210,6 +210,6 @@ class TracedStrengths(StrengthsInScene):
             settings = replace(_searched(mean), **choice["hyperparameters"])
             fitted = StrengthsInScene(settings, mean).fit(inner, split, session)
             place = inside(session, HELD)  # where the choice left these predictions
-            fitted.unseen = held_out_predictions(StrengthsInScene(), inner, fold, held, place, "paths")
+            fitted.unseen = held_out_predictions(StrengthsInScene(), inner, fold, held_out, place, "paths")
         fitted.stages = tuple(reports)
         return fitted

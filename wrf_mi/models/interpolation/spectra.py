@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from scipy.special import i0e, i1e
 
 from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray, pixel_directions
-from ...core.settings import Count, Positive
+from ...core.settings import Count
 from ...parallel.threads import one_blas_thread
 from ...receivers.array import array_response
 from ...receivers.lags import Lags
@@ -55,6 +55,7 @@ CHUNK = 16  # transmitters predicted together, which bounds the memory of images
 # Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
 MOST_COVARIANCES = 6.4e7
 STARTS = 60  # starts of the phase retrieval of one spectrum, at most
+LONGEST, SHORTEST = 4.6, 0.25  # lengths over which a wave stays coherent, in wavelengths
 LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
 FREQUENCY = "frequency_hz"  # key of the arrays that generic kriging has not
@@ -73,22 +74,13 @@ class SpectrumKrigingSettings(KrigingSettings):
     Attributes:
         cone_deg: greatest angle between the line of sight and waves that leave the transmitter.
         directions: directions on the whole sphere, of which those in the cone are used.
-        longest: greatest length over which a wave stays coherent, in wavelengths.
-        shortest: least such length.
-        lengths: number of lengths, evenly spaced on a logarithmic scale.
+        lengths: number of lengths of coherence from `SHORTEST` to `LONGEST`, evenly spaced on a logarithmic scale.
     """
 
     cone_deg: Annotated[float, Field(gt=0, le=180, description="more than 0 and at most 180")] = 80.0
     directions: Count = 120
-    longest: Positive = 4.6
-    shortest: Positive = 0.25
     lengths: Count = 4
-
-    def __post_init__(self) -> None:
-        """Refuse settings out of range (`InputError`)."""
-        super().__post_init__()
-        if self.shortest > self.longest:
-            raise InputError(f"setting shortest: {self.shortest} is out of range, choose at most longest")
+    FIXED: ClassVar[Mapping[str, float]] = {"longest": LONGEST, "shortest": SHORTEST}
 
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -269,7 +261,7 @@ def _fit_signals_and_nearby(
     receiver_m = rows.receiver.position_m
     towards = line_of_sight(position_m, receiver_m)
     covariances = Covariances(
-        np.geomspace(settings.longest, settings.shortest, settings.lengths) * wavelength,
+        np.geomspace(LONGEST, SHORTEST, settings.lengths) * wavelength,
         departures(towards, 2 * np.pi / wavelength, settings.cone_deg, settings.directions),
     )
 

@@ -17,10 +17,10 @@ are divided by the uplink's scale and phase. Chosen here:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import drjit as dr
 import numpy as np
@@ -41,6 +41,7 @@ from ..model import (
     from_field_arrays,
     keyed,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
@@ -52,6 +53,8 @@ from .csi_bands import Bands, UplinkModel, bands_of, known_rows, relative_error
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
 leaky = nn.LeakyReLU(0.1)
+ROW_BATCH = 64  # rows of a step, at most, where a sample is a row
+BETA = 1e-4  # weight of the divergence against the relative squared error of a sample
 WEAK = 0.3  # share of the root mean square below which a sum over subcarriers has no reliable phase
 
 
@@ -62,10 +65,8 @@ class FireSettings(NetworkSettings):
     Attributes:
         batch: antennas of a step, at most, where a sample is an antenna.
         sample: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows.
-        row_batch: rows of a step, at most, where a sample is a row.
         latent: number of latent variables.
         width: neurons of the hidden layers.
-        beta: weight of the Kullback-Leibler divergence against the mean squared error of a sample.
         spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
     """
 
@@ -73,10 +74,9 @@ class FireSettings(NetworkSettings):
     batch: int = 256
     validate_every: int = 500
     sample: Sample = "auto"
-    row_batch: Count = 64
+    FIXED: ClassVar[Mapping[str, float]] = {"row_batch": ROW_BATCH, "beta": BETA}
     latent: Count = 32
     width: Count = 256
-    beta: float = 1e-4
     spacing_hz: Positive = 312.5e3
 
 
@@ -129,7 +129,7 @@ class Fire(Module):
         self.p = Mlp(hidden, Linear(s.width, outputs, rng, gain=1.0), leaky)
 
 
-def fire_loss(fire: Fire, data: Any, drawn: Any, beta: float) -> Any:
+def fire_loss(fire: Fire, data: Any, drawn: Any) -> Any:
     """Relative squared error of the downlink and divergence of the latent distribution, means over the batch.
 
     Args:
@@ -137,13 +137,12 @@ def fire_loss(fire: Fire, data: Any, drawn: Any, beta: float) -> Any:
         data: ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
             the square of these units over the energy of their row.
         drawn: ``rows`` [batch] and normal draws ``noise`` [latent, batch].
-        beta: weight of the divergence.
     """
     uplink, downlink, weight = (columns(data[name], drawn["rows"]) for name in ("uplink", "downlink", "weight"))
     mean, log_variance = fire.q(uplink)
     latent = mean + dr.exp(0.5 * log_variance) * drawn["noise"]
     error = dr.sum(dr.square(fire.p(latent) - downlink) * weight, axis=None)
-    return ((error + beta * normal_divergence(mean, log_variance)) / mean.shape[1]).array
+    return ((error + BETA * normal_divergence(mean, log_variance)) / mean.shape[1]).array
 
 
 @dataclass(frozen=True)
@@ -174,11 +173,10 @@ def predict_samples(
     """Downlink [m, antennas of a sample, subcarriers] of uplink samples with their units."""
     scaled = parts(samples / unit[:, None, None])
     out = np.empty((len(samples), samples.shape[1] * subcarriers), complex)
-    for first in range(0, len(samples), CHUNK_SIZE):
-        some = slice(first, first + CHUNK_SIZE)
-        values = fire.p(fire.q(to_tensor(scaled[:, some]))[0]).numpy().T
+    for chunk in slices(len(samples), CHUNK_SIZE):
+        values = fire.p(fire.q(to_tensor(scaled[:, chunk]))[0]).numpy().T
         half = values.shape[1] // 2
-        out[some] = values[:, :half] + 1j * values[:, half:]
+        out[chunk] = values[:, :half] + 1j * values[:, half:]
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
 
 
@@ -210,13 +208,13 @@ def _fit(
 
     def score(fire: Fire) -> float:
         predicted = predict_samples(fire, uplink[judges], unit[judges], downlink.shape[-1])
-        found, truth = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
-        return float(np.median(relative_error(found, truth)))
+        rows = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
+        return float(np.median(relative_error(*rows)))
 
     first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
     rows_of = draw, first, everything, score if len(validation) else None
-    network = Network(f"fire {sample}", fire, partial(fire_loss, beta=s.beta), data, *rows_of, "relative error")
-    config = s if sample == "antenna" else replace(s, batch=s.row_batch)
+    network = Network(f"fire {sample}", fire, fire_loss, data, *rows_of, "relative error")
+    config = s if sample == "antenna" else replace(s, batch=ROW_BATCH)
     return train_network(network, config, seeds, session)
 
 
@@ -233,6 +231,7 @@ class FireModel(UplinkModel):
         train, validation = known_rows(self.name, record, split)
         bands = bands_of(record, settings.spacing_hz)
         kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
+        # A network of whole rows has that many more weights, which fewer rows than coefficients do not determine.
         few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
         unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
         if settings.sample == "auto" and (few or unscored or bands.antennas == 1):

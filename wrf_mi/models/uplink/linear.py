@@ -27,7 +27,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
 from .csi_bands import UplinkModel, known_rows, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
@@ -88,9 +88,9 @@ class Normal:
         assert record.uplink is not None
         up, down = record.uplink.shape[2], record.observation.shape[3]
         left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
-        for first in range(0, len(rows), CHUNK_SIZE):
-            some = rows[first : first + CHUNK_SIZE]
-            x, y = record.uplink[some].astype(complex), record.observation[0, some].astype(complex)
+        for part in slices(len(rows), CHUNK_SIZE):
+            chunk = rows[part]
+            x, y = record.uplink[chunk].astype(complex), record.observation[0, chunk].astype(complex)
             energy = np.square(np.abs(y)).sum(axis=(1, 2))
             # A row without energy has no relative error.
             scale = np.where(energy > 0, 1 / np.sqrt(np.where(energy > 0, energy, 1)), 0)[:, None, None]
@@ -103,6 +103,7 @@ class Normal:
 
     def matrix(self, penalty: float) -> NDArray[np.complex128]:
         """The map [f, g] that solves them with a penalty in units of the mean eigenvalue."""
+        # Ridge regression by eigenvectors: each penalty costs one product. Rounding leaves values below 0.
         damped = np.maximum(self.values, 0) + penalty * self.values.mean()
         return np.asarray(self.vectors @ ((self.vectors.conj().T @ self.right) / damped[:, None]))
 

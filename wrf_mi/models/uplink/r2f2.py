@@ -37,7 +37,7 @@ from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
 from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, under
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
 from .csi_bands import Bands, UplinkModel, bands_of, known_rows, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
@@ -87,6 +87,7 @@ class ScenePaths:
             solved = waves.solve(theta[part], present[part], h[part])
             return expected_gains(waves, h[part], present[part], solved)[1]
 
+        # The scene has more paths than matter: those that the uplink, too, gives power to.
         power = np.concatenate(in_parts(needed, len(h)))
         present &= power > NEEDED * power.max(axis=1, keepdims=True)
         order = np.argsort(~present, axis=1, kind="stable")[:, : max(1, int(present.sum(axis=1).max()))]
@@ -98,17 +99,17 @@ class ScenePaths:
         """Lengths and direction cosines [k, p] of each transmitter's paths, seen from the middle of the array."""
         from ...tracing.paths.traced_field import TracedField
 
-        for start in range(0, len(tx_pos_m), CHUNK_SIZE):
-            part = slice(start, start + CHUNK_SIZE)
+        for part in slices(len(tx_pos_m), CHUNK_SIZE):
             turned = None if heading_rad is None else heading_rad[part]
-            given = tx_pos_m[part], self._receiver, self._options, turned
             self._prepared.check(tx_pos_m[part], (self._receiver,))
-            traced = TracedField(self._scene, *given, prepared=self._prepared)
-            found = traced({})
-            shape = found.batch, found.each
-            amplitude = np.hypot(*(part.numpy() for part in found.gain)).reshape(shape)
-            arrival = np.stack([u.numpy() for u in found.arrival], axis=-1).reshape(*shape, 3)
-            source = arrival * found.length_m.numpy().reshape(*shape, 1) - self._centre
+            link = tx_pos_m[part], self._receiver, self._options, turned
+            traced = TracedField(self._scene, *link, prepared=self._prepared)
+            paths = traced({})
+            shape = paths.batch, paths.each
+            amplitude = np.hypot(*(component.numpy() for component in paths.gain)).reshape(shape)
+            arrival = np.stack([u.numpy() for u in paths.arrival], axis=-1).reshape(*shape, 3)
+            # The image source, from which a spherical wave has the length and direction of the path.
+            source = arrival * paths.length_m.numpy().reshape(*shape, 1) - self._centre
             length = np.linalg.norm(source, axis=-1, keepdims=True)
             every = np.concatenate([length, source / length @ self._axes.T], axis=-1)
             for strength, row in zip(amplitude * traced.exists.reshape(shape), every, strict=True):
@@ -119,14 +120,15 @@ def distinct(theta: FloatArray, strength: FloatArray) -> FloatArray:
     """The strongest different paths [k, p] among some with strengths [m], 0 for place holders."""
     order = np.argsort(-strength, kind="stable")
     least = FAINT * np.sqrt(np.square(strength).sum())
-    kept: list[int] = []
+    chosen: list[int] = []
     for place in order[strength[order] > least]:
-        apart = np.abs(theta[kept] - theta[place])
+        # Nearly equal paths would share a gain, which an uplink cannot divide between them.
+        apart = np.abs(theta[chosen] - theta[place])
         if not ((apart[:, 0] < ALIKE_M) & (apart[:, 1:] < ALIKE_COSINE).all(axis=1)).any():
-            kept.append(int(place))
-        if len(kept) == MOST:
+            chosen.append(int(place))
+        if len(chosen) == MOST:
             break
-    return theta[kept]
+    return theta[chosen]
 
 
 Kind = Literal["auto", "spherical", "plane", "free"]
@@ -191,7 +193,7 @@ def choose(
         for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
         for kind in kinds
     ]
-    if len(options) == 1:
+    if len(options) == 1:  # nothing to choose, and no row needs a downlink
         return options[0]
     judges = validation if len(validation) else train
     judges = judges[np.linspace(0, len(judges) - 1, min(settings.choice_rows, len(judges))).round().astype(int)]
@@ -217,8 +219,8 @@ class R2F2(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
         paths = self.paths(np.asarray(inputs.uplink, complex), inputs)
-        found = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
-        return Prediction(found.astype(np.complex64))
+        downlink = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
+        return Prediction(downlink.astype(np.complex64))
 
     def paths(self, h: Complex, inputs: Inputs) -> Paths:
         """Paths of uplinks [m, antennas, f] from the positions of ``inputs``."""
@@ -257,9 +259,9 @@ class R2F2Model(UplinkModel):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
         """The model that `R2F2.arrays` described."""
-        settings = {name: value.item() for name, value in under("settings/", arrays).items()}
-        found = PathSettings(**settings)
-        return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
+        settings = PathSettings(**{name: value.item() for name, value in under("settings/", arrays).items()})
+        bands = from_field_arrays(Bands, arrays)
+        return R2F2(str(arrays["wavefront"]), bands, settings, _scene_paths(problem, settings))
 
 
 MODEL = R2F2Model()

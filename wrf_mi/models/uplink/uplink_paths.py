@@ -21,6 +21,7 @@ import numpy as np
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...parallel.threads import on_threads
+from ..model import slices
 from .uplink_waves import SINGULAR, Complex, Mask, Solved, Waves, products, strongest
 
 T = TypeVar("T")
@@ -99,7 +100,7 @@ def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, ste
 
 def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
     """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use."""
-    return on_threads(work, [slice(start, start + ROWS) for start in range(0, count, ROWS)])
+    return on_threads(work, slices(count, ROWS))
 
 
 def join_paths(parts: list[Paths]) -> Paths:
@@ -141,12 +142,13 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, kn
         refined, solved = refine(waves, h[active], theta[active], trial, between, known[active])
         left = solved.energy
         floor = ACCURACY * energy[active]
+        # Bayesian information criterion (Schwarz, 1978), of noise whose power is unknown.
         gain = 2 * count * np.log(np.maximum(best[active], floor) / np.maximum(left, floor))
         better = gain > waves.freedom * np.log(2 * count)
-        kept = active[better]
-        theta[kept], present[kept, -1], best[kept] = refined[better], True, left[better]
-        residual[kept] = solved.residual[better]
-        active = kept[best[kept] > ACCURACY * energy[kept]]
+        improved = active[better]
+        theta[improved], present[improved, -1], best[improved] = refined[better], True, left[better]
+        residual[improved] = solved.residual[better]
+        active = improved[best[improved] > ACCURACY * energy[improved]]
         if not len(active):
             break
     return _finish(waves, h, theta, present, final, known)
@@ -172,14 +174,15 @@ def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> t
     right = products(solved.atoms, h)
     tiny = np.finfo(float).tiny
     noise = solved.energy / np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
-    whole = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
-    power = np.where(present, whole[:, None], 0.0)
+    mean_power = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
+    power = np.where(present, mean_power[:, None], 0.0)
     for _ in range(PASSES):
         ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
         loaded = solved.gram.copy()
         loaded[:, diagonal, diagonal] += ridge + SINGULAR * solved.atoms.shape[2]
         inverse = np.linalg.inv(loaded)
         gains = inverse @ right
+        # Expectation: the gains' posterior mean and variance; maximisation: a power of their expected square.
         variance = noise[:, None] * inverse[:, diagonal, diagonal].real
         mean = np.square(np.abs(gains)).reshape(*present.shape, -1).mean(axis=2)
         power = np.where(present, mean + np.maximum(variance, 0), 0.0)
@@ -200,8 +203,8 @@ def refine(
     noise = solved.energy / (h.shape[1] * h.shape[2])
     known = replace(known, precision=known.precision * noise[:, None, None])
     damping = np.full(len(h), 1e-3)
-    energy, whole = solved.energy + known.cost(theta), np.square(np.abs(h)).sum(axis=(1, 2))
-    active = np.flatnonzero(energy > ACCURACY * whole)
+    energy, total = solved.energy + known.cost(theta), np.square(np.abs(h)).sum(axis=(1, 2))
+    active = np.flatnonzero(energy > ACCURACY * total)
     for _ in range(steps):
         if not len(active):
             break
@@ -211,6 +214,7 @@ def refine(
         normal[:, diagonal, diagonal] += precision.reshape(len(active), -1)
         right = right + (precision * (known.theta[active] - theta[active])).reshape(len(active), -1)
         scale = np.maximum(normal[:, diagonal, diagonal], 0)
+        # An absent path has no derivatives: its diagonal must not vanish.
         scale = np.maximum(scale, 1e-12 * scale.max(axis=1, keepdims=True, initial=0) + np.finfo(float).tiny)
         normal[:, diagonal, diagonal] += damping[active, None] * scale
         # In units of the diagonal: distances and cosines differ by orders of magnitude.
@@ -221,12 +225,13 @@ def refine(
         left = tried.energy + known[active].cost(trial)
         better = left < energy[active]
         converged = better & (left > (1 - CONVERGED) * energy[active])
-        kept = active[better]
-        theta[kept] = trial[better]
-        for values, found in zip(vars(solved).values(), vars(tried).values(), strict=True):
-            values[kept] = found[better]
-        energy[kept] = left[better]
+        improved = active[better]
+        theta[improved] = trial[better]
+        for values, new_values in zip(vars(solved).values(), vars(tried).values(), strict=True):
+            values[improved] = new_values[better]
+        energy[improved] = left[better]
+        # Towards Gauss and Newton after a success, towards steepest descent after a failure (Marquardt, 1963).
         damping[active] = np.where(better, damping[active] / 5, damping[active] * 8).clip(1e-12, 1e6)
-        done = converged | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)
+        done = converged | (energy[active] <= ACCURACY * total[active]) | (damping[active] >= 1e6)
         active = active[~done]
     return theta, solved
