@@ -24,15 +24,10 @@ RowScores = Callable[[FloatArray, IntArray], FloatArray]
 
 @dataclass(frozen=True)
 class Mixture:
-    """Weights that are piecewise linear in the distance.
+    """Weights that are piecewise linear in the distance."""
 
-    Attributes:
-        distance_m: distances [b], metres, ascending.
-        weights: weights [b, k] at these distances, of sum 1.
-    """
-
-    distance_m: FloatArray
-    weights: FloatArray
+    distance_m: FloatArray  # distances [b], metres, ascending
+    weights: FloatArray  # weights [b, k] at these distances, of sum 1
 
     def __call__(self, distance_m: FloatArray) -> FloatArray:
         """Weights [m, k] at distances [m]; those at the last knot beyond it."""

@@ -43,19 +43,13 @@ FAST = tuple(stage for stage in STAGES if stage != FIELD)
 
 @dataclass(frozen=True)
 class StageReport:
-    """What one stage contributes.
+    """What one stage contributes."""
 
-    Attributes:
-        stage: its name, of `STAGES`.
-        kept: whether it is part of the prediction.
-        held_out: mean score of held-out training rows by the stages up to it; None: it was not judged.
-        seconds: duration of its fit; None: it is part of the next one's.
-    """
-
-    stage: str
-    kept: bool
+    stage: str  # its name, of `STAGES`
+    kept: bool  # whether it is part of the prediction
+    # Mean score of held-out training rows by the stages up to it; None: it was not judged
     held_out: float | None = None
-    seconds: float | None = None
+    seconds: float | None = None  # duration of its fit; None: it is part of the next one's
 
 
 class SceneSide(Fitted):

@@ -45,20 +45,14 @@ class Probabilistic(Single, Protocol):
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """Training rows of one receiver, and what they belong to.
-
-    Attributes:
-        tx_pos_m: positions [n, 3], metres.
-        observation: observations [n, ...]; NaN where nothing was received.
-        tx_heading_rad: headings [n], or None to leave them out.
-    """
+    """Training rows of one receiver, and what they belong to."""
 
     problem: Problem
     split: Split
     receiver: Receiver
-    tx_pos_m: FloatArray
-    observation: NDArray[Any]
-    tx_heading_rad: FloatArray | None
+    tx_pos_m: FloatArray  # positions [n, 3], metres
+    observation: NDArray[Any]  # observations [n, ...]; NaN where nothing was received
+    tx_heading_rad: FloatArray | None  # headings [n], or None to leave them out
     on_progress: OnProgress
 
 
@@ -94,17 +88,12 @@ def observed_rows(
 
 @dataclass(frozen=True)
 class ByReceiver(Fitted):
-    """A model for each receiver, and for each carrier where the rows have several.
+    """A model for each receiver, and for each carrier where the rows have several."""
 
-    Attributes:
-        name: name of the method, for errors.
-        models: models of the receivers in turn, and so for each carrier; None: too few rows at that carrier.
-        heading: whether the models use headings.
-    """
-
-    name: str
+    name: str  # name of the method, for errors
+    # Models of the receivers in turn, and so for each carrier; None: too few rows at that carrier
     models: list[Single | None]
-    heading: bool
+    heading: bool  # whether the models use headings
     carriers_hz: FloatArray | None = None
 
     @property

@@ -107,19 +107,11 @@ def direct_wave(tx_pos_m: FloatArray, receiver_m: FloatArray, k: FloatArray) -> 
 
 @dataclass(frozen=True)
 class KrigedChannels:
-    """Channels of one receiver: line of sight times a gain, and a diffuse field.
+    """Channels of one receiver: line of sight times a gain, and a diffuse field."""
 
-    Attributes:
-        receiver_m: position of the receiver [3], metres.
-        k: wave number of each subcarrier, rad/m.
-        gain: complex gain of the line of sight.
-        field: what it leaves.
-        dtype: type of observations.
-    """
-
-    receiver_m: FloatArray
-    k: FloatArray
-    gain: complex
+    receiver_m: FloatArray  # position of the receiver [3], metres
+    k: FloatArray  # wave number of each subcarrier, rad/m
+    gain: complex  # complex gain of the line of sight
     field: DiffuseField
     dtype: np.dtype[Any]
 

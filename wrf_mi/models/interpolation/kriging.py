@@ -39,13 +39,10 @@ LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 
 class Trend:
     """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
 
-    Attributes:
-        receiver_m: position [3] from which d is the distance, metres; None: one unknown mean.
-
     Source: Rappaport, "Wireless Communications" (2002), section 4.9.
     """
 
-    receiver_m: FloatArray | None = None
+    receiver_m: FloatArray | None = None  # position [3] from which d is the distance, metres; None: one unknown mean
 
     def __call__(self, positions_m: FloatArray) -> FloatArray:
         """Columns [n, p] at positions [n, 3]."""
@@ -63,29 +60,17 @@ STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attrib
 
 @dataclass(frozen=True)
 class Kriged:
-    """A fitted kriging: a trend, and weights of the training rows' correlations.
+    """A fitted kriging: a trend, and weights of the training rows' correlations."""
 
-    Attributes:
-        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
-        lengths: correlation length in metres, and over headings where there are any.
-        positions_m: positions of the rows [n, 3].
-        circle: cosine and sine of their headings [n, 2], or None.
-        coefficients: coefficients of the trend's columns for each component [p, q].
-        weights: weights of the rows for each component [n, q].
-        like: empty array of the shape and type of observations, [0, ...].
-        trend: columns of the trend.
-        noise: variance of the noise as a share of the field's.
-    """
-
-    kernel: str
-    lengths: FloatArray
-    positions_m: FloatArray
-    circle: FloatArray | None
-    coefficients: NDArray[np.inexact]
-    weights: NDArray[np.inexact]
-    like: NDArray[np.inexact]
+    kernel: str  # a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`
+    lengths: FloatArray  # correlation length in metres, and over headings where there are any
+    positions_m: FloatArray  # positions of the rows [n, 3]
+    circle: FloatArray | None  # cosine and sine of their headings [n, 2], or None
+    coefficients: NDArray[np.inexact]  # coefficients of the trend's columns for each component [p, q]
+    weights: NDArray[np.inexact]  # weights of the rows for each component [n, q]
+    like: NDArray[np.inexact]  # empty array of the shape and type of observations, [0, ...]
     trend: Trend
-    noise: float = 0.0
+    noise: float = 0.0  # variance of the noise as a share of the field's
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
         """Interpolate at positions [m, 3], metres: [m, ...], in the observations' unit and type.
@@ -120,13 +105,9 @@ class Kriged:
 
 @dataclass(frozen=True, kw_only=True)
 class UncertainKriged(Kriged):
-    """Kriging over positions, with a trend by generalised least squares, that states standard deviations.
+    """Kriging over positions, with a trend by generalised least squares, that states standard deviations."""
 
-    Attributes:
-        scale: standard deviation of the field of each component [q].
-    """
-
-    scale: FloatArray
+    scale: FloatArray  # standard deviation of the field of each component [q]
 
     @classmethod
     def of(cls, kriged: Kriged, observed: NDArray[Any]) -> UncertainKriged:

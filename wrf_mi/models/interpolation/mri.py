@@ -39,15 +39,10 @@ class MriSettings:
 
 @dataclass(frozen=True)
 class PathLoss:
-    """The fitted law of one receiver.
+    """The fitted law of one receiver."""
 
-    Attributes:
-        receiver_m: position of the receiver [3], metres.
-        law: power at one metre in dBm, and minus the exponent, [2].
-    """
-
-    receiver_m: FloatArray
-    law: FloatArray
+    receiver_m: FloatArray  # position of the receiver [3], metres
+    law: FloatArray  # power at one metre in dBm, and minus the exponent, [2]
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Power in dBm, [m] float32, at transmitter positions [m, 3]."""

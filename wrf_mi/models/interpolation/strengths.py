@@ -73,19 +73,12 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
 
 @dataclass(eq=False, repr=False)
 class Strengths(Fitted):
-    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report.
-
-    Attributes:
-        field: posterior of the signal strengths.
-        shift_db: shift of predictions.
-        widen: factor of each receiver's standard deviations [n_rx].
-        fit_facts: numbers of the fit for `facts`.
-    """
+    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report."""
 
     field: Field
     shift_db: float
-    widen: FloatArray
-    fit_facts: dict[str, float]
+    widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
+    fit_facts: dict[str, float]  # numbers of the fit for `facts`
 
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""

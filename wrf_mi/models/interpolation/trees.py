@@ -77,27 +77,16 @@ class Trees(CheckedSettings):
 
 @dataclass(frozen=True)
 class GrownTrees:
-    """Trees as plain arrays, over all nodes of all trees: a run file holds arrays, not pickled objects.
+    """Trees as plain arrays, over all nodes of all trees: a run file holds arrays, not pickled objects."""
 
-    Attributes:
-        root: first node of each tree.
-        left: next node where the feature is at most the threshold; of a leaf, itself.
-        right: next node where it is more.
-        feature: number of the feature that decides.
-        threshold: threshold of the feature.
-        value: mean of the training rows in the node.
-        depth: longest path from a root to a leaf.
-        like: empty array [0, features] of the observations' type.
-    """
-
-    root: NDArray[np.int32]
-    left: NDArray[np.int32]
-    right: NDArray[np.int32]
-    feature: NDArray[np.int8]
+    root: NDArray[np.int32]  # first node of each tree
+    left: NDArray[np.int32]  # next node where the feature is at most the threshold; of a leaf, itself
+    right: NDArray[np.int32]  # next node where it is more
+    feature: NDArray[np.int8]  # number of the feature that decides
     threshold: FloatArray
-    value: FloatArray
-    depth: NDArray[Any]
-    like: NDArray[Any]
+    value: FloatArray  # mean of the training rows in the node
+    depth: NDArray[Any]  # longest path from a root to a leaf
+    like: NDArray[Any]  # empty array [0, features] of the observations' type
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
         """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].

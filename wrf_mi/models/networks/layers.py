@@ -135,15 +135,10 @@ def columns(x: Any, picked: Any) -> Any:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """A frame of positions, fitted on training rows.
+    """A frame of positions, fitted on training rows."""
 
-    Attributes:
-        centre_m: mean of the training positions [3].
-        extent_m: largest distance from it along an axis, metres.
-    """
-
-    centre_m: FloatArray
-    extent_m: float
+    centre_m: FloatArray  # mean of the training positions [3]
+    extent_m: float  # largest distance from it along an axis, metres
 
     @classmethod
     def of(cls, positions_m: ArrayLike) -> Coordinates:

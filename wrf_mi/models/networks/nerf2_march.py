@@ -82,17 +82,11 @@ class Nerf2Network(Module):
 
 @dataclass
 class RayPoints:
-    """Everything about the points of some rays that does not depend on the transmitter.
+    """Everything about the points of some rays that does not depend on the transmitter."""
 
-    Attributes:
-        weight_re: real part of the factor of s_s in the sum, tensor [outputs, rays * S].
-        weight_im: its imaginary part.
-        first: sum of the inputs of the radiance network's first layer but the condition, [width, rays * S].
-    """
-
-    weight_re: Any
-    weight_im: Any
-    first: Any
+    weight_re: Any  # real part of the factor of s_s in the sum, tensor [outputs, rays * S]
+    weight_im: Any  # its imaginary part
+    first: Any  # sum of the inputs of the radiance network's first layer but the condition, [width, rays * S]
 
 
 def look(network: Nerf2Network, rays: Mapping[str, Any]) -> RayPoints:

@@ -40,36 +40,24 @@ SPECTRUM = TASKS["spectrum"]
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """Rows that a receiver's network learns from, and after them those that choose the number of steps.
-
-    Attributes:
-        receiver: name of the receiver.
-        spectra: greys [n, height, width].
-        where: features of the transmitters [features, n].
-        train: number of rows that train while the others choose.
-    """
+    """Rows that a receiver's network learns from, and after them those that choose the number of steps."""
 
     receiver: str
-    spectra: NDArray[np.float32]
-    where: Any
-    train: int
+    spectra: NDArray[np.float32]  # greys [n, height, width]
+    where: Any  # features of the transmitters [features, n]
+    train: int  # number of rows that train while the others choose
 
 
 class SpectrumNetwork(Model):
-    """A model with a network for each receiver.
-
-    Attributes:
-        generator: attribute of the trained network that makes spectra; no other part is stored.
-        generator_class: its class: ``generator_class(settings, (height, width), rng)``. The method ``spectra`` makes
-            greys [m * height * width], a flat array, from features of positions [features, m].
-        at_once: spectra that are predicted together, which bounds the memory.
-    """
+    """A model with a network for each receiver."""
 
     tasks = ("spectrum",)
     uplink, headings = "optional", True
-    generator: str
+    generator: str  # attribute of the trained network that makes spectra; no other part is stored
+    # Its class: ``generator_class(settings, (height, width), rng)``. The method ``spectra`` makes greys [m * height *
+    # width], a flat array, from features of positions [features, m]
     generator_class: Any
-    at_once: int
+    at_once: int  # spectra that are predicted together, which bounds the memory
 
     @abstractmethod
     def network(self, rows: ReceiverRows, settings: Any, rng: np.random.Generator) -> Network:

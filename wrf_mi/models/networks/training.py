@@ -54,36 +54,24 @@ class NetworkSettings(LoopConfig):
 
 @dataclass(frozen=True)
 class Network:
-    """A network with its loss, data and score.
+    """A network with its loss, data and score."""
 
-    Attributes:
-        name: name for progress and checkpoint.
-        module: network with its initial weights.
-        loss: ``loss(module, data, drawn)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`).
-        data: Dr.Jit arrays that the loss needs in every step.
-        draw: ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in
-            ``train`` and a generator of random numbers.
-        train: samples of each receiver that train while others validate.
-        everything: all samples of each receiver.
-        score: score of a module on the validation rows; None: there are no such rows.
-        label: name of that score.
-        higher_is_better: whether a higher score is better.
-        rates: learning rates by path of a weight; `AdamConfig.network` for all others.
-        momentum: Adam's decay of the first moment.
-    """
-
-    name: str
-    module: Module
+    name: str  # name for progress and checkpoint
+    module: Module  # network with its initial weights
+    # ``loss(module, data, drawn)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`)
     loss: Callable[[Any, Any, Any], Any]
-    data: Any
+    data: Any  # Dr.Jit arrays that the loss needs in every step
+    # ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in ``train``
+    # and a generator of random numbers
     draw: Callable[[IntArray, int, np.random.Generator], Any]
-    train: Sequence[IntArray]
-    everything: Sequence[IntArray]
-    score: Callable[[Any], float] | None
+    train: Sequence[IntArray]  # samples of each receiver that train while others validate
+    everything: Sequence[IntArray]  # all samples of each receiver
+    score: Callable[[Any], float] | None  # score of a module on the validation rows; None: there are no such rows
     label: str
     higher_is_better: bool = False
+    # Learning rates by path of a weight; `AdamConfig.network` for all others
     rates: Mapping[str, float] = field(default_factory=dict)
-    momentum: float = 0.9
+    momentum: float = 0.9  # Adam's decay of the first moment
 
 
 class NetworkTrainer(TrainingLoop):

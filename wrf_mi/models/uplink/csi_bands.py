@@ -20,21 +20,14 @@ wave's direction along that axis."""
 
 @dataclass(frozen=True)
 class Bands:
-    """Two bands and the array that observes them.
+    """Two bands and the array that observes them."""
 
-    Attributes:
-        uplink_hz: frequency of each uplink subcarrier [f].
-        downlink_hz: frequency of each downlink subcarrier [g].
-        antennas: number of antennas.
-        known: whether the frequencies come with the data.
-        elements_m: positions of the antennas about the centre of the array, along its q principal axes [antennas, q],
-            metres; None: unknown.
-    """
-
-    uplink_hz: FloatArray
-    downlink_hz: FloatArray
+    uplink_hz: FloatArray  # frequency of each uplink subcarrier [f]
+    downlink_hz: FloatArray  # frequency of each downlink subcarrier [g]
     antennas: int
-    known: bool
+    known: bool  # whether the frequencies come with the data
+    # Positions of the antennas about the centre of the array, along its q principal axes [antennas, q], metres; None:
+    # unknown
     elements_m: FloatArray | None = None
 
     @property

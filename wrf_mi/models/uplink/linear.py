@@ -66,17 +66,11 @@ class LinearMap(Fitted):
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations: sums over rows and antennas of weighted products.
+    """Normal equations: sums over rows and antennas of weighted products."""
 
-    Attributes:
-        values: eigenvalues of the uplink's products x^H x, [f].
-        vectors: their eigenvectors, [f, f].
-        right: products of uplink and downlink, x^H y, [f, g].
-    """
-
-    values: NDArray[np.float64]
-    vectors: NDArray[np.complex128]
-    right: NDArray[np.complex128]
+    values: NDArray[np.float64]  # eigenvalues of the uplink's products x^H x, [f]
+    vectors: NDArray[np.complex128]  # their eigenvectors, [f, f]
+    right: NDArray[np.complex128]  # products of uplink and downlink, x^H y, [f, g]
 
     @classmethod
     def of(cls, record: Record, rows: IntArray) -> Normal:

@@ -36,32 +36,20 @@ CONVERGED = 1e-9  # relative fall of the residual's energy below which a refinem
 
 @dataclass
 class Paths:
-    """Paths of n rows.
+    """Paths of n rows."""
 
-    Attributes:
-        theta: parameters [n, k, p], see `Waves`.
-        present: whether a row has each of the k paths, [n, k].
-        gains: complex gains [n, k, antennas], or [n, k, 1] for all antennas.
-    """
-
-    theta: FloatArray
-    present: Mask
-    gains: Complex
+    theta: FloatArray  # parameters [n, k, p], see `Waves`
+    present: Mask  # whether a row has each of the k paths, [n, k]
+    gains: Complex  # complex gains [n, k, antennas], or [n, k, 1] for all antennas
 
 
 @dataclass
 class Start:
-    """Paths of n rows that are known before the search, such as those of a scene.
+    """Paths of n rows that are known before the search, such as those of a scene."""
 
-    Attributes:
-        theta: expected parameters [n, k, p], see `Waves`.
-        present: whether a row has each of the k paths, [n, k].
-        precision: inverse variances of the parameters [n, k, p]; 0: nothing is known.
-    """
-
-    theta: FloatArray
-    present: Mask
-    precision: FloatArray
+    theta: FloatArray  # expected parameters [n, k, p], see `Waves`
+    present: Mask  # whether a row has each of the k paths, [n, k]
+    precision: FloatArray  # inverse variances of the parameters [n, k, p]; 0: nothing is known
 
     @classmethod
     def none(cls, rows: int, parameters: int) -> Start:

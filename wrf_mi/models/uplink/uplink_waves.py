@@ -35,19 +35,12 @@ SINGULAR = 1e-12  # added to normal matrices, of the power of one path: two equa
 
 @dataclass
 class Solved:
-    """Best gains for some paths.
+    """Best gains for some paths."""
 
-    Attributes:
-        gains: complex gains [n, paths, antennas], or [n, paths, 1] for all antennas.
-        residual: uplink minus the paths [n, antennas, f].
-        atoms: `Waves.unit` of the paths, 0 for absent ones.
-        gram: products of the atoms [n, paths, paths].
-    """
-
-    gains: Complex
-    residual: Complex
-    atoms: Complex
-    gram: Complex
+    gains: Complex  # complex gains [n, paths, antennas], or [n, paths, 1] for all antennas
+    residual: Complex  # uplink minus the paths [n, antennas, f]
+    atoms: Complex  # `Waves.unit` of the paths, 0 for absent ones
+    gram: Complex  # products of the atoms [n, paths, paths]
 
     @property
     def energy(self) -> FloatArray:
