@@ -128,18 +128,10 @@ def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:
-    """Weights [k] of a forward selection with replacement on some observations, which count by their shares.
+    """Weights [k] of a forward selection with replacement, from weights that count as ``begun`` steps.
 
-    The selection goes on while the mean score increases.
-
-    Args:
-        score: scores by weights.
-        rows: observations.
-        share: their shares.
-        weights: weights at the start [k].
-        begun: number of steps that the start counts as.
-
-    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
+    It goes on while the mean score of the observations, which count by their shares, increases. Source: Caruana,
+    Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
     """
     every = np.eye(len(weights))
     best = _mean(score, weights, rows, share)

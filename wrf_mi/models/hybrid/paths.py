@@ -20,7 +20,6 @@ from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..held_out import HeldOut, as_unseen
 from ..model import (
     Arrays,
-    Decomposition,
     Fitted,
     Inputs,
     Model,
@@ -70,33 +69,17 @@ def config_of(problem: Problem, split: Split, wanted: Collection[str]) -> TrainC
 
 
 class FittedPaths(SceneSide):
-    """The scene's side: paths, Gaussians on surfaces and those of a field.
+    """The scene's side: a trained graph of paths, Gaussians on surfaces and those of a field."""
 
-    Args:
-        graph: the trained graph in the scene that it was trained in.
-        problem: problem of the hybrid with that scene.
-        stages: reports of the stages that were tried.
-    """
-
-    def __init__(self, graph: FittedField, problem: Problem, stages: Sequence[StageReport] = ()) -> None:
-        self.graph, self.problem, self.stages = graph, problem, tuple(stages)
-        self.receivers, self.uses_heading, self.carriers_hz = graph.receivers, graph.uses_heading, graph.carriers_hz
-
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Observations of the receiver of that index, [m, ...]."""
-        return self.graph.predict(inputs, receiver)
-
-    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """Observations, and the paths' and the Gaussians' share of them."""
-        return self.graph.decompose(inputs, receiver, std)
+    fitted: FittedField
 
     def arrays(self) -> Arrays:
         """Arrays of the graph, and its settings."""
-        return self.graph.arrays() | {"settings": settings_array(self.graph.config)}
+        return super().arrays() | {"settings": settings_array(self.fitted.config)}
 
     def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Reports of the rows that the stages were chosen by; None: not all held-out rows are among these."""
-        reports = self.graph.held_out
+        reports = self.fitted.held_out
         if reports is None:
             return None
         place = {pair: number for number, pair in enumerate(zip(reports.receiver, reports.row, strict=True))}
@@ -158,24 +141,20 @@ class Paths(InScene):
         return paths
 
 
-def by_stage(problem: Problem, split: Split, side: SceneSide, kept: Collection[str]) -> dict[str, PredictAll]:
-    """Predictions of the stages up to each but the last.
+def by_stage(problem: Problem, split: Split, side: SceneSide, used: Collection[str]) -> dict[str, PredictAll]:
+    """Predictions of the stages up to each but the last, of the ``used`` ones of a fitted scene's side.
 
-    Args:
-        problem: problem of the hybrid, with the scene as it is stated.
-        split: its training rows fit offsets of traced signal strengths.
-        side: the fitted scene's side.
-        kept: stages that are used.
+    The problem has the scene as it is stated; training rows of the split fit offsets of traced signal strengths.
     """
     predictions: dict[str, PredictAll] = {}
-    earlier = [stage for stage in STAGES if stage in kept][:-1]
+    earlier = [stage for stage in STAGES if stage in used][:-1]
     if MEAN in earlier:
         predictions[MEAN] = _traced(problem, split)
     if side.problem.scene != problem.scene:
         predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
     if isinstance(side, FittedPaths):
         if SURFACES in earlier:
-            predictions[SURFACES] = _of_all(side.graph.without_gaussians() if FIELD in kept else side)
+            predictions[SURFACES] = _of_all(side.fitted.without_gaussians() if FIELD in used else side)
         if FIELD in earlier:
             predictions[FIELD] = _of_all(side)
     return predictions

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record, Split
 from ...core.files import write_atomically
@@ -22,7 +23,7 @@ from ...scene.correction_data import FILE as CORRECTION
 from ...tasks import task_of
 from ...training.reach import hold_out_groups
 from ..held_out import HeldOut
-from ..model import Fitted, Problem, Session
+from ..model import Arrays, Decomposition, Fitted, Inputs, Problem, Session
 
 logger = logging.getLogger(__name__)
 
@@ -53,15 +54,30 @@ class StageReport:
 
 
 class SceneSide(Fitted):
-    """A part of the hybrid that predicts from the scene.
+    """A part of the hybrid that predicts from the scene, by a model fitted in it.
 
-    Attributes:
-        problem: problem with the scene that it was fitted in.
-        stages: reports of the stages that were tried; none after loading.
+    ``problem`` is the hybrid's with that scene, ``stages`` are reports of those that were tried, none after loading.
     """
 
-    problem: Problem
-    stages: tuple[StageReport, ...] = ()
+    def __init__(self, fitted: Fitted, problem: Problem, stages: Collection[StageReport] = ()) -> None:
+        self.fitted, self.problem, self.stages = fitted, problem, tuple(stages)
+        self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Observations of the receiver of that index, [m, ...]."""
+        return self.fitted.predict(inputs, receiver)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, of strengths in a fraction of its time."""
+        return self.fitted.predict_mean(inputs, receiver)
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Observations, and the paths' and the Gaussians' share of them where there are both."""
+        return self.fitted.decompose(inputs, receiver, std)
+
+    def arrays(self) -> Arrays:
+        """Arrays of the fitted model."""
+        return self.fitted.arrays()
 
     def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of held-out rows, as large in error as if the scene had not seen them; None: a further fit has to

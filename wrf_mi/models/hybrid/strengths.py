@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Receiver, Split
 from ...core.files import write_atomically
@@ -28,9 +27,9 @@ from ...tracing.tracer import check_polarization
 from ..held_out import HeldOut, held_out_predictions, hold_out
 from ..interpolation.by_task import STOPS, StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
-from ..model import Arrays, Inputs, Model, Problem, Session
+from ..model import Arrays, Model, Problem, Session
 from .mixture import unit_means
-from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, inside, write_reports
+from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
@@ -44,34 +43,14 @@ ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 
 
 class FittedStrengths(SceneSide):
-    """Kriging of signal strengths about traced power.
+    """The scene's side for strengths: kriging about traced power."""
 
-    Args:
-        strengths: the fitted kriging.
-        problem: problem of the hybrid with the scene that was traced.
-        stages: reports of the stages that were tried.
-    """
-
-    def __init__(self, strengths: Strengths, problem: Problem, stages: Sequence[StageReport] = ()) -> None:
-        self.strengths, self.problem, self.stages = strengths, problem, tuple(stages)
-        self.unseen: Prediction | None = None
-        self.receivers, self.uses_heading = strengths.receivers, strengths.uses_heading
-
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Strengths at the receiver of that index, dBm [m]."""
-        return self.strengths.predict(inputs, receiver)
-
-    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """The mean of `predict`, which takes a fraction of its time."""
-        return self.strengths.predict_mean(inputs, receiver)
+    fitted: Strengths
+    unseen: Prediction | None = None  # predictions of held-out rows
 
     def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
         return self.unseen
-
-    def arrays(self) -> Arrays:
-        """Arrays of the kriging, the map among them."""
-        return self.strengths.arrays()
 
 
 def _chosen(
@@ -103,7 +82,7 @@ def _chosen(
     judged = _Remembering(_searched(mean), mean)
     shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
     held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
-    hyperparameters = asdict(judged.fitted.strengths.field.hyperparameters)
+    hyperparameters = asdict(judged.last.fitted.field.hyperparameters)
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
 
 
@@ -180,11 +159,11 @@ class StrengthsInScene(Model):
 class _Remembering(StrengthsInScene):
     """Keeps its last fit, whose hyperparameters the final one starts from."""
 
-    fitted: FittedStrengths
+    last: FittedStrengths
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
-        self.fitted = super().fit(problem, split, session)
-        return self.fitted
+        self.last = super().fit(problem, split, session)
+        return self.last
 
 
 class TracedStrengths(StrengthsInScene):

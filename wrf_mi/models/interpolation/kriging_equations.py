@@ -141,9 +141,7 @@ class KrigingSystem:
     def restricted_cost(self, root: FloatArray, least: float) -> float:
         """Minus twice the logarithm of the restricted likelihood of one component, the field's variance at its best.
 
-        Args:
-            root: `component_root` of the observations.
-            least: lower limit of the residual sum of squares.
+        ``root`` is the `component_root` of the observations, ``least`` the lower limit of the residual sum of squares.
         """
         # Residual sum of squares of the whitened rows beside an orthonormal basis of the whitened trend, whose triangle
         # has the square root of the determinant of B^T K^-1 B.

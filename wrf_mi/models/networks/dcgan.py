@@ -296,10 +296,8 @@ def softplus(x: Any) -> Any:
 def duel_loss(dcgan: Dcgan, data: Any, drawn: Any) -> Any:
     """Sum of the losses of generator and discriminator, each with gradients of its own weights alone.
 
-    Args:
-        dcgan: both networks.
-        data: ``truth``, spectra one after the other, and ``where`` [features, n].
-        drawn: ``rows`` [batch] and ``noise`` [k, batch] of the step.
+    ``data`` has ``truth``, spectra one after the other, and ``where`` [features, n]; ``drawn`` has ``rows`` [batch] and
+    ``noise`` [k, batch] of the step.
     """
     chosen, flat, shape = drawn["rows"], data["truth"], dcgan.g.shape
     pixels = shape[0] * shape[1]

@@ -268,11 +268,8 @@ class Field(Fitted):
 def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str, Any], field: Field) -> Any:
     """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
 
-    Args:
-        network: both networks.
-        data: `Field.data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
-        drawn: ``rows``, ``rays`` and ``receiver``, indices.
-        field: field to be trained.
+    ``data`` has that of the field, ``condition`` [features, n] and ``truth`` [n_rx * n, values]; ``drawn`` has indices:
+    ``rows``, ``rays`` and ``receiver``.
     """
     tensor, rays = type(data["direction"]), dr.width(drawn["rays"])
     points = look(network, rays_of(data, drawn["receiver"], drawn["rays"], field.n_rays))

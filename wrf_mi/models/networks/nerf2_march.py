@@ -92,10 +92,8 @@ class RayPoints:
 def look(network: Nerf2Network, rays: Mapping[str, Any]) -> RayPoints:
     """Evaluate the attenuation network on all points of some rays.
 
-    Args:
-        network: both networks.
-        rays: tensors of `constant_parts`, ``direction`` (unit vectors in the world [3, rays]) and ``origin`` (starting
-            point [3, 1], metres from the frame's centre).
+    ``rays`` has tensors of `constant_parts`, ``direction`` (unit vectors in the world [3, rays]) and ``origin``
+    (starting point [3, 1], metres from the frame's centre).
     """
     sizes, radiance = network.sizes, network.radiance.layers[0]
     count, samples = rays["direction"].shape[1], rays["distance"].shape[1]
@@ -136,16 +134,9 @@ def look(network: Nerf2Network, rays: Mapping[str, Any]) -> RayPoints:
 
 
 def march(network: Nerf2Network, points: RayPoints, condition: Any, samples: int) -> tuple[Any, Any]:
-    """Signal of each ray for each condition.
+    """Signal of each ray of S samples for conditions [features, batch]: real and imaginary part.
 
-    Args:
-        network: both networks.
-        points: result of `look`.
-        condition: features of transmitters for the radiance network, [features, batch].
-        samples: S.
-
-    Returns:
-        Real and imaginary part, flat arrays [outputs * batch * rays].
+    Both are flat arrays [outputs * batch * rays]; ``points`` is the result of `look`.
     """
     width, n = points.first.shape
     outputs, batch = points.weight_re.shape[0], condition.shape[1]

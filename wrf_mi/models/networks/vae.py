@@ -101,13 +101,10 @@ def normal_divergence(mean: Any, log_variance: Any) -> Any:
 
 
 def elbo_loss(vae: Vae, data: Any, drawn: Any, latents: int) -> Any:
-    """Negative evidence lower bound a pixel, mixed with the likelihood under the prior.
+    """Negative evidence lower bound a pixel, mixed with the likelihood under the prior, for z of ``latents`` numbers.
 
-    Args:
-        vae: network.
-        data: ``cells`` [cells, n], ``where`` [features, n] and ``pixels`` [pixels, n] of all rows.
-        drawn: ``rows`` [batch] and two draws of a normal distribution, ``noise`` and ``prior`` [latent, batch].
-        latents: size of z.
+    ``data`` has ``cells`` [cells, n], ``where`` [features, n] and ``pixels`` [pixels, n] of all rows; ``drawn`` has
+    ``rows`` [batch] and two draws of a normal distribution, ``noise`` and ``prior`` [latents, batch].
     """
     cells, where, truth = (columns(data[name], drawn["rows"]) for name in ("cells", "where", "pixels"))
     out = vae.q(image=cells, position=where)

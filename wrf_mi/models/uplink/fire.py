@@ -132,11 +132,9 @@ class Fire(Module):
 def fire_loss(fire: Fire, data: Any, drawn: Any) -> Any:
     """Relative squared error of the downlink and divergence of the latent distribution, means over the batch.
 
-    Args:
-        fire: network.
-        data: ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
-            the square of these units over the energy of their row.
-        drawn: ``rows`` [batch] and normal draws ``noise`` [latent, batch].
+    ``data`` has ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
+    the square of these units over the energy of their row; ``drawn`` has ``rows`` [batch] and normal draws ``noise``
+    [latent, batch].
     """
     uplink, downlink, weight = (columns(data[name], drawn["rows"]) for name in ("uplink", "downlink", "weight"))
     mean, log_variance = fire.q(uplink)
