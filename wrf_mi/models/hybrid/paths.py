@@ -87,21 +87,6 @@ class FittedPaths(SceneSide):
         return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held_out))
 
 
-def fit_in_scene(problem: Problem, split: Split, session: Session) -> FittedPaths:
-    """Paths, Gaussians on surfaces and those of the field in the scene as it is."""
-    settings = config_of(problem, split, problem.settings.wanted)
-    if too_few(problem.record, split):  # all of them train, as none can choose
-        split = replace(split, train=split.all_train, validation=split.validation[:0])
-    graph = WRF_GS_PLUS.fit(replace(problem, settings=settings), split, session)
-    scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
-    used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
-    reports = [StageReport(CALIBRATION, True, scores[CALIBRATION])] if CALIBRATION in scores else []
-    reports += [StageReport(stage, used[stage], scores.get(stage)) for stage in used if stage in scores or used[stage]]
-    if reports:
-        reports[-1] = replace(reports[-1], seconds=graph.train_seconds)
-    return FittedPaths(graph, problem, reports)
-
-
 class InScene(Model):
     """Stages 4 and 5 in a scene that is corrected already: no name of the registry."""
 
@@ -112,7 +97,19 @@ class InScene(Model):
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedPaths:
         """Train paths, Gaussians on surfaces and those of the field."""
-        return fit_in_scene(problem, split, session)
+        settings = config_of(problem, split, problem.settings.wanted)
+        if too_few(problem.record, split):  # all of them train, as none can choose
+            split = replace(split, train=split.all_train, validation=split.validation[:0])
+        graph = WRF_GS_PLUS.fit(replace(problem, settings=settings), split, session)
+        scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
+        used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
+        reports = [StageReport(CALIBRATION, True, scores[CALIBRATION])] if CALIBRATION in scores else []
+        reports += [
+            StageReport(stage, used[stage], scores.get(stage)) for stage in used if stage in scores or used[stage]
+        ]
+        if reports:
+            reports[-1] = replace(reports[-1], seconds=graph.train_seconds)
+        return FittedPaths(graph, problem, reports)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
         """The scene's side that was fitted in a folder."""
@@ -136,7 +133,7 @@ class Paths(InScene):
             Interrupted: stopped; the correction is kept, training goes on from its checkpoint.
         """
         inner, reports = corrected(problem, split, session)
-        paths = fit_in_scene(inner, split, session)
+        paths = super().fit(inner, split, session)
         paths.stages = (*reports, *(each for each in paths.stages if each.stage != CALIBRATION or not reports))
         return paths
 

@@ -81,20 +81,19 @@ class UplinkModel(Model):
     tasks = ("csi",)
     uplink, headings = "required", True
 
+    def known_rows(self, record: Record, split: Split) -> tuple[IntArray, IntArray]:
+        """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
 
-def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
-
-    Raises:
-        InputError: several receivers, no axis of antennas, or fewer than two rows.
-    """
-    shape = record.observation.shape
-    if len(shape) != 4 or shape[0] != 1:
-        raise InputError(
-            f"{record.name}: channel coefficients {list(shape)}; {name} needs one receiver with the antennas "
-            "that the uplink has, [1, rows, antennas, subcarriers]"
-        )
-    return received_rows(record, split, 0, name)
+        Raises:
+            InputError: several receivers, no axis of antennas, or fewer than two rows.
+        """
+        shape = record.observation.shape
+        if len(shape) != 4 or shape[0] != 1:
+            raise InputError(
+                f"{record.name}: channel coefficients {list(shape)}; {self.name} needs one receiver with the antennas "
+                "that the uplink has, [1, rows, antennas, subcarriers]"
+            )
+        return received_rows(record, split, 0, self.name)
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:

@@ -48,7 +48,7 @@ from ..model import (
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, UplinkModel, bands_of, known_rows, relative_error
+from .csi_bands import Bands, UplinkModel, bands_of, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
@@ -226,7 +226,7 @@ class FireModel(UplinkModel):
     def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedFire:
         """Fit a network, or two of which the better is kept."""
         record, settings = problem.record, problem.settings
-        train, validation = known_rows(self.name, record, split)
+        train, validation = self.known_rows(record, split)
         bands = bands_of(record, settings.spacing_hz)
         kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
         # A network of whole rows has that many more weights, which fewer rows than coefficients do not determine.

@@ -28,7 +28,7 @@ from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
-from .csi_bands import UplinkModel, known_rows, relative_error
+from .csi_bands import UplinkModel, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -126,7 +126,7 @@ class LinearModel(UplinkModel):
     def fit(self, problem: Problem, split: Split, session: FitSession) -> LinearMap:
         """Choose the penalty, then fit the map to all training rows."""
         record, settings = problem.record, problem.settings
-        train, validation = known_rows(self.name, record, split)
+        train, validation = self.known_rows(record, split)
         known = np.concatenate([train, validation])
         if not len(validation):
             picked = np.arange(len(train)) % JUDGES == 0

@@ -294,7 +294,7 @@ class OptMLModel(UplinkModel):
     def fit(self, problem: Problem, split: Split, session: FitSession) -> OptML:
         """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
         settings: OptMLSettings = problem.settings
-        kind, bands = choose(self.name, problem.record, split, settings, session.report)
+        kind, bands = choose(self.known_rows(problem.record, split), problem.record, settings, session.report)
         waves = waves_of(kind, bands, settings.max_distance_m)
         session.report("simulating channels", 0.0)
         rng = np.random.default_rng(problem.seed)

@@ -35,10 +35,11 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
+from ...core.types import IntArray
 from ...tracing.options import TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
-from .csi_bands import Bands, UplinkModel, bands_of, known_rows, principal_axes, relative_error
+from .csi_bands import Bands, UplinkModel, bands_of, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
 
@@ -163,17 +164,21 @@ class PathSettings(CheckedSettings):
 
 
 def choose(
-    name: str, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress, directions: bool = False
+    rows: tuple[IntArray, IntArray],
+    record: Record,
+    settings: PathSettings,
+    on_progress: OnProgress,
+    directions: bool = False,
 ) -> tuple[str, Bands]:
     """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
 
-    The criterion is the median over rows and antennas. Without validation rows, training rows decide. ``directions``:
-    among the wave models whose paths have a direction.
+    The criterion is the median over rows and antennas. Of ``rows`` that train and that validate, the latter decide
+    where there are any. ``directions``: among the wave models whose paths have a direction.
 
     Raises:
-        InputError: as `bands_of` and `known_rows`, or a wave front that needs elements where there are none.
+        InputError: as `bands_of`, or a wave front that needs elements where there are none.
     """
-    train, validation = known_rows(name, record, split)
+    train, validation = rows
     first = bands_of(record, settings.spacing_hz)
     if directions and (first.elements_m is None or settings.wavefront == "free"):
         text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
@@ -252,10 +257,9 @@ class R2F2Model(UplinkModel):
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> R2F2:
         """Choose the wave model and, where frequencies are unknown, the bands."""
-        settings, record = problem.settings, problem.record
-        with_scene = problem.scene is not None
-        chosen = choose(self.name, record, split, settings, session.report, with_scene)
-        return R2F2(*chosen, settings, _scene_paths(problem, settings))
+        settings, rows = problem.settings, self.known_rows(problem.record, split)
+        kind, bands = choose(rows, problem.record, settings, session.report, directions=problem.scene is not None)
+        return R2F2(kind, bands, settings, _scene_paths(problem, settings))
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
         """The model that `R2F2.arrays` described."""
