@@ -19,7 +19,7 @@ from ...core import Prediction, Receiver
 from ...core.angles import FloatArray
 from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import GenericKriging, UncertainKriged, kriged
+from .kriging import NEAREST_M, GenericKriging, UncertainKriged, kriged
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32
@@ -29,7 +29,6 @@ CERTAIN = 3.0  # standard errors by which predictions with the field must be bet
 LEAST_ROWS = 8
 """Least number of rows that may choose the line of sight: its gain, fitted to all of them, flatters them by 2 / n."""
 NEGLIGIBLE = 1e-8  # share of the mean power, -80 dB, below which an error no longer counts in the choice
-NEAREST_M = 0.01  # least distance of the line of sight: below 1 cm no antenna is a point
 GAIN = "gain"  # key of the arrays that generic kriging has not
 
 

@@ -26,6 +26,7 @@ from ..model import Arrays
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
+NEAREST_M = 0.01  # least distance of two antennas in a law: below 1 cm none is a point
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)
 HEADING_LENGTH = (0.1, 100.0)
@@ -49,8 +50,8 @@ class Trend:
         mean = np.ones(len(positions_m))
         if self.receiver_m is None:
             return mean[:, None]
-        # Below 1 cm no antenna is a point; the logarithm must not diverge on a transmitter at the receiver.
-        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), 0.01)
+        # The logarithm must not diverge on a transmitter at the receiver.
+        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), NEAREST_M)
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
