@@ -17,6 +17,7 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
 from wrf_mi.models import Interrupted
+from wrf_mi.models.hybrid import paths
 from wrf_mi.models.hybrid.scene_side import STAGES
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -152,6 +153,23 @@ def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path
     run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split)
     assert [one["stage"] for one in run.metrics["stages"]] == ["surfaces", "residual"]
     assert run.metrics["inside_90"] > 0.5
+
+
+def test_scene_as_stated_is_kept_where_few_rows_prefer_it(
+    scenes: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = str(scenes["thought"])
+    monkeypatch.setattr(paths, "_held_out_score", lambda one: float(one.problem.scene == stated))
+    record, split = measured(scenes, "spectrum", 16)
+    run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=("steps=20",))
+    again = wrf_mi.open_run(run.folder, record)
+    assert all(one.fitted.parts["paths"].problem.scene == stated for one in (run, again))
+    assert not (run.folder / "parts" / "paths" / "scene").exists()
+    reports = {report["stage"]: report for report in run.metrics["stages"]}
+    assert [stage for stage in STAGES if stage in reports] == list(reports)
+    assert reports["calibration"]["kept"]
+    assert not reports["correction"]["kept"]
+    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
 
 
 def test_stages_that_are_not_wanted_are_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:

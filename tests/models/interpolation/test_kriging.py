@@ -8,6 +8,7 @@ from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
+from wrf_mi.models.interpolation import kriging_equations
 from wrf_mi.models.interpolation.kriging import Kriged, Kriging, Trend
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, component_root
 from wrf_mi.models.interpolation.trees import Trees
@@ -67,6 +68,23 @@ def test_restricted_likelihood_is_that_of_contrasts_free_of_the_trend():
     root = component_root(values)
     assert root.shape == (25, 25)
     assert KrigingSystem(k, 0.3, b).restricted_cost(root, 0.0) == pytest.approx(expected, rel=EXACT)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.complex64])
+def test_components_are_solved_for_in_parts(kind: type, monkeypatch: pytest.MonkeyPatch):
+    """As all at once in double precision, of which single-precision values are an exact part."""
+    positions, heading, rng = made(25)
+    k, b = covariance(positions, heading, positions, heading), rng.normal(size=(25, 2))
+    parts = rng.normal(size=(2, 25, 90))
+    values = (parts[0] + 1j * parts[1] if kind is np.complex64 else parts[0]).astype(kind)
+    exact = values.astype(np.result_type(values, float))
+    system = KrigingSystem(k, 0.3, b)
+    monkeypatch.setattr(kriging_equations, "COLUMNS", 40)
+    coefficients, weights = system.regression(values)
+    np.testing.assert_allclose(coefficients, system.coefficients(exact), rtol=EXACT)
+    np.testing.assert_allclose(weights, system.weights(exact, coefficients), rtol=EXACT)
+    root = component_root(values)
+    np.testing.assert_allclose(root @ root.T, (exact @ exact.conj().T).real, rtol=EXACT, atol=EXACT)
 
 
 def test_regression_kriging_adds_the_residuals_of_least_squares():

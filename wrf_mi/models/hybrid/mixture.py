@@ -16,7 +16,8 @@ KNOTS, KNOT_ROWS = 4, 20
 FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
 
-DOUBT = 2.0  # standard errors of a difference that is clear: by chance five rows exceed one of them one time in five
+DOUBT = 2.0
+"""Standard errors of a difference that is clear: by chance five rows exceed one of them one time in five."""
 
 RowScores = Callable[[FloatArray, IntArray], FloatArray]
 """From weights [n, k] of some held-out observations and their numbers [n] to scores [n], the higher the better."""
@@ -24,10 +25,15 @@ RowScores = Callable[[FloatArray, IntArray], FloatArray]
 
 @dataclass(frozen=True)
 class Mixture:
-    """Weights that are piecewise linear in the distance."""
+    """Weights that are piecewise linear in the distance.
 
-    distance_m: FloatArray  # distances [b], metres, ascending
-    weights: FloatArray  # weights [b, k] at these distances, of sum 1
+    Attributes:
+        distance_m: distances [b], metres, ascending.
+        weights: weights [b, k] at these distances, of sum 1.
+    """
+
+    distance_m: FloatArray
+    weights: FloatArray
 
     def __call__(self, distance_m: FloatArray) -> FloatArray:
         """Weights [m, k] at distances [m]; those at the last knot beyond it."""
@@ -45,10 +51,10 @@ def averaged(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: Int
     Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
     Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
     """
-    scores = [score(np.broadcast_to(single, (len(rows), count)), rows) for single in np.eye(count)]
+    scores = [score(np.broadcast_to(one, (len(rows), count)), rows) for one in np.eye(count)]
     means = [unit_means(values, unit[rows]) for values in scores]
     best = max(means, key=np.mean)
-    alike = np.array([not improves(best, mean, True, DOUBT) for mean in means])
+    alike = np.array([not improves(best, one, True, DOUBT) for one in means])
     return constant(_selected(score, rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
 
 
@@ -71,7 +77,8 @@ def by_distance(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: 
 
 FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
 """Forms of the weights, in the order of their freedom."""
-SINGLE = "single"  # form before these: one prediction alone, which is named beforehand
+SINGLE = "single"
+"""Form before these: one prediction alone, which is named beforehand."""
 
 
 def choose(
@@ -104,19 +111,17 @@ def choose(
 
     forms = FORMS if trusted is None else {SINGLE: single, **FORMS}
     folds, every = np.unique(fold), np.arange(len(fold))
-    scores = {name: np.full(len(fold), np.nan) for name in forms}
+    found = {name: np.full(len(fold), np.nan) for name in forms}
     for done, number in enumerate(folds):
         out = fold == number
         for name, form in forms.items():
-            # A single fold has nothing to judge by; its form is then fitted to the rows that it is scored on.
             chosen = form(score, distance_m, unit, every[~out] if len(folds) > 1 else every, count)
-            scores[name][out] = score(chosen(distance_m[out]), every[out])
+            found[name][out] = score(chosen(distance_m[out]), every[out])
         on_fold((done + 1) / len(folds))
     best = next(iter(forms))
     for name in forms:
-        # Two errors to leave the trusted prediction: with few rows a mixture often gains by chance.
         errors = DOUBT if best == SINGLE else 1.0
-        if improves(unit_means(scores[name], unit), unit_means(scores[best], unit), True, errors):
+        if improves(unit_means(found[name], unit), unit_means(found[best], unit), True, errors):
             best = name
     return best, forms[best](score, distance_m, unit, every, count)
 
@@ -128,17 +133,24 @@ def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
 
 
 def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:
-    """Weights [k] of a forward selection with replacement, from weights that count as ``begun`` steps.
+    """Weights [k] of a forward selection with replacement on some observations, which count by their shares.
 
-    It goes on while the mean score of the observations, which count by their shares, increases. Source: Caruana,
-    Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
+    The selection goes on while the mean score increases.
+
+    Args:
+        score: scores by weights.
+        rows: observations.
+        share: their shares.
+        weights: weights at the start [k].
+        begun: number of steps that the start counts as.
+
+    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
     """
     every = np.eye(len(weights))
     best = _mean(score, weights, rows, share)
     for step in range(begun, begun + STEPS):
-        # Each prediction in turn gets one further vote among ``step`` that are cast.
         changed = (weights * step + every) / (step + 1)
-        values = [_mean(score, candidate, rows, share) for candidate in changed]
+        values = [_mean(score, one, rows, share) for one in changed]
         if max(values) <= best:
             break
         best, weights = max(values), changed[int(np.argmax(values))]
@@ -148,13 +160,12 @@ def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: Floa
 def _best_selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
     """`_selected` from the best single prediction."""
     every = np.eye(count)
-    first = every[int(np.argmax([_mean(score, single, rows, share) for single in every]))]
+    first = every[int(np.argmax([_mean(score, one, rows, share) for one in every]))]
     return _selected(score, rows, share, first, FIRST)
 
 
 def _knots(distance_m: FloatArray) -> FloatArray:
     finite = distance_m[np.isfinite(distance_m)]
-    # Quantiles, so that each knot has as many rows; infinite distances are beyond the last.
     count = int(np.clip(len(finite) // KNOT_ROWS, 1, KNOTS))
     knots: FloatArray = np.unique(np.quantile(finite, (np.arange(count) + 0.5) / count)) if len(finite) else np.zeros(1)
     return knots

@@ -26,7 +26,7 @@ from ..model import Arrays, Fitted, Model, Problem, Session, from_field_arrays, 
 from .fitted import NEGLIGIBLE, PREDICTED, STATED, FittedHybrid
 from .mixture import Mixture, choose, constant
 from .parts import KRIGING, PATHS, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
-from .residuals import Residuals
+from .residuals import Residuals, left_over
 from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
 
 FOLDER = "parts"
@@ -114,13 +114,15 @@ class _Fit:
         Both are residuals of the final parameters, which have seen the held-out rows, too: an approximation. To keep
         those of the chosen state would take the reports of all rows.
         """
-        side, record, seed = self._part(PATHS), self.record, self.problem.seed
-        among_known, mean = Residuals.of(side, record, fold, seed), np.array(self.predictions[PATHS].mean)
+        record, seed = self.record, self.problem.seed
+        left, mean = left_over(self._part(PATHS), record, self.split), np.array(self.predictions[PATHS].mean)
+        among_known = Residuals.of(left, record, fold, seed)
         for receiver in np.unique(held_out.receiver):
             places = held_out.receiver == receiver
             mean[places] += among_known(record.tx_pos_m[held_out.row[places]], int(receiver), mean.shape[1:])
+        del among_known  # as large as those of all rows
         self.predictions[RESIDUAL] = Prediction(np.clip(mean, 0, 1) if self.task.image else mean)
-        self.residuals = Residuals.of(side, record, self.split, seed)
+        self.residuals = Residuals.of(left, record, self.split, seed)
 
     def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, dict[str, float]]:
         """Form of the weights, the weights, and mean held-out scores of the parts and of the hybrid."""

@@ -10,12 +10,37 @@ from numpy.typing import NDArray
 
 from ...core import Record, Split
 from ...core.angles import FloatArray
-from ...datasets.observations import LEAST_ROWS
+from ...core.types import IntArray
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Fitted, keyed, under
 
-LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
+LEAST_RESIDUALS = 3
+"""Fewest rows of a receiver whose residuals are interpolated."""
+
+
+LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]
+"""Rows [n] by receiver, and what a model's mean leaves of their observations, [n, ...]."""
+
+
+def left_over(fitted: Fitted, record: Record, split: Split) -> LeftOver:
+    """What a fitted model leaves of the observations of its training rows."""
+    left: dict[int, tuple[IntArray, NDArray[Any]]] = {}
+    for receiver in range(len(record.receivers)):
+        rows = _training_rows(record, split, receiver)
+        if len(rows):
+            observed = record.observation[receiver, rows]
+            left[receiver] = rows, observed - predicted_rows(fitted, record, rows, receiver).mean
+    return left
+
+
+def _training_rows(record: Record, split: Split, receiver: int) -> IntArray:
+    """Training rows of a split whose observations a receiver has."""
+    rows = split.all_train
+    rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
+    if receiver in split.held_receivers:
+        rows = np.intersect1d(rows, split.left[split.left[:, 0] == receiver, 1])
+    return rows
 
 
 class Residuals:
@@ -29,19 +54,15 @@ class Residuals:
         self.by_receiver = dict(by_receiver)
 
     @classmethod
-    def of(cls, fitted: Fitted, record: Record, split: Split, seed: int) -> Residuals:
-        """Residuals of a fitted model at the training rows of a split."""
-        known: dict[int, Kriged] = {}
-        rows = split.all_train
-        for receiver in range(len(record.receivers)):
-            observed = record.observation[receiver, rows]
-            seen = rows[np.isfinite(observed).reshape(len(rows), -1).all(axis=1)]
-            if receiver in split.held_receivers:
-                seen = np.intersect1d(seen, split.left[split.left[:, 0] == receiver, 1])
-            if len(seen) >= max(LEAST_RESIDUALS, LEAST_ROWS):
-                left = record.observation[receiver, seen] - predicted_rows(fitted, record, seen, receiver).mean
-                known[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[seen], left)
-        return cls(known)
+    def of(cls, left: LeftOver, record: Record, split: Split, seed: int) -> Residuals:
+        """Residuals that a model left, at the training rows of a split that is the model's or holds out more."""
+        by_receiver: dict[int, Kriged] = {}
+        for receiver, (rows, residual) in left.items():
+            known = np.isin(rows, _training_rows(record, split, receiver))
+            if known.sum() >= LEAST_RESIDUALS:
+                residual = residual if known.all() else residual[known]
+                by_receiver[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[rows[known]], residual)
+        return cls(by_receiver)
 
     def __call__(self, tx_pos_m: FloatArray, receiver: int, shape: tuple[int, ...]) -> NDArray[Any] | float:
         """Expected residuals of a receiver at positions [m, 3], [m, *shape]; 0 without any rows."""

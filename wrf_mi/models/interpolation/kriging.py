@@ -194,7 +194,7 @@ class Kriging(CovarianceSettings):
         """
         positions, values, heading = observed_rows(tx_pos, observation, tx_heading_rad)
         like = np.empty((0, *values.shape[1:]), np.result_type(values, np.float32))
-        y = values.reshape(len(values), -1).astype(complex if np.iscomplexobj(values) else float)
+        y = values.reshape(len(values), -1)
         circle = None if heading is None else _circle(heading)
         columns = self.trend(positions)
         if len(y) < columns.shape[1]:
@@ -210,8 +210,7 @@ class Kriging(CovarianceSettings):
             system = self._factored(_coordinates(positions, circle, lengths), noise, columns)
         except LinAlgError:
             raise InputError("kriging: rows coincide and the noise is zero; give noise above 0") from None
-        beta = system.coefficients(field)
-        weights = system.weights(field, beta)
+        beta, weights = system.regression(field)
         coefficients = beta if ordinary is None else ordinary
         return Kriged(self.kernel, lengths, positions, circle, coefficients, weights, like, self.trend, noise)
 

@@ -34,6 +34,7 @@ from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ..model import slices
 
 Values = NDArray[Any]
 
@@ -42,6 +43,7 @@ NOISE = (1e-3, 1.0)  # bounds of the noise as a share of the variance, at least 
 START = (0.3, 0.3, 0.3, 0.01)  # three lengths and noise from which the search starts
 PIXELS = 4700  # approximate number of pixels in the likelihood: neighbouring pixels are redundant
 VARIANCE = 1e-12  # least variance of grey values, for equal spectra
+COLUMNS = 4096  # components that are solved for at once: 50 MB of a thousand rows and a half in double precision
 MOST_ROWS = 400  # rows in the likelihood at most
 
 KERNELS: dict[str, Callable[[FloatArray], FloatArray]] = {
@@ -106,6 +108,19 @@ class KrigingSystem:
         """K^-1 (y - B beta) [n, q]: a prediction is b . beta plus covariances with the rows times these."""
         return self.solve(values - self.trend @ coefficients)
 
+    def regression(self, values: Values) -> tuple[Values, Values]:
+        """`coefficients` [p, q] and `weights` [n, q] of observations [n, q] of any precision, both in double precision.
+
+        A thousand images in double precision are gigabytes, so their pixels are solved for in parts.
+        """
+        kind = np.result_type(values, float)
+        beta, weights = (np.empty((rows, values.shape[1]), kind) for rows in (self.trend.shape[1], len(values)))
+        for part in slices(values.shape[1], COLUMNS):
+            columns = values[:, part].astype(kind)
+            beta[:, part] = self.coefficients(columns)
+            weights[:, part] = self.weights(columns, beta[:, part])
+        return beta, weights
+
     def variance(
         self, prior: float, cross: FloatArray, trend: FloatArray | None = None, information: FloatArray | None = None
     ) -> FloatArray:
@@ -158,11 +173,16 @@ def component_root(values: Values) -> FloatArray:
 
     The likelihood needs no more of them, and an image has many more pixels than there are rows.
     """
-    parts = np.concatenate([values.real, values.imag], axis=1) if np.iscomplexobj(values) else values
-    if parts.shape[1] <= len(parts):
-        return np.ascontiguousarray(parts)
+    parts = (values.real, values.imag) if np.iscomplexobj(values) else (values,)
+    if len(parts) * values.shape[1] <= len(values):
+        return np.concatenate(parts, axis=1, dtype=float)
+    gram = np.zeros((len(values), len(values)))
+    for part in slices(values.shape[1], COLUMNS):
+        for component in parts:
+            columns = component[:, part].astype(float)
+            gram += columns @ columns.T
     # Y Y^T = V diag(p) V^T, so V sqrt(p) serves as well; negative p are rounding.
-    power, basis = np.linalg.eigh(parts @ parts.T)
+    power, basis = np.linalg.eigh(gram)
     return np.asarray(basis * np.sqrt(np.maximum(power, 0)))
 
 
