@@ -55,8 +55,7 @@ def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arra
     settings = default_settings(entry, SETTINGS.get(name, ()), given)
     problem = Problem(record, settings, 0, scene, None if scene is None else "concrete")
     session = Session(folder, folder)
-    if entry.prepare is not None:
-        problem.settings = entry.prepare(problem, [split], session)
+    problem.settings = entry.prepare(problem, [split], session)
     arrays = entry.fit(problem, split, session).arrays()
     for key, values in arrays.items():
         kept = key.rpartition("/")[2] in entry.gaps or np.asarray(values).dtype.kind not in "fc"

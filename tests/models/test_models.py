@@ -56,18 +56,21 @@ class Nearest(Fitted):
         return {"rows": len(self.kept["tx_pos"])}
 
 
-def fit(problem, split, session):
-    session.report("nearest rows", 0.0)
-    record, rows = problem.record, problem.rows(split)
-    kept = {"tx_pos": record.tx_pos_m[rows], "observation": record.observation[:, rows]}
-    return Nearest(kept, problem.settings)
+class NearestModel(Model):
+    name, source, settings = "nearest", "this test", NearestSettings
+    tasks = ("rssi",)
+
+    def fit(self, problem, split, session):
+        session.report("nearest rows", 0.0)
+        record, rows = problem.record, problem.rows(split)
+        kept = {"tx_pos": record.tx_pos_m[rows], "observation": record.observation[:, rows]}
+        return Nearest(kept, problem.settings)
+
+    def load(self, arrays, problem, folder):
+        return Nearest(arrays, problem.settings)
 
 
-def load(arrays, problem, folder):
-    return Nearest(arrays, problem.settings)
-
-
-MODEL = Model("nearest", ("rssi",), NearestSettings, fit, load, "this test")
+MODEL = NearestModel()
 '''
 
 

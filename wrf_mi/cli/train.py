@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -176,8 +175,7 @@ def _settings_text() -> str:
 
     names: dict[type, list[str]] = {}
     for name, model in MODELS.items():
-        kinds = model.settings if isinstance(model.settings, Mapping) else {"": model.settings}
-        for data, kind in kinds.items():
+        for data, kind in model.settings_by_data().items():
             names.setdefault(kind, []).append(f"{name}, {data}" if data else name)
     return "\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items())
 

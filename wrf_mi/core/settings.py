@@ -93,6 +93,8 @@ class CheckedSettings:
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
     """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
+    Settings of earlier versions that are constants now, in the mapping ``FIXED`` of the class, must have that value.
+
     ``source`` names the file or option in messages.
 
     Raises:
@@ -109,6 +111,11 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     for key, value in values.items():
         key = key if key in hints else FORMER_NAMES.get(key, key)
         name = f"{prefix}{key}"
+        if key in (fixed := getattr(kind, "FIXED", {})):
+            if value != fixed[key]:
+                text = f"{value!r}, where this version has {fixed[key]!r} alone; omit it, or train the run anew"
+                raise InputError(f"{source}, setting {name}: {text}")
+            continue
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")

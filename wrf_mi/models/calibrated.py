@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,7 @@ from .model import (
     under,
 )
 
-INTERVALS, ROWS = "intervals/", "intervals_rows"
-"""Prefix of the arrays of intervals, and key of the training rows."""
+INTERVALS, ROWS = "intervals/", "intervals_rows"  # prefix of the arrays of intervals, and key of the training rows
 
 
 class FittedWithIntervals(Fitted):
@@ -41,9 +41,9 @@ class FittedWithIntervals(Fitted):
         self._distance = RowDistance(record, rows)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
-    def _stated(self, found: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
+    def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
-        return self._intervals(found.mean, expected_size(task_of(self._record), found), distance_m)
+        return self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction of the model with calibrated standard deviations, [m, ...]."""
@@ -51,13 +51,13 @@ class FittedWithIntervals(Fitted):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Stored predictions of the model with calibrated standard deviations."""
-        found = self.fitted.predict_rows(rows, receiver)
-        return None if found is None else self._stated(found, self._record.tx_pos_m[rows], receiver)
+        stored = self.fitted.predict_rows(rows, receiver)
+        return None if stored is None else self._stated(stored, self._record.tx_pos_m[rows], receiver)
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Decomposition of the model's prediction, with calibrated standard deviations."""
-        found = self.fitted.decompose(inputs, receiver, std)
-        return replace(found, whole=self._stated(found.whole, inputs.tx_pos_m, receiver))
+        decomposed = self.fitted.decompose(inputs, receiver, std)
+        return replace(decomposed, whole=self._stated(decomposed.whole, inputs.tx_pos_m, receiver))
 
     @property
     def depends_on_heading(self) -> bool:
@@ -73,33 +73,42 @@ class FittedWithIntervals(Fitted):
         return self.fitted.facts()
 
 
-def with_intervals(entry: Model) -> Model:
-    """The entry of a model with calibrated intervals; its fit takes twice as long."""
+class WithIntervals(Model):
+    """A model with calibrated intervals, which states all else as the model does; its fit takes twice as long."""
 
-    def fit(problem: Problem, split: Split, session: Session) -> Fitted:
+    def __init__(self, model: Model) -> None:
+        vars(self).update({name: getattr(model, name) for name in Model.__annotations__})
+        self.model, self.gaps = model, (*model.gaps, *GAPS)
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedWithIntervals:
+        """Fit the model, and once more without held-out rows, whose errors calibrate the intervals."""
         record = problem.record
-        fitted = entry.fit(problem, split, session)
-        fold = _fold(entry, problem, split)
-        held = HeldOut.of(record, fold, problem.seed)
+        fitted = self.model.fit(problem, split, session)
+        fold = _fold(self.model, problem, split)
+        held_out = HeldOut.of(record, fold, problem.seed)
         place = replace(session, folder=session.folder / "held_out")
-        found = held_out_predictions(entry, problem, fold, held, place, entry.name)
+        predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
         shutil.rmtree(place.folder)
-        size = expected_size(task_of(record), found)
-        intervals = fit_intervals(found.mean, held.observed(record), size, held.distance_m, held.row)
+        size = expected_size(task_of(record), predicted)
+        intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
         return FittedWithIntervals(fitted, record, problem.rows(split), intervals)
 
-    def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedWithIntervals:
+        """The model and its intervals."""
         intervals = from_field_arrays(Intervals, under(INTERVALS, arrays))
-        kept = {key: values for key, values in arrays.items() if not key.startswith("intervals")}
-        return FittedWithIntervals(entry.load(kept, problem, folder), problem.record, arrays[ROWS], intervals)
+        of_model = {key: values for key, values in arrays.items() if not key.startswith("intervals")}
+        fitted = self.model.load(of_model, problem, folder)
+        return FittedWithIntervals(fitted, problem.record, arrays[ROWS], intervals)
 
-    def check(problem: Problem, splits: Sequence[Split]) -> None:
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse rows that are too few to hold some out, and what the model refuses."""
         for split in splits:
-            _fold(entry, problem, split)
-        if entry.check is not None:
-            entry.check(problem, splits)
+            _fold(self.model, problem, split)
+        self.model.check(problem, splits)
 
-    return replace(entry, fit=fit, load=load, check=check, gaps=(*entry.gaps, *GAPS))
+    def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
+        """Settings of the model without open choices."""
+        return self.model.prepare(problem, splits, session)
 
 
 def _fold(entry: Model, problem: Problem, split: Split) -> Split:

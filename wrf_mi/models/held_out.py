@@ -201,8 +201,9 @@ def labelled(session: Session, label: str) -> Session:
 
 def fit_model(entry: Model, problem: Problem, split: Split, session: Session) -> tuple[Fitted, Problem]:
     """A fitted model, and the problem with the settings that its `Model.prepare` chose."""
-    if entry.prepare is not None:
-        problem = replace(problem, settings=entry.prepare(problem, [split], session))
+    settings = entry.prepare(problem, [split], session)
+    if settings is not problem.settings:  # a new problem would open its scene anew
+        problem = replace(problem, settings=settings)
     return entry.fit(problem, split, session), problem
 
 

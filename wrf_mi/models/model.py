@@ -1,13 +1,14 @@
-"""A model as an entry of the registry, the problem that it is fitted to, inputs of predictions, and a fitted model."""
+"""Base class of models, the problem that they are fitted to, inputs of predictions, and a fitted model."""
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -69,7 +70,9 @@ class Problem:
 
         record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         if self.left_out:
-            record = record.at_receivers([k for k, one in enumerate(record.receivers) if one.name not in self.left_out])
+            record = record.at_receivers(
+                [k for k, each in enumerate(record.receivers) if each.name not in self.left_out]
+            )
         return record.with_antennas(self.antennas)
 
     @cached_property
@@ -195,21 +198,19 @@ class Fitted(ABC):
         return {}
 
 
-@dataclass(frozen=True)
-class Model:
-    """An entry of the registry.
+class Model(ABC):
+    """A model as the registry, help, descriptions, tables and checks know it; a subclass is one file.
 
-    A model of another package is a `Model` that an entry point of the group ``wrf_mi.models`` names.
+    One line in `wrf_mi.models` registers it; a model of another package is an instance that an entry point of the group
+    ``wrf_mi.models`` names.
 
     Attributes:
         name: name as in ``wrf-mi train --model``.
-        tasks: tasks that it serves; None: all.
-        settings: frozen dataclass of its settings, all with defaults; or several by purpose (`by_data`).
-        fit: ``fit(problem, split, session)``. ``split.validation`` may choose settings; the result uses no row but
-            ``problem.rows(split)``. Training step by step keeps a checkpoint in ``session.folder`` and continues from
-            it; all other fits call ``session.report``.
-        load: ``load(arrays, problem, folder)``, from `Fitted.arrays`; ``folder`` holds the fitted model.
         source: publication.
+        settings: frozen dataclass of its settings, all with defaults.
+        tasks: tasks that it serves; None: all.
+        summary: the model in a few words for readers of a page; "": its source.
+        scene_summary: the same with a scene, after ``summary``.
         scene: whether it takes a scene.
         uses_antennas: whether patterns and polarisations of antennas count in that scene.
         several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
@@ -220,22 +221,18 @@ class Model:
         complete: whether it needs every receiver's observation of every training row.
         gaps: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a
             run with such values in another array is refused.
-        given: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
-            ``receiver`` or ``evaluation``.
+        train_arguments: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``,
+            ``deterministic``, ``receiver`` or ``evaluation``.
         defaults: ``key=value`` that differ from the defaults of ``settings``.
         presets: named settings, ``key=value``.
-        check: ``check(problem, splits)`` raises `InputError` where a fit would, before anything is written.
-        prepare: ``prepare(problem, splits, session)``: settings without open choices; called before the first fit, and
-            again when an interrupted fit is resumed.
-        by_data: ``by_data(task, with_scene)``: the entry of the same name for data of a task, with or without a scene.
     """
 
     name: str
-    tasks: tuple[str, ...] | None
-    settings: type | Mapping[str, type]
-    fit: Callable[[Problem, Split, Session], Fitted]
-    load: Callable[[Arrays, Problem, Path], Fitted]
     source: str
+    settings: type
+    tasks: tuple[str, ...] | None = None
+    summary: str = ""
+    scene_summary: str = ", trained jointly with the paths of the scene"
     scene: Literal["none", "optional", "required"] = "none"
     uses_antennas: bool = True
     several_carriers: bool = False
@@ -244,33 +241,60 @@ class Model:
     new_receivers: bool = False
     complete: bool = False
     gaps: tuple[str, ...] = ()
-    given: tuple[str, ...] = ()
+    train_arguments: tuple[str, ...] = ()
     defaults: tuple[str, ...] = ()
-    presets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    check: Callable[[Problem, Sequence[Split]], None] | None = None
-    prepare: Callable[[Problem, Sequence[Split], Session], Any] | None = None
-    by_data: Callable[[str, bool], Model] | None = None
+    presets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+
+    @abstractmethod
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
+        """Fit to the rows ``problem.rows(split)`` alone, of which ``split.validation`` may choose settings.
+
+        Training step by step keeps a checkpoint in ``session.folder`` and continues from it; all other fits call
+        ``session.report``.
+        """
+
+    @abstractmethod
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The model that `Fitted.arrays` described; ``folder`` is that of its fit."""
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:  # noqa: B027 - most models refuse nothing
+        """Refuse what a fit would, before anything is written.
+
+        Raises:
+            InputError: settings, data or scene that it cannot be fitted to.
+        """
+
+    def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
+        """Settings without open choices; called before the first fit, and again when an interrupted fit is resumed."""
+        return problem.settings
+
+    def serving(self, task: str, with_scene: bool) -> Model:
+        """The model of the same name for data of a task that it serves, with or without a scene."""
+        return self
+
+    def settings_by_data(self) -> Mapping[str, type]:
+        """Classes of settings by the data that they are for, in words; "": all data."""
+        return {"": self.settings}
 
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks
 
-    def serving(self, task: str, with_scene: bool) -> Model:
-        """The entry for data of a task, with or without a scene."""
-        return self if self.by_data is None or not self.serves(task) else self.by_data(task, with_scene)
+    def described(self, with_scene: bool) -> str:
+        """The model in a few words, with or without a scene."""
+        return (self.summary or self.source) + (self.scene_summary if with_scene else "")
 
 
-def default_settings(entry: Model, settings: Iterable[str], given: Mapping[str, Any]) -> Any:
+def default_settings(model: Model, settings: Iterable[str], arguments: Mapping[str, Any]) -> Any:
     """Settings of a model with ``key=value`` applied after its defaults.
 
     Args:
-        entry: model, as `Model.serving` gives it.
+        model: model, as `Model.serving` gives it.
         settings: ``key=value``.
-        given: arguments of `wrf_mi.train` that may be settings, too (`Model.given`).
+        arguments: arguments of `wrf_mi.train` that may be settings, too (`Model.train_arguments`).
     """
-    kind: Any = entry.settings
-    stated = {name: value for name, value in given.items() if name in entry.given and value is not None}
-    return with_settings(kind(**stated), [*entry.defaults, *settings])
+    stated = {key: arguments[key] for key in model.train_arguments if arguments.get(key) is not None}
+    return with_settings(model.settings(**stated), [*model.defaults, *settings])
 
 
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
@@ -303,6 +327,11 @@ def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
     return record.tx_pos_m[rows]
 
 
+def slices(count: int, size: int) -> list[slice]:
+    """Slices of ``size`` rows each, the last possibly of fewer, that cover so many rows."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
 def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Arrays with a prefix before their names."""
     return {f"{prefix}{name}": values for name, values in arrays.items()}
@@ -315,13 +344,13 @@ def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[
 
 def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
-    named = ((one.name, getattr(value, one.name)) for one in fields(value))
-    return {f"{prefix}{name}": np.asarray(held) for name, held in named if held is not None}
+    named = ((field.name, getattr(value, field.name)) for field in fields(value))
+    return {f"{prefix}{name}": np.asarray(content) for name, content in named if content is not None}
 
 
 def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
     """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    names = (one.name for one in fields(cast(Any, kind)) if f"{prefix}{one.name}" in arrays)
+    names = (field.name for field in fields(cast(Any, kind)) if f"{prefix}{field.name}" in arrays)
     stored = {name: arrays[f"{prefix}{name}"] for name in names}
     return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
 

@@ -53,8 +53,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
-WITHOUT_PATH = 0.05
-"""Share of measured values without a path from which on walls that nothing passes are suspected."""
+WITHOUT_PATH = 0.05  # share of measured values without a path from which on walls that nothing passes are suspected
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
 alone, a part of any size costs as much as a few hundred positions."""
@@ -206,13 +205,13 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
         InputError: a receiver without a training row that a path reaches.
     """
     if problem.settings.calibration is not None:
-        found = fit_field(_graph_problem(problem), split, session)
+        graph = fit_field(_graph_problem(problem), split, session)
         if _changes_scene(problem):
-            scene = found.predictor.graph.scene
-            write_corrected_scene(session.folder / CORRECTED, scene, found.params, replace=True)
-        kept = load(found.arrays(), problem, session.folder)
-        kept.train_seconds = found.train_seconds
-        return kept
+            scene = graph.predictor.graph.scene
+            write_corrected_scene(session.folder / CORRECTED, scene, graph.params, replace=True)
+        calibrated = load(graph.arrays(), problem, session.folder)
+        calibrated.train_seconds = graph.train_seconds
+        return calibrated
     record, path, start = problem.record, session.run / PATHS, time.perf_counter()
     assert problem.scene is not None
     settings: TracingSettings = problem.settings
@@ -242,7 +241,9 @@ def fit(problem: Problem, split: Split, session: Session) -> Fitted:
 def _stored_trace(path: Path, record: Record) -> TraceResult:
     """The run's trace at the receivers of a record: a fold leaves out those with too few training rows."""
     traced, names = load_trace(path), {receiver.name for receiver in record.receivers}
-    return traced.of_receivers(np.array([k for k, one in enumerate(traced.receivers) if one.name in names], np.int64))
+    return traced.of_receivers(
+        np.array([k for k, receiver in enumerate(traced.receivers) if receiver.name in names], np.int64)
+    )
 
 
 def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None:
@@ -260,8 +261,8 @@ def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
     """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
     if problem.settings.calibration is not None:
         return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
-    here = folder / PATHS
-    return FittedTracing(problem, arrays, here if here.exists() else folder.parent / PATHS)
+    paths = folder / PATHS
+    return FittedTracing(problem, arrays, paths if paths.exists() else folder.parent / PATHS)
 
 
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
@@ -274,12 +275,12 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     if not tracer.options.sampled:
         least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
     parts = row_parts(len(tx_pos_m), scheduler.workers, least, PAIRS_TOGETHER)
-    given = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
-    sizes = [len(positions) for positions, *_ in given]
+    rows_of = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
+    sizes = [len(positions) for positions, *_ in rows_of]
     options = replace(tracer.options, rays=rays)
     opener = partial(RayTracer, problem.scene, tracer.instrument, options, problem.material)
-    found = scheduler.map(_trace_part, given, opener, what="tracing", sizes=sizes)
-    return replace(join_traces(found), options=tracer.options)
+    traces = scheduler.map(_trace_part, rows_of, opener, what="tracing", sizes=sizes)
+    return replace(join_traces(traces), options=tracer.options)
 
 
 def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None]) -> TraceResult:
@@ -350,17 +351,30 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
     assert problem.opened_scene is not None
 
 
-MODEL = Model(
-    NAME,
-    None,
-    TracingSettings,
-    fit,
-    load,
-    "Hoydis et al., 'Sionna RT' (2023)",
-    scene="required",
-    several_carriers=True,
-    new_receivers=True,
-    gaps=GAPS,
-    check=check,
-    prepare=prepare,
-)
+class RayTracing(Model):
+    """Paths of a scene, optionally calibrated on the training rows."""
+
+    name, source, settings = NAME, "Hoydis et al., 'Sionna RT' (2023)", TracingSettings
+    summary, scene_summary = "Sionna RT in the scene", ""
+    scene = "required"
+    several_carriers, new_receivers = True, True
+    gaps = GAPS
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
+        """Train the calibrated parameters; or trace all rows, and fit offsets of signal strengths, see `fit`."""
+        return fit(problem, split, session)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The model that a fit's arrays describe, see `load`."""
+        return load(arrays, problem, folder)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
+        check(problem, splits)
+
+    def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
+        """Settings, with those that are chosen by convergence, see `prepare`."""
+        return prepare(problem, splits, session)
+
+
+MODEL = RayTracing()

@@ -55,7 +55,7 @@ from ..datasets import make_splits
 from ..datasets.observations import check_observations, fitted_receivers, place_of, warn_of_left_out
 from ..datasets.splits import splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
-from ..models.calibrated import with_intervals
+from ..models.calibrated import WithIntervals
 from ..models.checks import check_held_receivers, check_record
 from ..models.model import default_settings
 from ..parallel import Scheduler
@@ -94,7 +94,7 @@ def _settings_of(model: Model, settings: Settings, given: dict[str, Any]) -> Any
     else:
         assert isinstance(settings, Iterable)
         found = default_settings(model, settings, given)
-    if "model" in model.given and found.model != model.name:
+    if "model" in model.train_arguments and found.model != model.name:
         raise InputError(f"setting model: {found.model}, where the model is {model.name}; choose it with --model")
     return found
 
@@ -124,20 +124,20 @@ def plan_run(
     given = {"model": model, "seed": seed, "deterministic": deterministic, "receiver": receiver}
     given["evaluation"] = evaluation
     for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
-        if given[option] is not None and option not in chosen.given:
-            raise InputError(f"--{option} belongs to {data} (wrf-gs, wrf-gs+, factorised), not to {model}")
+        if given[option] is not None and option not in chosen.train_arguments:
+            able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
+            raise InputError(f"--{option} belongs to {data} ({able}), not to {model}")
     _check_scene(chosen, record, scene_name, material, antennas)
     found = _settings_of(chosen, settings, given)
-    if "seed" in chosen.given:
+    if "seed" in chosen.train_arguments:
         seed, deterministic = found.seed, found.deterministic
     record, splits, left_out = _split_rows(record, split, seed, n_train)
     for rows in splits:
         check_held_receivers(record, rows, chosen, MODELS.values())
         check_observations(record, rows, complete=chosen.complete)
     problem = Problem(record, found, seed, scene_name, material, antennas)
-    checked = with_intervals(chosen) if intervals else chosen
-    if checked.check is not None:
-        checked.check(problem, splits)
+    checked = WithIntervals(chosen) if intervals else chosen
+    checked.check(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene_name, material, antennas, deterministic, intervals, found, left_out)
@@ -314,7 +314,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     """Fit every part that is not fitted yet, and score the run."""
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
-    if config.entry.prepare is not None and not all((part / FITTED).exists() for part in folders):
+    if not all((part / FITTED).exists() for part in folders):
         problem.settings = config.entry.prepare(problem, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)

@@ -173,7 +173,7 @@ def _method(run: Results) -> Any:
     if config is None:
         return run.name
     settings = config.settings
-    if "seed" in config.entry.given:
+    if "seed" in config.entry.train_arguments:
         settings = replace(settings, seed=0)
     return repr(replace(config, seed=0, settings=settings))
 

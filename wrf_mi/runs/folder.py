@@ -38,7 +38,7 @@ from ..datasets import load_split, save_split
 from ..datasets.folder_files import shown
 from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
-from ..models.calibrated import with_intervals
+from ..models.calibrated import WithIntervals
 from ..models.model import Arrays
 from ..tasks import TASKS
 from ..training.fit_plan import check_rows
@@ -84,7 +84,7 @@ class RunConfig:
             InputError: no model of that name.
         """
         entry = known_model(self.model).serving(self.task, self.scene is not None)
-        return with_intervals(entry) if self.intervals else entry
+        return WithIntervals(entry) if self.intervals else entry
 
 
 def package_versions() -> dict[str, str]:

@@ -12,31 +12,9 @@ import yaml
 
 from ..core import AntennaOptions, InputError
 from ..core.settings import flat
-from ..models.model import Model, default_settings
+from ..models.model import default_settings
 from .compressed import COMPRESSION
 from .folder import CONFIG, RunConfig, read_config
-
-WORDS = {
-    "wrf-gs": "3D Gaussians with complex attenuation, signals by networks",
-    "wrf-gs+": "3D Gaussians with static attributes and a deformation network",
-    "factorised": "static 3D Gaussians, signals are mixtures of a few functions of the transmitter",
-    "ray-tracing": "Sionna RT in the scene",
-    "hybrid": "one fit in stages: paths of a scene, its correction, Gaussians, interpolation of the rest",
-    "idw": "inverse-distance weighting",
-    "kriging": "kriging (Gaussian process)",
-    "trees": "extremely randomised trees",
-    "mri": "log-distance path loss of each receiver, interpolated residuals",
-    "vae": "variational autoencoder",
-    "dcgan": "generative adversarial network",
-    "nerf2": "neural field of voxels, marched along rays",
-    "linear": "linear map from uplink to downlink",
-    "fire": "variational autoencoder from uplink to downlink",
-    "r2f2": "paths fitted to the uplink",
-    "optml": "paths fitted to the uplink, started by a network",
-}
-"""Models for readers of a page; others, of installed packages, are named by their source."""
-GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")
-"""Settings that are options of ``train``."""
 
 
 def known_config(folder: Path) -> RunConfig | None:
@@ -58,21 +36,16 @@ def stored_versions(folder: Path) -> dict[str, str]:
 
 def model_words(config: RunConfig) -> str:
     """The model in words, with its scene."""
-    words = WORDS.get(config.model, config.entry.source)
-    if config.scene is not None and config.model not in ("ray-tracing", "hybrid"):
-        words += ", trained jointly with the paths of the scene"
-    return words
+    return config.entry.described(config.scene is not None)
 
 
 def changed_settings(config: RunConfig) -> dict[str, Any]:
-    """Settings, by dotted name, that differ from the model's defaults for these data; not those of `GIVEN`."""
-    entry: Model = config.entry
-    given = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
-    standard = dict(flat(asdict(default_settings(entry, (), given))))
+    """Settings, by dotted name, that differ from the model's defaults for these data, but not arguments of `train`."""
+    model = config.entry
+    arguments = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
+    standard = dict(flat(asdict(default_settings(model, (), arguments))))
     stated = flat(asdict(config.settings))
-    return {
-        name: value for name, value in stated if value != standard[name] and not (name in GIVEN and name in entry.given)
-    }
+    return {key: value for key, value in stated if value != standard[key] and key not in model.train_arguments}
 
 
 def command(config: RunConfig, folder: Path) -> str:
@@ -93,13 +66,13 @@ def command(config: RunConfig, folder: Path) -> str:
         value = getattr(config.antennas, field.name)
         words += [] if value is None else [f"--{field.name.replace('_', '-')}", str(value)]
     for name in ("receiver", "evaluation"):
-        if name in config.entry.given:
+        if name in config.entry.train_arguments:
             value = getattr(config.settings, name)
             words += [] if value == getattr(default_settings(config.entry, (), {}), name) else [f"--{name}", value]
     changed = changed_settings(config)
     if config.seed:
         words += ["--seed", str(config.seed)]
-        if "seed" not in config.entry.given and hasattr(config.settings, "seed"):
+        if "seed" not in config.entry.train_arguments and hasattr(config.settings, "seed"):
             changed["seed"] = config.settings.seed  # --seed alone would set that of the rays, too
     words += [f"--{name}" for name in ("deterministic", "intervals") if getattr(config, name)]
     for name, value in changed.items():

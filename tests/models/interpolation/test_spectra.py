@@ -400,7 +400,7 @@ def test_an_array_on_a_line_is_kriged_generically_with_a_warning(
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0), ("shortest", 5.0)],
+    [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)],
 )
 def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) -> None:
     with pytest.raises(InputError, match=f"setting {setting}: {value} is out of range, choose"):

@@ -19,6 +19,7 @@ from small_fits import network_settings
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.settings import settings_from
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models import Model, Problem
 from wrf_mi.models.model import inputs_of
@@ -140,9 +141,9 @@ def test_rows_without_positions_or_observations_are_refused(name: str, one_gatew
     "make",
     [
         lambda: VaeSettings(latent=0),
-        lambda: VaeSettings(noise=0.0),
+        lambda: VaeSettings(scale_m=0.0),
         lambda: DcganSettings(channels=4),
-        lambda: DcganSettings(l1=-1.0),
+        lambda: DcganSettings(noise=0),
         lambda: Nerf2Settings(samples=0),
         lambda: Nerf2Settings(near_m=2.0, far_m=1.0),
         lambda: Nerf2Settings(networks=Networks(layers=0)),
@@ -152,6 +153,13 @@ def test_rows_without_positions_or_observations_are_refused(name: str, one_gatew
 def test_settings_out_of_range_are_refused(make: Callable[[], Any]):
     with pytest.raises(InputError, match="choose"):
         make()
+
+
+def test_constants_that_were_settings_are_read_where_they_are_the_same():
+    stored = {"latent": 4, "pool": 6, "noise": 0.1, "beta": 0.03, "prior_share": 0.8}
+    assert settings_from(VaeSettings, stored, "run") == VaeSettings(latent=4)
+    with pytest.raises(InputError, match=r"^run, setting beta: 0\.1, where this version has 0\.03 alone"):
+        settings_from(VaeSettings, {**stored, "beta": 0.1}, "run")
 
 
 def test_signal_strengths_of_two_receivers_beat_their_means():

@@ -263,7 +263,7 @@ def test_normalisation_of_uplinks_is_undone_for_channels():
         normalised_uplink(np.where(np.arange(3)[:, None, None] == 1, 0, uplink))
 
 
-VAE = VaeSettings(latent=2, width=5, last=5, octaves=0, noise=0.5, beta=0.3, prior_share=0.4)
+VAE = VaeSettings(latent=2, width=5, last=5, octaves=0)
 """Of four cells, three coordinates and six pixels."""
 
 
@@ -278,7 +278,7 @@ def test_gradients_of_the_evidence_bound():
     given["prior"] = doubles(rng.standard_normal((2, 2)))
 
     def function(tensors: list[Any]) -> Any:
-        return elbo_loss(vae.with_state(dict(zip(weights, tensors, strict=True))), data, given, VAE)
+        return elbo_loss(vae.with_state(dict(zip(weights, tensors, strict=True))), data, given, VAE.latent)
 
     assert_gradients(function, list(weights.values()), rng)
 

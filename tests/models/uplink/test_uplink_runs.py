@@ -15,7 +15,9 @@ from made_channels import ANTENNAS, SUBCARRIERS, channels
 from wrf_mi import models
 from wrf_mi.core import InputError, Prediction, Split
 from wrf_mi.datasets import load, write_nerf2_csi
-from wrf_mi.models import Fitted, Inputs, Model, Problem
+from wrf_mi.models import Fitted, Inputs, Problem
+from wrf_mi.models.model import Arrays
+from wrf_mi.models.uplink.csi_bands import UplinkModel
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
@@ -55,29 +57,23 @@ class Turned(Fitted):
         return {"angle": np.asarray(self.angle)}
 
 
-def fit_turned(problem: Problem, split: Split, session: FitSession) -> Turned:
-    record = problem.record
-    assert record.uplink is not None
-    rows = split.all_train
-    return Turned(float(np.angle((record.observation[0, rows] * record.uplink[rows].conj()).sum())))
+class TurnedModel(UplinkModel):
+    name, source, settings = "turned", "this test", models.MODELS["mri"].settings
 
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Turned:
+        record = problem.record
+        assert record.uplink is not None
+        rows = split.all_train
+        return Turned(float(np.angle((record.observation[0, rows] * record.uplink[rows].conj()).sum())))
 
-TURNED = Model(
-    "turned",
-    ("csi",),
-    models.MODELS["mri"].settings,
-    fit_turned,
-    lambda arrays, problem, folder: Turned(float(arrays["angle"])),
-    "this test",
-    uplink="required",
-    headings=True,
-)
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Turned:
+        return Turned(float(arrays["angle"]))
 
 
 @pytest.fixture
 def turned(monkeypatch: pytest.MonkeyPatch) -> None:
     """A method that predicts from the uplink, among the others."""
-    monkeypatch.setitem(models.MODELS._known, "turned", TURNED)
+    monkeypatch.setitem(models.MODELS._known, "turned", TurnedModel())
 
 
 def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folder: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import astuple, fields, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -254,12 +254,6 @@ def _scene(problem: Problem, split: Split) -> Any | None:
     return problem.open_scene(scene_carrier(problem.record, split.all_train))
 
 
-def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
-    """Settings with number of steps and scale of transmitters resolved."""
-    config: TrainConfig = problem.settings
-    return config.resolved(problem.record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
-
-
 def check(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse settings, files and scenes that a training would refuse; warn of settings of paths without a scene."""
     traced, default = problem.settings.traced, TrainConfig().traced
@@ -275,32 +269,48 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         initial_gaussians(plan.config.initial, placed, rows.train, drawn)
 
 
-@cache
-def _by_data(name: str, task: str, with_scene: bool) -> Model:
-    """The entry for a task, with its default settings; spectra must be complete."""
-    image = TASKS[task].image
-    return replace(_entry(name), defaults=task_settings(task, image, with_scene), complete=image, by_data=None)
+class GaussianField(Model):
+    """A model of 3D Gaussians, of `wrf_mi.gaussians.FIELDS`, for any task or for data of one."""
+
+    source, settings = SOURCE, TrainConfig
+    tasks = ("spectrum", "rssi", "csi")
+    scene, uplink = "optional", "optional"
+    several_carriers, new_receivers = True, True
+    gaps = (*GAPS, REACH)
+    train_arguments = ("model", "seed", "deterministic", "receiver", "evaluation")
+    presets = PRESETS
+
+    def __init__(self, name: str, summary: str, task: str | None = None, with_scene: bool = False) -> None:
+        self.name, self.summary = name, summary
+        if task is not None:
+            # A training step evaluates all pixels of a spectrum at once, so that none may be missing.
+            self.complete = TASKS[task].image
+            self.defaults = task_settings(task, self.complete, with_scene)
+
+    def serving(self, task: str, with_scene: bool) -> Model:
+        """The model with its default settings for data of a task, with or without a scene."""
+        return GaussianField(self.name, self.summary, task, with_scene) if self.serves(task) else self
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedField:
+        """Train from the last checkpoint, or from the start, see `fit`."""
+        return fit(problem, split, session)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
+        """The field that `FittedField.arrays` described, see `load`."""
+        return load(arrays, problem, folder)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse settings, files and scenes that a training would refuse, see `check`."""
+        check(problem, splits)
+
+    def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
+        """Settings with number of steps and scale of transmitters resolved."""
+        config: TrainConfig = problem.settings
+        return config.resolved(problem.record.tx_pos_m[np.concatenate([rows.all_train for rows in splits])])
 
 
-def _entry(name: str) -> Model:
-    return Model(
-        name,
-        ("spectrum", "rssi", "csi"),
-        TrainConfig,
-        fit,
-        load,
-        SOURCE,
-        scene="optional",
-        uplink="optional",
-        several_carriers=True,
-        new_receivers=True,
-        gaps=(*GAPS, REACH),
-        given=("model", "seed", "deterministic", "receiver", "evaluation"),
-        presets=PRESETS,
-        check=check,
-        prepare=prepare,
-        by_data=partial(_by_data, name),
-    )
-
-
-WRF_GS, WRF_GS_PLUS, FACTORISED = _entry("wrf-gs"), _entry("wrf-gs+"), _entry("factorised")
+WRF_GS = GaussianField("wrf-gs", "3D Gaussians with complex attenuation, signals by networks")
+WRF_GS_PLUS = GaussianField("wrf-gs+", "3D Gaussians with static attributes and a deformation network")
+FACTORISED = GaussianField(
+    "factorised", "static 3D Gaussians, signals are mixtures of a few functions of the transmitter"
+)

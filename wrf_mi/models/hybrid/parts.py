@@ -14,16 +14,16 @@ from ...tasks import task_of
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..model import Model, Problem, default_settings
-from . import paths, strengths
+from .paths import InScene, Paths
 from .scene_side import FIELD, RESIDUAL, STAGES, needs_scene
+from .strengths import StrengthsInScene, TracedStrengths
 
 logger = logging.getLogger(__name__)
 
 PATHS, KRIGING = "paths", "kriging"
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
-TRACED = (PATHS, "r2f2-scene")
-"""Parts that are given the scene."""
+TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class HybridSettings(CheckedSettings):
 def scene_side(record: Record) -> tuple[Model, Model]:
     """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
     if task_of(record).in_decibel and record.frequencies_hz is not None:
-        return strengths.TRACED_STRENGTHS, strengths.IN_SCENE
-    return paths.PATHS, paths.IN_SCENE
+        return TracedStrengths(), StrengthsInScene()
+    return Paths(), InScene()
 
 
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
@@ -99,8 +99,8 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
         return scene_side(problem.record)[0], problem
     model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
-    given = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
-    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), given))
+    arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
+    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
 
@@ -114,8 +114,7 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
         entry, inner = _part(problem, name, scene)
         check_record(entry, problem.record)
         check_held_receivers(problem.record, split, entry, MODELS.values())
-        if entry.check is not None:
-            entry.check(inner, [split])
+        entry.check(inner, [split])
     except InputError as error:
         if scene:
             raise

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...backend.device import release_memory
 from ...core import InputError, Prediction, Record, Split
@@ -23,7 +24,7 @@ from ...scene.correction_data import FILE as CORRECTION
 from ...tasks import task_of
 from ...training.reach import hold_out_groups
 from ..held_out import HeldOut
-from ..model import Fitted, Problem, Session
+from ..model import Arrays, Decomposition, Fitted, Inputs, Problem, Session
 
 logger = logging.getLogger(__name__)
 
@@ -36,43 +37,50 @@ MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = (
     "field",
     "residual",
 )
-OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))
-"""Parts of a correction beyond materials and gains."""
-STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)
-"""Stages in their order."""
+OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parts of a correction beyond materials and gains
+STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)  # stages in their order
 FAST = tuple(stage for stage in STAGES if stage != FIELD)
 """Stages without the one whose training takes most of the time."""
 
 
 @dataclass(frozen=True)
 class StageReport:
-    """What one stage contributes.
+    """What one stage contributes."""
 
-    Attributes:
-        stage: its name, of `STAGES`.
-        kept: whether it is part of the prediction.
-        held_out: mean score of held-out training rows by the stages up to it; None: it was not judged.
-        seconds: duration of its fit; None: it is part of the next one's.
-    """
-
-    stage: str
-    kept: bool
+    stage: str  # its name, of `STAGES`
+    kept: bool  # whether it is part of the prediction
+    # Mean score of held-out training rows by the stages up to it; None: it was not judged
     held_out: float | None = None
-    seconds: float | None = None
+    seconds: float | None = None  # duration of its fit; None: it is part of the next one's
 
 
 class SceneSide(Fitted):
-    """A part of the hybrid that predicts from the scene.
+    """A part of the hybrid that predicts from the scene, by a model fitted in it.
 
-    Attributes:
-        problem: problem with the scene that it was fitted in.
-        stages: reports of the stages that were tried; none after loading.
+    ``problem`` is the hybrid's with that scene, ``stages`` are reports of those that were tried, none after loading.
     """
 
-    problem: Problem
-    stages: tuple[StageReport, ...] = ()
+    def __init__(self, fitted: Fitted, problem: Problem, stages: Collection[StageReport] = ()) -> None:
+        self.fitted, self.problem, self.stages = fitted, problem, tuple(stages)
+        self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
-    def held_out_at(self, held: HeldOut) -> Prediction | None:
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Observations of the receiver of that index, [m, ...]."""
+        return self.fitted.predict(inputs, receiver)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, of strengths in a fraction of its time."""
+        return self.fitted.predict_mean(inputs, receiver)
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Observations, and the paths' and the Gaussians' share of them where there are both."""
+        return self.fitted.decompose(inputs, receiver, std)
+
+    def arrays(self) -> Arrays:
+        """Arrays of the fitted model."""
+        return self.fitted.arrays()
+
+    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of held-out rows, as large in error as if the scene had not seen them; None: a further fit has to
         make them.
         """
@@ -108,7 +116,7 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
     """
     record, path = problem.record, session.folder / STAGES_FILE
     if path.exists():
-        return in_scene(problem, session.folder), [StageReport(**one) for one in json.loads(path.read_text())]
+        return in_scene(problem, session.folder), [StageReport(**report) for report in json.loads(path.read_text())]
     reports: list[StageReport] = []
     wanted = problem.settings.wanted
     # A correction changes materials, too: it contains the calibration.
@@ -140,8 +148,9 @@ def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport
         judged = {name: score for name, score in scores.items() if of_geometry[name] == geometry}
         if judged:
             best = (max if higher_is_better else min)(judged.values())
-            kept = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
-            reports.append(StageReport(stage, kept, judged.get(correction.kept, best)))
+            # What was not kept is reported by the best that it reached.
+            gains = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
+            reports.append(StageReport(stage, gains, judged.get(correction.kept, best)))
     return [*reports[:-1], replace(reports[-1], seconds=correction.seconds)]
 
 
@@ -152,4 +161,4 @@ def write_reports(folder: Path, reports: Collection[StageReport]) -> None:
 
 def stated_reports(reports: Collection[StageReport]) -> list[dict[str, Any]]:
     """Reports as ``metrics.json`` has them."""
-    return [asdict(one) for one in reports]
+    return [asdict(report) for report in reports]

@@ -11,12 +11,11 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Receiver, Split
 from ...core.files import write_atomically
@@ -26,97 +25,49 @@ from ...tracing.options import TraceOptions
 from ...tracing.paths.solve import Prepared
 from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ...tracing.tracer import check_polarization
-from .. import MODELS
 from ..held_out import HeldOut, held_out_predictions, hold_out
+from ..interpolation.by_task import STOPS, StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
-from ..model import Arrays, Inputs, Model, Problem, Session
+from ..model import Arrays, Model, Problem, Session
 from .mixture import unit_means
-from .scene_side import MEAN, SCENE, SceneSide, StageReport, corrected, in_scene, inside, write_reports
+from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
-TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)
-"""Paths of the traced mean: as deep as those of a correction."""
+TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)  # as a correction's
 DEFAULT = StrengthSettings()
-SEARCH_ROWS = 30
-"""Least number of rows by which hyperparameters about an exact mean are searched."""
-HELD = "held"
-"""Folder of the predictions of held-out rows."""
-NEVER = 2**31
-"""`StrengthSettings.search_rows` above any number of rows."""
+SEARCH_ROWS = 30  # least number of rows by which hyperparameters about an exact mean are searched
+HELD = "held"  # folder of the predictions of held-out rows
+NEVER = 2**31  # `StrengthSettings.search_rows` above any number of rows
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
 
 
 class FittedStrengths(SceneSide):
-    """Kriging of signal strengths about traced power.
+    """The scene's side for strengths: kriging about traced power."""
 
-    Args:
-        strengths: the fitted kriging.
-        problem: problem of the hybrid with the scene that was traced.
-        stages: reports of the stages that were tried.
-    """
+    fitted: Strengths
+    unseen: Prediction | None = None  # predictions of held-out rows
 
-    def __init__(self, strengths: Strengths, problem: Problem, stages: Sequence[StageReport] = ()) -> None:
-        self.strengths, self.problem, self.stages = strengths, problem, tuple(stages)
-        self.unseen: Prediction | None = None
-        self.receivers, self.uses_heading = strengths.receivers, strengths.uses_heading
-
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Strengths at the receiver of that index, dBm [m]."""
-        return self.strengths.predict(inputs, receiver)
-
-    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
-        """The mean of `predict`, which takes a fraction of its time."""
-        return self.strengths.predict_mean(inputs, receiver)
-
-    def held_out_at(self, held: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
         return self.unseen
 
-    def arrays(self) -> Arrays:
-        """Arrays of the kriging, the map among them."""
-        return self.strengths.arrays()
-
-
-def fit(problem: Problem, split: Split, session: Session) -> FittedStrengths:
-    """Correct the scene, trace a map in it, and fit kriging about it."""
-    inner, reports = corrected(problem, split, session)
-    fold = hold_out(problem.record, split)
-    if fold is None:
-        fitted = fit_in_scene(inner, split, session)
-    else:
-        held, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
-        if not path.exists():
-            write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held, session)) + "\n")
-        choice = json.loads(path.read_text())
-        if inner is not problem and not choice["corrected"]:
-            inner, reports = problem, [replace(one, kept=one.stage == MEAN) for one in reports]
-            write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
-            shutil.rmtree(session.folder / SCENE)
-        mean = _traced(inner) if choice["exact"] else None
-        # The search goes on from what was found without the held-out rows.
-        settings = replace(_searched(mean), **choice["hyperparameters"])
-        fitted = fit_in_scene(inner, split, session, settings, mean)
-        fitted.unseen = held_out_predictions(IN_SCENE, inner, fold, held, inside(session, HELD), "paths")
-    fitted.stages = tuple(reports)
-    return fitted
-
 
 def _chosen(
-    stated: Problem, inner: Problem, split: Split, fold: Split, held: HeldOut, session: Session
+    stated: Problem, inner: Problem, split: Split, fold: Split, held_out: HeldOut, session: Session
 ) -> dict[str, Any]:
     """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
     record = stated.record
-    unit = held.receiver if split.held_receivers else held.row
+    unit = held_out.receiver if split.held_receivers else held_out.row
 
     def score(problem: Problem, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
-        entry, place = _with(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
-        means = held_out_predictions(entry, problem, fold, held, place, "mean").mean
+        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
+        means = held_out_predictions(model, problem, fold, held_out, place, "mean").mean
         shutil.rmtree(place.folder)
-        of_row = task_of(record).mixtures(means[None], held.observed(record))
-        return float(unit_means(of_row(np.ones((len(held), 1)), np.arange(len(held))), unit).mean())
+        of_row = task_of(record).mixtures(means[None], held_out.observed(record))
+        return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())
 
     problem, best = inner, score(inner)
     if inner is not stated:
@@ -129,15 +80,10 @@ def _chosen(
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
         exact = _traced(problem)
         mean = exact if score(problem, exact) > best else None
-    fits: list[FittedStrengths] = []
-
-    def fit_kept(problem: Problem, split: Split, session: Session) -> FittedStrengths:
-        fits.append(fit_in_scene(problem, split, session, _searched(mean), mean))
-        return fits[-1]
-
+    judged = _Remembering(_searched(mean), mean)
     shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
-    held_out_predictions(replace(IN_SCENE, fit=fit_kept), problem, fold, held, inside(session, HELD), "paths")
-    hyperparameters = asdict(fits[0].strengths.field.hyperparameters)
+    held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
+    hyperparameters = asdict(judged.last.fitted.field.hyperparameters)
     return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
 
 
@@ -160,63 +106,90 @@ def _local_mean(problem: Problem) -> PowerMap:
     return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, TRACE)
 
 
-def fit_in_scene(
-    problem: Problem,
-    split: Split,
-    session: Session,
-    settings: StrengthSettings = DEFAULT,
-    mean: ExactMean | None = None,
-) -> FittedStrengths:
-    """`fit` without the correction, about a mean of all receivers; None: about the local mean."""
-    session.report("tracing a map", 0.0)
-    record = problem.record
-    power = _local_mean(problem) if mean is None else mean(record.receivers)
-    fitted = fit_strengths(record, problem.rows(split), power, settings, session.report)
-    if power.exact:
-        field = fitted.field
-        field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))
-    return FittedStrengths(fitted, problem)
+class StrengthsInScene(Model):
+    """Kriging about power traced in a scene that is corrected already: no name of the registry.
 
-
-def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
-    """The kriging that `FittedStrengths.arrays` described."""
-    inner = in_scene(problem, folder)
-
-    @cache
-    def tracer() -> Tracer:  # the scene is opened where something is traced
-        return power_tracer(inner.opened_scene, inner.record, TRACE)
-
-    return FittedStrengths(
-        Strengths.from_arrays(arrays, lambda position_m, places: tracer()(position_m, places)), inner
-    )
-
-
-def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse data without a single, known carrier, and antennas inside solids.
-
-    Raises:
-        InputError: naming them.
+    Args:
+        search: settings of the kriging.
+        mean: mean of all receivers; None: the local mean.
     """
-    record = problem.record
-    if record.frequencies_hz is None:
-        raise InputError(f"{record.name}: carrier frequency unknown, or several; a map is traced at one")
-    Prepared(problem.opened_scene).check(record.tx_pos_m, record.receivers)
-    check_polarization(problem.opened_scene, record.tx_pos_m, record.receivers, record.tx_antenna)
+
+    name, source, settings = "strengths", StrengthKriging.source, object
+    tasks, gaps = ("rssi",), (STOPS,)
+    scene, uplink, headings = "required", "optional", True
+    several_carriers, new_receivers = True, True
+
+    def __init__(self, search: StrengthSettings = DEFAULT, mean: ExactMean | None = None) -> None:
+        self.search, self.mean = search, mean
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
+        """Trace a map, and fit kriging about it."""
+        session.report("tracing a map", 0.0)
+        record = problem.record
+        power = _local_mean(problem) if self.mean is None else self.mean(record.receivers)
+        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report)
+        if power.exact:
+            field = fitted.field
+            field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))
+        return FittedStrengths(fitted, problem)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
+        """The kriging that `FittedStrengths.arrays` described."""
+        inner = in_scene(problem, folder)
+
+        @cache
+        def tracer() -> Tracer:  # the scene is opened where something is traced
+            return power_tracer(inner.opened_scene, inner.record, TRACE)
+
+        strengths = Strengths.from_arrays(arrays, lambda position_m, places: tracer()(position_m, places))
+        return FittedStrengths(strengths, inner)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse data without a single, known carrier, and antennas inside solids.
+
+        Raises:
+            InputError: naming them.
+        """
+        record = problem.record
+        if record.frequencies_hz is None:
+            raise InputError(f"{record.name}: carrier frequency unknown, or several; a map is traced at one")
+        Prepared(problem.opened_scene).check(record.tx_pos_m, record.receivers)
+        check_polarization(problem.opened_scene, record.tx_pos_m, record.receivers, record.tx_antenna)
 
 
-TRACED_STRENGTHS = replace(
-    MODELS["kriging"].serving("rssi", False),
-    name="strengths",
-    fit=fit,
-    load=load,
-    scene="required",
-    check=check,
-    by_data=None,
-)
-"""The scene's side for strengths as an entry, which no name of the registry has."""
-IN_SCENE: Model = replace(TRACED_STRENGTHS, fit=fit_in_scene)
-"""The same in a scene that is corrected already."""
+class _Remembering(StrengthsInScene):
+    """Keeps its last fit, whose hyperparameters the final one starts from."""
+
+    last: FittedStrengths
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
+        self.last = super().fit(problem, split, session)
+        return self.last
 
 
-def _with(settings: StrengthSettings, mean: ExactMean | None) -> Model:
-    return replace(IN_SCENE, fit=partial(fit_in_scene, settings=settings, mean=mean))
+class TracedStrengths(StrengthsInScene):
+    """The scene's side for strengths."""
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
+        """Correct the scene, trace a map in it, and fit kriging about it."""
+        inner, reports = corrected(problem, split, session)
+        fold = hold_out(problem.record, split)
+        if fold is None:
+            fitted = StrengthsInScene().fit(inner, split, session)
+        else:
+            held_out, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
+            if not path.exists():
+                write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held_out, session)) + "\n")
+            choice = json.loads(path.read_text())
+            if inner is not problem and not choice["corrected"]:
+                inner, reports = problem, [replace(report, kept=report.stage == MEAN) for report in reports]
+                write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
+                shutil.rmtree(session.folder / SCENE)
+            mean = _traced(inner) if choice["exact"] else None
+            # The search goes on from what was found without the held-out rows.
+            settings = replace(_searched(mean), **choice["hyperparameters"])
+            fitted = StrengthsInScene(settings, mean).fit(inner, split, session)
+            place = inside(session, HELD)  # where the choice left these predictions
+            fitted.unseen = held_out_predictions(StrengthsInScene(), inner, fold, held_out, place, "paths")
+        fitted.stages = tuple(reports)
+        return fitted

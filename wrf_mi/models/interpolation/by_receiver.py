@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -18,10 +18,8 @@ from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
 
+# Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
 HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
-"""Keys of the arrays: whether headings are used, and where there are several carriers these, and numbers of models that
-there are not.
-"""
 
 
 class Single(Protocol):
@@ -47,29 +45,15 @@ class Probabilistic(Single, Protocol):
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """Training rows of one receiver, some of which it may not have received, and what they belong to.
-
-    Attributes:
-        problem: data and settings.
-        split: split of the data.
-        receiver: the receiver.
-        tx_pos_m: positions [n, 3], metres.
-        observation: observations [n, ...]; NaN where nothing was received.
-        tx_heading_rad: headings [n], or None to leave them out.
-        on_progress: progress callback.
-    """
+    """Training rows of one receiver, and what they belong to."""
 
     problem: Problem
     split: Split
     receiver: Receiver
-    tx_pos_m: FloatArray
-    observation: NDArray[Any]
-    tx_heading_rad: FloatArray | None
+    tx_pos_m: FloatArray  # positions [n, 3], metres
+    observation: NDArray[Any]  # observations [n, ...]; NaN where nothing was received
+    tx_heading_rad: FloatArray | None  # headings [n], or None to leave them out
     on_progress: OnProgress
-
-
-FitSingle = Callable[[ReceiverRows], Single]
-"""From the rows of a receiver to its model."""
 
 
 def finite_positions(inputs: Inputs, name: str) -> FloatArray:
@@ -104,18 +88,12 @@ def observed_rows(
 
 @dataclass(frozen=True)
 class ByReceiver(Fitted):
-    """A model for each receiver, and for each carrier where the rows have several.
+    """A model for each receiver, and for each carrier where the rows have several."""
 
-    Attributes:
-        name: name of the method, for errors.
-        models: models of the receivers in turn, and so for each carrier; None: too few rows at that carrier.
-        heading: whether the models use headings.
-        carriers_hz: carriers of the training rows, ascending; None: a single carrier.
-    """
-
-    name: str
+    name: str  # name of the method, for errors
+    # Models of the receivers in turn, and so for each carrier; None: too few rows at that carrier
     models: list[Single | None]
-    heading: bool
+    heading: bool  # whether the models use headings
     carriers_hz: FloatArray | None = None
 
     @property
@@ -158,6 +136,7 @@ class ByReceiver(Fitted):
         fitted, known_log = list(models.values()), np.log(self.carriers_hz[list(models)])
 
         def of_carrier(carrier_hz: float, rows: IntArray) -> NDArray[Any]:
+            # Over log f, in which free-space path loss is linear; `interp` holds the outermost models beyond them.
             place = np.interp(np.log(carrier_hz), known_log, np.arange(len(known_log)))
             turned = None if heading is None else heading[rows]
 
@@ -165,6 +144,7 @@ class ByReceiver(Fitted):
                 return np.asarray(fitted[number].predict(tx_pos_m[rows], turned))
 
             below, share = int(place), place % 1
+            # At a carrier with a model no second one is evaluated, and none may exist above the last.
             return at(below) if share == 0 else (1 - share) * at(below) + share * at(below + 1)
 
         return Prediction(by_carrier(inputs.carriers_hz, of_carrier))
@@ -172,6 +152,7 @@ class ByReceiver(Fitted):
     def _of(self, receiver: int) -> dict[int, Single]:
         """Models of a receiver by the number of the carrier."""
         carriers = 1 if self.carriers_hz is None else len(self.carriers_hz)
+        # Models run through the receivers of the first carrier, then of the next.
         models = enumerate(self.models[receiver :: len(self.models) // carriers])
         return {number: model for number, model in models if model is not None}
 
@@ -197,69 +178,74 @@ class ByReceiver(Fitted):
         return arrays
 
 
-def model_by_receiver(
-    name: str,
-    tasks: tuple[str, ...] | None,
-    settings: type,
-    fit_single: FitSingle,
-    load_single: Callable[[Receiver, dict[str, NDArray[Any]]], Single],
-    source: str,
-    heading: Callable[[Record, Any], bool] = lambda record, settings: False,
-    new_receivers: bool = False,
-) -> Model:
-    """Entry of the registry for a method that fits every receiver to all training rows, those of each carrier alone.
+class ByReceiverModel(Model):
+    """A method that fits every receiver by itself to all training rows, those of each carrier by themselves."""
 
-    Args:
-        name: name of the method.
-        tasks: tasks that it serves; None: all.
-        settings: class of its settings.
-        fit_single: fit of one receiver.
-        load_single: the model of a receiver from its arrays.
-        source: publication.
-        heading: ``heading(record, settings)``: whether headings count where the record has them.
-        new_receivers: whether ``fit_single`` serves receivers without training rows.
-    """
+    uplink = "optional"
+    several_carriers, headings = True, True
 
-    def fit(problem: Problem, split: Split, session: FitSession) -> ByReceiver:
-        record, rows, stated = problem.record, split.all_train, problem.record.carriers_hz
-        known_positions(record, rows, name)
-        headings = record.tx_heading_rad if heading(record, problem.settings) else None
-        carriers = None if stated is None else np.unique(stated[rows])
-        parts = [rows] if stated is None else [rows[stated[rows] == carrier] for carrier in np.unique(stated[rows])]
-        models: list[Single | None] = []
-        fits_in_all = len(parts) * len(record.receivers)
+    @abstractmethod
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """The model of one receiver.
+
+        Raises:
+            InputError: rows that it cannot be fitted to.
+        """
+
+    @abstractmethod
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The model of a receiver from its arrays."""
+
+    def takes_headings(self, record: Record, settings: Any) -> bool:
+        """Whether headings count where the record has them."""
+        return False
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
+        """Models of all receivers, and of all carriers.
+
+        Raises:
+            InputError: unknown positions, or rows that the model of a receiver cannot be fitted to.
+        """
+        record, rows = problem.record, split.all_train
+        known_positions(record, rows, self.name)
+        headings = record.tx_heading_rad if self.takes_headings(record, problem.settings) else None
+        carriers, parts = None, [rows]
+        if record.carriers_hz is not None:
+            carriers_hz = record.carriers_hz[rows]
+            carriers = np.unique(carriers_hz)
+            parts = [rows[carriers_hz == carrier_hz] for carrier_hz in carriers]
         counts = np.stack([rows_received(record, part) for part in parts])
         # A receiver with few rows at one carrier is interpolated between its other carriers.
         enough = counts >= np.minimum(counts.max(axis=0), LEAST_ROWS)
-        for part, fits in zip(parts, enough, strict=True):
+        models: list[Single | None] = []
+        for part, has_rows in zip(parts, enough, strict=True):
             turned = None if headings is None else headings[part]
-            for receiver, observed, fit_it in zip(record.receivers, record.observation, fits, strict=True):
-                if not fit_it:
+            for receiver, observed, fits in zip(record.receivers, record.observation, has_rows, strict=True):
+                if not fits:
                     models.append(None)
                     continue
+                done, name = len(models), receiver.name
 
                 def report(
-                    stage: str, share: float, _: object = None, /, *, done: int = len(models), who: str = receiver.name
+                    stage: str, share: float, _: object = None, /, *, done: int = done, name: str = name
                 ) -> None:
-                    session.report(f"{who}: {stage}", (done + share) / fits_in_all)
+                    session.report(f"{name}: {stage}", (done + share) / enough.size)
 
+                rows_of = ReceiverRows(problem, split, receiver, record.tx_pos_m[part], observed[part], turned, report)
                 try:
-                    rows_of = record.tx_pos_m[part], observed[part], turned
-                    models.append(fit_single(ReceiverRows(problem, split, receiver, *rows_of, report)))
+                    models.append(self.fit_single(rows_of))
                 except InputError as error:
-                    raise InputError(f"{record.name}, receiver {receiver.name}: {error}") from None
-                session.report(f"{name}: receivers", len(models) / fits_in_all)
-        return ByReceiver(name, models, headings is not None, carriers)
+                    raise InputError(f"{record.name}, receiver {name}: {error}") from None
+                session.report(f"{self.name}: receivers", len(models) / enough.size)
+        return ByReceiver(self.name, models, headings is not None, carriers)
 
-    def load(arrays: Arrays, problem: Problem, folder: Path) -> ByReceiver:
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The models that `ByReceiver.arrays` described."""
         carriers = arrays.get(CARRIERS)
         receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
         without = arrays.get(WITHOUT, np.zeros(0, np.int64))
         models = [
-            None if number in without else load_single(receiver, under(f"{number}/", arrays))
+            None if number in without else self.load_single(receiver, under(f"{number}/", arrays))
             for number, receiver in enumerate(receivers)
         ]
-        return ByReceiver(name, models, bool(arrays[HEADING]), carriers)
-
-    how: dict[str, Any] = {"uplink": "optional", "several_carriers": True, "headings": True}
-    return Model(name, tasks, settings, fit, load, source, new_receivers=new_receivers, **how)
+        return ByReceiver(self.name, models, bool(arrays[HEADING]), carriers)

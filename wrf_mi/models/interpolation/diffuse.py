@@ -19,22 +19,17 @@ from ...core import Prediction, Receiver
 from ...core.angles import FloatArray
 from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import UncertainKriged, fit_generic, load_generic
+from .kriging import NEAREST_M, GenericKriging, UncertainKriged, kriged
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
 """Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
-CERTAIN = 3.0
-"""Standard errors by which predictions with the field must be better than without."""
+CERTAIN = 3.0  # standard errors by which predictions with the field must be better than without
 LEAST_ROWS = 8
 """Least number of rows that may choose the line of sight: its gain, fitted to all of them, flatters them by 2 / n."""
-NEGLIGIBLE = 1e-8
-"""Share of the mean power, -80 dB, below which an error no longer counts in the choice."""
-NEAREST_M = 0.01
-"""Least distance of the line of sight: below 1 cm no antenna is a point."""
-GAIN = "gain"
-"""Key of the arrays that generic kriging has not."""
+NEGLIGIBLE = 1e-8  # share of the mean power, -80 dB, below which an error no longer counts in the choice
+GAIN = "gain"  # key of the arrays that generic kriging has not
 
 
 @dataclass(frozen=True)
@@ -64,6 +59,7 @@ class DiffuseField:
         count = len(position_m)
         if self.share == 0 or len(self.position_m) <= skip:
             return np.zeros((count, self.value.shape[1]), complex), np.full(count, self.power)
+        # A few neighbours screen all others; the factor of all rows would cost their cube.
         near = min(NEIGHBOURS, len(self.position_m) - skip)
         distance, index = KDTree(self.position_m).query(position_m, k=list(range(1 + skip, near + skip + 1)))
         between = np.linalg.norm(self.position_m[index][:, :, None] - self.position_m[index][:, None], axis=-1)
@@ -98,30 +94,23 @@ def _scores(field: DiffuseField) -> FloatArray:
     """Score of each row predicted from the others [n]; robust to rows that lack a path."""
     mean, variance = field.predict(field.position_m, skip=1)
     error = np.square(np.abs(field.value - mean)).mean(axis=1)
+    # Of a Student-t-like density, whose tail a few rows without their line of sight do not dominate.
     return np.asarray(np.log(variance) + 2 * np.log1p(error / variance))
 
 
 def direct_wave(tx_pos_m: FloatArray, receiver_m: FloatArray, k: FloatArray) -> Complex:
     """Free-space channels [n, subcarriers] of unit gain at wave numbers k, rad/m; positions in metres."""
     phase = k * np.maximum(np.linalg.norm(tx_pos_m - receiver_m, axis=1), NEAREST_M)[:, None]
-    return np.asarray(np.exp(-1j * phase) / (2 * phase))
+    return np.asarray(np.exp(-1j * phase) / (2 * phase))  # Friis: wavelength / (4 pi d) = 1 / (2 k d)
 
 
 @dataclass(frozen=True)
 class KrigedChannels:
-    """Channels of one receiver: line of sight times a gain, and a diffuse field.
+    """Channels of one receiver: line of sight times a gain, and a diffuse field."""
 
-    Attributes:
-        receiver_m: position of the receiver [3], metres.
-        k: wave number of each subcarrier, rad/m.
-        gain: complex gain of the line of sight.
-        field: what it leaves.
-        dtype: type of observations.
-    """
-
-    receiver_m: FloatArray
-    k: FloatArray
-    gain: complex
+    receiver_m: FloatArray  # position of the receiver [3], metres
+    k: FloatArray  # wave number of each subcarrier, rad/m
+    gain: complex  # complex gain of the line of sight
     field: DiffuseField
     dtype: np.dtype[Any]
 
@@ -129,6 +118,7 @@ class KrigedChannels:
     def fit(cls, position_m: FloatArray, observed: Complex, receiver_m: FloatArray, k: FloatArray) -> KrigedChannels:
         """Gain by least squares, and the field of its residuals, from channels [n, subcarriers]."""
         direct = direct_wave(position_m, receiver_m, k)
+        # One complex gain for all subcarriers: antennas and cables are taken to be flat over the band.
         gain = complex(np.vdot(direct, observed) / np.vdot(direct, direct))
         field = fit_diffuse(position_m, observed - gain * direct, float(k.mean()))
         return cls(receiver_m, k, gain, field, observed.dtype)
@@ -152,8 +142,8 @@ class KrigedChannels:
         power_db = float(10 * np.log10(max(self.field.power, 1e-300)))
         gain_db = float(20 * np.log10(max(abs(self.gain), 1e-300)))
         gain = {"gain_db": gain_db, "gain_phase_rad": float(np.angle(self.gain))}
-        rest = {"diffuse_share": self.field.share, "rest_power_db": power_db}
-        return {"parts": "line of sight, diffuse field"} | gain | rest
+        diffuse = {"diffuse_share": self.field.share, "rest_power_db": power_db}
+        return {"parts": "line of sight, diffuse field"} | gain | diffuse
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""
@@ -168,30 +158,34 @@ class KrigedChannels:
         return cls(receiver.position_m, arrays["k"], complex(arrays[GAIN]), field, arrays["like"].dtype)
 
 
-def fit_channels(rows: ReceiverRows) -> Single:
-    """Kriging of the channels of one receiver: line of sight and diffuse field where clearly better, else generic.
+class ChannelKriging(GenericKriging):
+    """Kriging of channels: line of sight and diffuse field where they are clearly better, else generic."""
 
-    Raises:
-        InputError: no row that was received, or channels that are all zero.
-    """
-    record = rows.problem.record
-    if rows.problem.settings.is_generic or record.frequencies_hz is None or rows.observation.ndim != 2:
-        return fit_generic(rows)
-    position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
-    generic = UncertainKriged.of(fit_generic(rows), observed)
-    if len(observed) < LEAST_ROWS:
-        return generic
-    k = np.broadcast_to(2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light, observed.shape[1])
-    channels = KrigedChannels.fit(position_m, observed, rows.receiver.position_m, k)
-    left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(), channels.left_out())]
-    # Of logarithms, as accuracy is scored in decibels, and so that no strong row near the receiver decides alone. A
-    # share of the power is added, below which an error no longer counts.
-    generic_log, channels_log = np.log(np.array(left) + NEGLIGIBLE * np.square(np.abs(observed)).mean())
-    gain = generic_log - channels_log
-    # Few rows prefer one of both by chance, and generic kriging, which assumes least, is then the safer one.
-    return channels if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)) else generic
+    headings = False  # antennas are isotropic
 
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the channels of one receiver.
 
-def load_channels(receiver: Receiver, arrays: Arrays) -> Single:
-    """The model of a receiver that `fit_channels` made."""
-    return KrigedChannels.from_arrays(arrays, receiver) if GAIN in arrays else load_generic(receiver, arrays)
+        Raises:
+            InputError: no row that was received, or channels that are all zero.
+        """
+        record = rows.problem.record
+        if rows.problem.settings.is_generic or record.frequencies_hz is None or rows.observation.ndim != 2:
+            return kriged(rows)
+        position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
+        generic = UncertainKriged.of(kriged(rows), observed)
+        if len(observed) < LEAST_ROWS:
+            return generic
+        k = np.broadcast_to(2 * np.pi * np.asarray(record.frequencies_hz, float) / speed_of_light, observed.shape[1])
+        channels = KrigedChannels.fit(position_m, observed, rows.receiver.position_m, k)
+        left = [np.square(np.abs(errors)).mean(axis=1) for errors in (generic.left_out(), channels.left_out())]
+        # Of logarithms, as accuracy is scored in decibels, and so that no strong row near the receiver decides alone. A
+        # share of the power is added, below which an error no longer counts.
+        generic_log, channels_log = np.log(np.array(left) + NEGLIGIBLE * np.square(np.abs(observed)).mean())
+        gain = generic_log - channels_log
+        # Few rows prefer one of both by chance, and generic kriging, which assumes least, is then the safer one.
+        return channels if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)) else generic
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The kriging of a receiver from its arrays."""
+        return KrigedChannels.from_arrays(arrays, receiver) if GAIN in arrays else super().load_single(receiver, arrays)

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError
+from ...core import InputError, Receiver
 from ...tasks import task_of
-from .by_receiver import ReceiverRows, model_by_receiver, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
 class InverseDistance:
@@ -37,11 +38,7 @@ class InverseDistance:
         self.k, self.power, self.softening_m = k, power, softening_m
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike) -> InverseDistance:
-        """Keep the training rows that were observed.
-
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: shape [n, ...], any unit; rows with NaN, where nothing was received, are left out.
+        """Keep the rows at positions [n, 3], metres, that were observed: observations [n, ...] without NaN.
 
         Raises:
             InputError: no rows, none that was observed, or two different numbers of them.
@@ -51,7 +48,7 @@ class InverseDistance:
         return self
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings and the rows that were kept."""
+        """Settings, and the rows that were observed."""
         settings = np.array([self.k, self.power, self.softening_m], float)
         return {"settings": settings, "tx_pos_m": np.asarray(self._tree.data), "value": self._values}
 
@@ -65,6 +62,7 @@ class InverseDistance:
         """Observations [m, ...] at positions [m, 3] in metres; headings are not used."""
         positions = np.asarray(tx_pos, float)
         k = min(self.k, len(self._values))
+        # A list of neighbours keeps their axis where there is a single one.
         distance, neighbour = self._tree.query(positions, k=list(range(1, k + 1)))
         distance += self.softening_m
         nearest = distance[:, :1]
@@ -73,6 +71,7 @@ class InverseDistance:
             weight = np.where(nearest > 0, (nearest / distance) ** self.power, distance == 0)
         weight /= weight.sum(axis=1, keepdims=True)
         blended = np.empty((len(positions), *self._values.shape[1:]), np.result_type(self._values, np.float32))
+        # Row by row: the neighbours of all rows together would take k times the memory of the images.
         for row, (w, i) in enumerate(zip(weight, neighbour, strict=True)):
             blended[row] = np.tensordot(w, self._values[i], axes=1)
         return blended
@@ -93,19 +92,24 @@ class IdwSettings:
     softening_m: float | None = None
 
 
-def _fit(rows: ReceiverRows) -> InverseDistance:
-    settings: IdwSettings = rows.problem.settings
-    task = task_of(rows.problem.record)
-    k = task.neighbours if settings.neighbours is None else settings.neighbours
-    softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
-    return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
+class Idw(ByReceiverModel):
+    """Inverse-distance weighting of each receiver's rows."""
+
+    name, settings = "idw", IdwSettings
+    source = "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)"
+    summary = "inverse-distance weighting"
+
+    def fit_single(self, rows: ReceiverRows) -> InverseDistance:
+        """Keep the rows of a receiver."""
+        settings: IdwSettings = rows.problem.settings
+        task = task_of(rows.problem.record)
+        k = task.neighbours if settings.neighbours is None else settings.neighbours
+        softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
+        return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> InverseDistance:
+        """The rows that were kept."""
+        return InverseDistance.from_arrays(arrays)
 
 
-MODEL = model_by_receiver(
-    "idw",
-    None,
-    IdwSettings,
-    _fit,
-    lambda receiver, arrays: InverseDistance.from_arrays(arrays),
-    "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)",
-)
+MODEL = Idw()

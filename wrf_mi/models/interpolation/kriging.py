@@ -18,83 +18,63 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver
+from ...core import InputError, Prediction, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from .by_receiver import ReceiverRows, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
+NEAREST_M = 0.01  # least distance of two antennas in a law: below 1 cm none is a point
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)
 HEADING_LENGTH = (0.1, 100.0)
 NOISE = (1e-4, 10.0)
 """Limits of the likelihood's maximum: metres, chords of the unit circle (2 is the opposite heading), shares of the
 variance."""
-LIKELIHOOD_EVALUATIONS = 200
-"""Nelder-Mead on three logarithms settles to 0.01 in 60 to 150."""
+LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 in 60 to 150
 
 
 @dataclass(frozen=True)
 class Trend:
     """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
 
-    Attributes:
-        receiver_m: position [3] from which d is the distance, metres; None: one unknown mean.
-
     Source: Rappaport, "Wireless Communications" (2002), section 4.9.
     """
 
-    receiver_m: FloatArray | None = None
+    receiver_m: FloatArray | None = None  # position [3] from which d is the distance, metres; None: one unknown mean
 
     def __call__(self, positions_m: FloatArray) -> FloatArray:
         """Columns [n, p] at positions [n, 3]."""
         mean = np.ones(len(positions_m))
         if self.receiver_m is None:
             return mean[:, None]
-        # Below 1 cm no antenna is a point; the logarithm must not diverge on a transmitter at the receiver.
-        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), 0.01)
+        # The logarithm must not diverge on a transmitter at the receiver.
+        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), NEAREST_M)
         return np.stack([mean, 10 * np.log10(distance)], axis=1)
 
 
-SCALE = "scale"
-"""Key of the arrays that kriging without standard deviations has not."""
-KEPT = ("lengths", "positions_m", "coefficients", "weights", "like")
-"""Attributes of `Kriged` that are stored as they are."""
+SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
+STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attributes of `Kriged` as they are
 
 
 @dataclass(frozen=True)
 class Kriged:
-    """A fitted kriging: a trend, and weights of the training rows' correlations.
+    """A fitted kriging: a trend, and weights of the training rows' correlations."""
 
-    Attributes:
-        kernel: a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
-        lengths: correlation length in metres, and over headings where there are any.
-        positions_m: positions of the rows [n, 3].
-        circle: cosine and sine of their headings [n, 2], or None.
-        coefficients: coefficients of the trend's columns for each component [p, q].
-        weights: weights of the rows for each component [n, q].
-        like: empty array of the shape and type of observations, [0, ...].
-        trend: columns of the trend.
-        noise: variance of the noise as a share of the field's.
-    """
-
-    kernel: str
-    lengths: FloatArray
-    positions_m: FloatArray
-    circle: FloatArray | None
-    coefficients: NDArray[np.inexact]
-    weights: NDArray[np.inexact]
-    like: NDArray[np.inexact]
+    kernel: str  # a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`
+    lengths: FloatArray  # correlation length in metres, and over headings where there are any
+    positions_m: FloatArray  # positions of the rows [n, 3]
+    circle: FloatArray | None  # cosine and sine of their headings [n, 2], or None
+    coefficients: NDArray[np.inexact]  # coefficients of the trend's columns for each component [p, q]
+    weights: NDArray[np.inexact]  # weights of the rows for each component [n, q]
+    like: NDArray[np.inexact]  # empty array of the shape and type of observations, [0, ...]
     trend: Trend
-    noise: float = 0.0
+    noise: float = 0.0  # variance of the noise as a share of the field's
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.inexact]:
-        """Interpolate: [m, ...], in the observations' unit and type.
-
-        Args:
-            tx_pos: shape [m, 3], metres.
-            tx_heading_rad: shape [m], if and only if the fit had headings.
+        """Interpolate at positions [m, 3], metres: [m, ...], in the observations' unit and type.
 
         Raises:
             InputError: headings that the fit did not have, or the other way round.
@@ -114,25 +94,21 @@ class Kriged:
         circle = np.zeros((0, 2)) if self.circle is None else self.circle
         trend = CONSTANT if self.trend.receiver_m is None else LOG_DISTANCE
         names = {"trend": np.asarray(trend), "kernel": np.asarray(self.kernel)}
-        return names | {"circle": circle} | {name: getattr(self, name) for name in KEPT}
+        return names | {"circle": circle} | {name: getattr(self, name) for name in STORED}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver, **more: Any) -> Kriged:
         """The predictions that `arrays` described, with values ``more`` of further attributes."""
         circle = arrays["circle"] if len(arrays["circle"]) else None
-        kept: dict[str, Any] = {name: arrays[name] for name in KEPT} | more
-        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **kept)
+        values: dict[str, Any] = {name: arrays[name] for name in STORED} | more
+        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UncertainKriged(Kriged):
-    """Kriging over positions, with a trend by generalised least squares, that states standard deviations.
+    """Kriging over positions, with a trend by generalised least squares, that states standard deviations."""
 
-    Attributes:
-        scale: standard deviation of the field of each component [q].
-    """
-
-    scale: FloatArray
+    scale: FloatArray  # standard deviation of the field of each component [q]
 
     @classmethod
     def of(cls, kriged: Kriged, observed: NDArray[Any]) -> UncertainKriged:
@@ -209,10 +185,8 @@ class Kriging(CovarianceSettings):
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> Kriged:
         """Choose lengths and noise that are None, and factor the covariance of the rows that were observed.
 
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: shape [n, ...], real or complex; rows with NaN, where nothing was received, are left out.
-            tx_heading_rad: shape [n], or None to leave headings out.
+        Positions [n, 3] are in metres; real or complex observations [n, ...] are NaN where nothing was received; None
+        leaves headings [n] out.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, fewer than the trend has columns,
@@ -228,7 +202,7 @@ class Kriging(CovarianceSettings):
             raise InputError(f"{text}, so give more rows or a constant trend")
         field, ordinary = y, None
         if self.trend_fit == "ols":
-            # The field is the residual of the least-squares trend, which is taken as known from here on.
+            # Regression kriging: the field is the residual of the least-squares trend, known from here on.
             ordinary = np.linalg.lstsq(columns, y, rcond=None)[0]
             field, columns = y - columns @ ordinary, columns[:, :0]
         lengths, noise = self._choose(field, columns, positions, circle)
@@ -252,15 +226,15 @@ class Kriging(CovarianceSettings):
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
         positions_m, circle, columns = positions_m[rows], None if circle is None else circle[rows], columns[rows]
         extent = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
-        # Given value or None, limits, and first value of the search.
+        # Stated value or None, limits, and first value of the search.
         table = [
             (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
-        given, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
-        free = np.array([value is None for value in given])
-        value = np.array([0.0 if v is None else v for v in given])
+        stated, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
+        free = np.array([value is None for value in stated])
+        value = np.array([0.0 if v is None else v for v in stated])
         if not free.any():
             return value[:-1], float(value[-1])
         root = component_root(field[rows])
@@ -273,14 +247,15 @@ class Kriging(CovarianceSettings):
             raise InputError("kriging: all observations are zero; give length and noise instead of None")
 
         def objective(logarithm: FloatArray) -> float:
-            """Minus the logarithm of the restricted likelihood, the variance at its best, per component."""
+            # Minus the logarithm of the restricted likelihood, the variance at its best, per component.
             value[free] = np.exp(logarithm)
             try:
                 system = self._factored(_coordinates(positions_m, circle, value[:-1]), float(value[-1]), columns)
-            except LinAlgError:
+            except LinAlgError:  # singular to rounding, as a smooth kernel is at great lengths: the search turns back
                 return np.inf
             return system.restricted_cost(root, np.finfo(float).tiny) / 2
 
+        # Over logarithms, as lengths and noise are scales.
         start = np.log(first)[free]
         simplex = np.concatenate([start[None], start + np.eye(len(start))])
         best = minimize(
@@ -325,15 +300,37 @@ class KrigingSettings(CovarianceSettings):
     @property
     def is_generic(self) -> bool:
         """Whether `generic` or any setting that only generic kriging has differs from its default."""
-        only = [one for one in fields(KrigingSettings) if one.name != "heading"]
-        return any(getattr(self, one.name) != one.default for one in only)
+        only = [setting for setting in fields(KrigingSettings) if setting.name != "heading"]
+        return any(getattr(self, setting.name) != setting.default for setting in only)
+
+
+class GenericKriging(ByReceiverModel):
+    """Kriging of any observations, each receiver by itself."""
+
+    name, summary = "kriging", "kriging (Gaussian process)"
+    source = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
+    settings: type = KrigingSettings
+
+    def takes_headings(self, record: Record, settings: KrigingSettings) -> bool:
+        """Whether the settings let headings count, which matter to strengths alone."""
+        return settings.heading and task_of(record).in_decibel
+
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the observations themselves, see `kriged`."""
+        return kriged(rows)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The kriging of a receiver from its arrays."""
+        if SCALE not in arrays:
+            return Kriged.from_arrays(arrays, receiver)
+        return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
     return Trend(receiver.position_m if name == LOG_DISTANCE else None)
 
 
-def fit_generic(rows: ReceiverRows) -> Kriged:
+def kriged(rows: ReceiverRows) -> Kriged:
     """Kriging of the observations of one receiver.
 
     Raises:
@@ -343,19 +340,10 @@ def fit_generic(rows: ReceiverRows) -> Kriged:
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
     name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
-    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
-    given = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-    kriging = Kriging(*given, _trend(name, rows.receiver), how, rows.problem.seed)
+    # The law of distance is that of the whole room: each row weighs the same in it, however dense the rows around it.
+    how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
+    stated = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
+    kriging = Kriging(*stated, _trend(name, rows.receiver), how, rows.problem.seed)
     return kriging.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)
-
-
-SOURCE = "Rasmussen and Williams, 'Gaussian Processes for Machine Learning' (2006), sections 2.2, 2.7 and 5.4"
-
-
-def load_generic(receiver: Receiver, arrays: dict[str, NDArray[Any]]) -> Kriged:
-    """The kriging of a receiver from its arrays."""
-    if SCALE not in arrays:
-        return Kriged.from_arrays(arrays, receiver)
-    return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])

@@ -34,23 +34,17 @@ from scipy.spatial.distance import cdist
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ..model import slices
 
 Values = NDArray[Any]
 
-LENGTH = (0.03, 30.0)
-"""Bounds of the lengths in wavelengths."""
-NOISE = (1e-3, 1.0)
-"""Bounds of the noise as a share of the variance, at least that of 8 bits."""
-START = (0.3, 0.3, 0.3, 0.01)
-"""Three lengths and noise from which the search starts."""
-PIXELS = 4700
-"""Approximate number of pixels in the likelihood: neighbouring pixels are redundant."""
-VARIANCE = 1e-12
-"""Least variance of grey values, for equal spectra."""
-MOST_ROWS = 400
-"""Rows in the likelihood at most."""
-COLUMNS = 4096
-"""Components that are solved for at once: 50 MB of a thousand rows and a half in double precision."""
+LENGTH = (0.03, 30.0)  # bounds of the lengths in wavelengths
+NOISE = (1e-3, 1.0)  # bounds of the noise as a share of the variance, at least that of 8 bits
+START = (0.3, 0.3, 0.3, 0.01)  # three lengths and noise from which the search starts
+PIXELS = 4700  # approximate number of pixels in the likelihood: neighbouring pixels are redundant
+VARIANCE = 1e-12  # least variance of grey values, for equal spectra
+COLUMNS = 4096  # components that are solved for at once: 50 MB of a thousand rows and a half in double precision
+MOST_ROWS = 400  # rows in the likelihood at most
 
 KERNELS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "exponential": lambda d: np.exp(-d),
@@ -121,7 +115,7 @@ class KrigingSystem:
         """
         kind = np.result_type(values, float)
         beta, weights = (np.empty((rows, values.shape[1]), kind) for rows in (self.trend.shape[1], len(values)))
-        for part in column_parts(values.shape[1]):
+        for part in slices(values.shape[1], COLUMNS):
             columns = values[:, part].astype(kind)
             beta[:, part] = self.coefficients(columns)
             weights[:, part] = self.weights(columns, beta[:, part])
@@ -138,10 +132,12 @@ class KrigingSystem:
             trend: columns at the positions [m, p]; None: zero mean.
             information: inverse covariance of the trend's coefficients [p, p] from more than these rows.
         """
+        # k(x, x) - k^T K^-1 k (Rasmussen and Williams, equation 2.26); rounding may take it below zero.
         half = self.whiten(cross.T)
         left = np.maximum(prior - np.square(half).sum(axis=0), 0)
         if trend is None:
             return np.asarray(left)
+        # And that of the trend's coefficients, R^T (B^T K^-1 B)^-1 R with R = b - B^T K^-1 k (equation 2.42).
         gap = trend - half.T @ self._trend
         known = self.information if information is None else information
         return np.asarray(left + (gap * np.linalg.solve(known, gap.T).T).sum(axis=1))
@@ -160,10 +156,10 @@ class KrigingSystem:
     def restricted_cost(self, root: FloatArray, least: float) -> float:
         """Minus twice the logarithm of the restricted likelihood of one component, the field's variance at its best.
 
-        Args:
-            root: `component_root` of the observations.
-            least: lower limit of the residual sum of squares.
+        ``root`` is the `component_root` of the observations, ``least`` the lower limit of the residual sum of squares.
         """
+        # Residual sum of squares of the whitened rows beside an orthonormal basis of the whitened trend, whose triangle
+        # has the square root of the determinant of B^T K^-1 B.
         half = self.whiten(root)
         basis, triangle = np.linalg.qr(self._trend)
         left = max(float(np.square(half).sum() - np.square(basis.T @ half).sum()), least)
@@ -181,17 +177,13 @@ def component_root(values: Values) -> FloatArray:
     if len(parts) * values.shape[1] <= len(values):
         return np.concatenate(parts, axis=1, dtype=float)
     gram = np.zeros((len(values), len(values)))
-    for part in column_parts(values.shape[1]):
+    for part in slices(values.shape[1], COLUMNS):
         for component in parts:
             columns = component[:, part].astype(float)
             gram += columns @ columns.T
+    # Y Y^T = V diag(p) V^T, so V sqrt(p) serves as well; negative p are rounding.
     power, basis = np.linalg.eigh(gram)
     return np.asarray(basis * np.sqrt(np.maximum(power, 0)))
-
-
-def column_parts(count: int) -> list[slice]:
-    """Slices of at most `COLUMNS` of ``count`` columns."""
-    return [slice(first, first + COLUMNS) for first in range(0, count, COLUMNS)]
 
 
 def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, float]:
@@ -200,6 +192,7 @@ def left_out(precision: Values, block: IntArray, row: int) -> tuple[Values, floa
     ``precision`` [n, n] is that of `KrigingSystem`. Returns the weights of the rows [n], zero in the block, and the
     variance of an observation about the prediction.
     """
+    # A block of the precision is the inverse of the covariance given all other rows (Dubrule, 1983).
     unit = (block == row).astype(float)
     column = np.linalg.solve(precision[np.ix_(block, block)], unit)
     weights = -column.conj() @ precision[block]
@@ -211,6 +204,7 @@ def line_of_sight(tx_pos_m: FloatArray, receiver_m: FloatArray) -> FloatArray:
     """Unit vector [3] from the centre of transmitters [n, 3] to the receiver [3]; up for a receiver at the centre."""
     way = receiver_m - tx_pos_m.mean(axis=0)
     distance = float(np.linalg.norm(way))
+    # A receiver among the transmitters has no line of sight in common.
     around = distance < 1e-6 * max(float(np.ptp(tx_pos_m, axis=0).max()), 1e-6)
     return np.array([0.0, 0.0, 1.0]) if around else way / distance
 
@@ -252,8 +246,9 @@ class AnisotropicKriging:
         self._precision, self._mean = self._system.precision, self._system.coefficients(np.eye(n))[0]
 
     def _correlation(self, tx_pos_m: FloatArray) -> FloatArray:
-        here, there = (positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m))
-        return correlation(here, there)
+        # In correlation lengths along the axes, in which the correlation is isotropic.
+        scaled, rows = (positions @ self.axes.T / self.length_m for positions in (tx_pos_m, self.tx_pos_m))
+        return correlation(scaled, rows)
 
     def _weighted(self, weights: FloatArray) -> NDArray[np.float32]:
         return np.tensordot(weights.astype(np.float32), self.observed, 1)
@@ -277,7 +272,7 @@ class AnisotropicKriging:
         flat = self.observed.reshape(len(self.observed), -1)
         centred = flat - self._mean.astype(np.float32) @ flat
         squares = np.einsum("np,np->p", self._precision.astype(np.float32) @ centred, centred)
-        variance = squares / max(len(centred) - 1, 1)
+        variance = squares / max(len(centred) - 1, 1)  # one degree of freedom went to the mean
         return np.asarray(np.sqrt(np.maximum(variance, 0)).reshape(self.observed.shape[1:]))
 
     def held_out(self, radius_m: float, rows: IntArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -286,7 +281,7 @@ class AnisotropicKriging:
         weights = np.full(distance.shape, 1 / distance.shape[1])
         unknown = np.full(len(rows), 1 + self.noise)
         for number, (row, near) in enumerate(zip(rows, distance <= radius_m, strict=True)):
-            if not near.all():
+            if not near.all():  # else no row remains, and the mean of all is as good a guess as any
                 weights[number], unknown[number] = left_out(self._precision, np.flatnonzero(near), row)
         return self._weighted(weights), self._deviation(unknown)
 
@@ -301,6 +296,7 @@ def fit_anisotropic(
     """
     axes = sight_axes(tx_pos_m, receiver_m)
     chosen = chosen_rows(len(tx_pos_m), MOST_ROWS, seed)
+    # In wavelengths, so that bounds and start of the search serve every carrier.
     local = tx_pos_m[chosen] @ axes.T / wavelength_m
     flat = observed[chosen].reshape(len(chosen), -1)
     flat = flat[:, :: max(round(flat.shape[1] / PIXELS), 1)].astype(float)
@@ -313,6 +309,6 @@ def fit_anisotropic(
         return system.restricted_cost(root, VARIANCE) / len(root)
 
     bounds = [tuple(np.log(LENGTH))] * 3 + [tuple(np.log(NOISE))]
-    found = np.exp(minimize(cost, np.log(START), method="L-BFGS-B", bounds=bounds).x)
-    length_m, noise = found[:3] * wavelength_m, float(found[3])
-    return AnisotropicKriging(tx_pos_m, np.asarray(observed, np.float32), axes, length_m, noise)
+    *lengths, noise = np.exp(minimize(cost, np.log(START), method="L-BFGS-B", bounds=bounds).x)
+    length_m = np.array(lengths) * wavelength_m
+    return AnisotropicKriging(tx_pos_m, np.asarray(observed, np.float32), axes, length_m, float(noise))

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Record
+from ...core import InputError, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .by_receiver import ReceiverRows, model_by_receiver
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows
 from .kriging import Trend
 
 
@@ -38,15 +39,10 @@ class MriSettings:
 
 @dataclass(frozen=True)
 class PathLoss:
-    """The fitted law of one receiver.
+    """The fitted law of one receiver."""
 
-    Attributes:
-        receiver_m: position of the receiver [3], metres.
-        law: power at one metre in dBm, and minus the exponent, [2].
-    """
-
-    receiver_m: FloatArray
-    law: FloatArray
+    receiver_m: FloatArray  # position of the receiver [3], metres
+    law: FloatArray  # power at one metre in dBm, and minus the exponent, [2]
 
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Power in dBm, [m] float32, at transmitter positions [m, 3]."""
@@ -57,24 +53,9 @@ class PathLoss:
         return {"law": self.law}
 
 
-def _fit(rows: ReceiverRows) -> PathLoss:
-    record, train, observed = rows.problem.record, rows.split.all_train, rows.observation
-    receiver_m = rows.receiver.position_m
-    columns = Trend(receiver_m)(rows.tx_pos_m)
-    if rows.problem.settings.shared or np.isnan(observed).all():  # one of the held-out receivers
-        return PathLoss(receiver_m, _shared_law(record, train))
-    received = ~np.isnan(observed)
-    if np.ptp(rows.tx_pos_m, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
-        # Rows at a single distance state a level but no exponent, which is that of all receivers.
-        _, slope = _shared_law(record, train)
-        level = float(np.mean(observed[received] - slope * columns[received, 1]))
-        return PathLoss(receiver_m, np.array([level, slope]))
-    return PathLoss(receiver_m, _law(columns, observed))
-
-
 def _shared_law(record: Record, rows: IntArray) -> FloatArray:
     """Power at one metre and slope that fit some rows of all receivers together."""
-    columns = np.stack([Trend(each.position_m)(record.tx_pos_m[rows]) for each in record.receivers])
+    columns = np.stack([Trend(receiver.position_m)(record.tx_pos_m[rows]) for receiver in record.receivers])
     return _law(columns, record.observation[:, rows])
 
 
@@ -86,12 +67,34 @@ def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
     return np.asarray(np.linalg.lstsq(columns, observed, rcond=None)[0])
 
 
-MODEL = model_by_receiver(
-    "mri",
-    ("rssi",),
-    MriSettings,
-    _fit,
-    lambda receiver, arrays: PathLoss(receiver.position_m, arrays["law"]),
-    "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss",
-    new_receivers=True,
-)
+class Mri(ByReceiverModel):
+    """The log-distance law of each receiver."""
+
+    name, settings = "mri", MriSettings
+    source = "Shin et al., 'MRI: model-based radio interpolation for indoor war-walking' (2015): log-distance path loss"
+    summary = "log-distance path loss of each receiver"
+    tasks = ("rssi",)
+    new_receivers = True
+
+    def fit_single(self, rows: ReceiverRows) -> PathLoss:
+        """The law of a receiver, or that of all receivers."""
+        record, train, observed = rows.problem.record, rows.split.all_train, rows.observation
+        receiver_m = rows.receiver.position_m
+        columns = Trend(receiver_m)(rows.tx_pos_m)
+        if rows.problem.settings.shared or np.isnan(observed).all():  # a receiver that is held out has no rows
+            return PathLoss(receiver_m, _shared_law(record, train))
+        received = ~np.isnan(observed)
+        # Where all positions coincide, the shared law has no slope either, and `_law` says so.
+        if np.ptp(rows.tx_pos_m, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
+            # Rows at a single distance state a level but no exponent, which is that of all receivers.
+            _, slope = _shared_law(record, train)
+            level = float(np.mean(observed[received] - slope * columns[received, 1]))
+            return PathLoss(receiver_m, np.array([level, slope]))
+        return PathLoss(receiver_m, _law(columns, observed))
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> PathLoss:
+        """The law of a receiver from its arrays."""
+        return PathLoss(receiver.position_m, arrays["law"])
+
+
+MODEL = Mri()

@@ -39,22 +39,15 @@ from ..model import field_arrays, from_field_arrays
 from .kriging_equations import KrigingSystem, chosen_rows, left_out
 
 ComplexArray = NDArray[np.complex128]
-LEAST_NOISE = 3e-3
-"""Least noise as a share of a signal's power, below the resolution of 8-bit spectra."""
-NEGLIGIBLE = 1e-4
-"""Shares below this part of the greatest are dropped during the iteration."""
-TINY = 1e-100
-"""Least denominator."""
-RICH = 8
-"""Principal components with the whole dictionary; the others, some per cent of the power, have no turns."""
+LEAST_NOISE = 3e-3  # least noise as a share of a signal's power, below the resolution of 8-bit spectra
+NEGLIGIBLE = 1e-4  # shares below this part of the greatest are dropped during the iteration
+TINY = 1e-100  # least denominator
+RICH = 8  # principal components with the whole dictionary; the others, some per cent of the power, have no turns
 ROUNDS = 3
 STEPS = 25
-SWEEPS = 3
-"""Sweeps of alignment in each round: rows stop changing after two."""
-LEAST_POWER = 1e-6
-"""Least power of a component, a row's being 1: with fewer rows than elements some are only rounding."""
-MOST_ROWS = 320
-"""Rows of the fit of shares at most: its time grows with their cube."""
+SWEEPS = 3  # sweeps of alignment in each round: rows stop changing after two
+LEAST_POWER = 1e-6  # least power of a component, a row's being 1: with fewer rows than elements some are only rounding
+MOST_ROWS = 320  # rows of the fit of shares at most: its time grows with their cube
 STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
 
 
@@ -74,10 +67,7 @@ class Covariances:
         return len(self.lengths_m) * len(self.turns)
 
     def mixed(self, a_m: FloatArray, b_m: FloatArray, weight: FloatArray) -> ComplexArray:
-        """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m].
-
-        A sum over turns is a product of two thin matrices, which takes less memory than the dictionary.
-        """
+        """Sums with weights [s, count] between positions [n, 3] and [m, 3] (metres), shape [s, n, m]."""
         distance = cdist(a_m, b_m)
         waves_a, waves_b = np.exp(1j * (a_m @ self.turns.T)), np.exp(1j * (b_m @ self.turns.T))
         total = np.zeros((len(weight), *distance.shape), complex)
@@ -94,19 +84,12 @@ def _add_waves(
     """Add the covariances of one length with shares [t] of waves [n, t] and [m, t], in place."""
     used = np.flatnonzero(shares)
     if len(used):
+        # A sum over turns of outer products is a product of two thin matrices; the dictionary would not fit in memory.
         total += decay * ((waves_a[:, used] * shares[used]) @ waves_b[:, used].conj().T)
 
 
 class RowCovariances:
-    """The dictionary's covariances between n rows, as products with a matrix, never as ``count`` matrices [n, n].
-
-    Each covariance is a decay times the outer product of one wave with itself, so a sum over turns is a product of two
-    thin matrices.
-
-    Args:
-        covariances: the dictionary.
-        tx_pos_m: positions of the rows [n, 3], metres.
-    """
+    """The dictionary's covariances between rows at positions [n, 3], metres, never as ``count`` matrices [n, n]."""
 
     def __init__(self, covariances: Covariances, tx_pos_m: FloatArray) -> None:
         distance = cdist(tx_pos_m, tx_pos_m)
@@ -165,13 +148,14 @@ def fit_shares(
         if step == steps:
             break
         inverse = system.precision
-        # Numbers that float32 holds, whatever the signal's power: both traces are scaled by it.
+        # A minorise-maximise step (Zhou et al.): share *= sqrt(y^H P V P y / tr(P V)), P the inverse of the
+        # covariance. Both sides are scaled by the power, so that float32 holds them whatever the signal's power.
         explained = covariances.traces(np.outer(solved, solved.conj()) * power, weight)
         expected = covariances.traces(inverse * power, weight)
         weight *= np.sqrt(np.maximum(explained, 0) / np.maximum(expected, TINY))
-        weight[weight < NEGLIGIBLE * weight.max()] = 0
+        weight[weight < NEGLIGIBLE * weight.max()] = 0  # these vanish in the limit, and cost as much as the others
         noise *= np.sqrt(float((np.abs(solved) ** 2).sum()) / float(np.trace(inverse).real))
-        noise = max(noise, LEAST_NOISE * power)
+        noise = max(noise, LEAST_NOISE * power)  # without noise the covariance is singular where rows coincide
     cost = float((signal.conj() @ solved).real) + system.log_determinant
     return weight, noise, cost
 
@@ -224,11 +208,12 @@ class SignalProcess:
         return np.stack([system.precision for system in self._systems])
 
     def forget_precision(self) -> None:
-        """Free `precision`, as large as the factors, which `held_out` alone needs and computes anew."""
+        """Free `precision`, as large as the factors; `held_out` alone needs it, and computes it anew."""
         self.__dict__.pop("precision", None)
 
     def predict(self, tx_pos_m: ArrayLike) -> Posterior:
         """Posterior at positions [q, 3], metres."""
+        # Simple kriging of each component: its mean is zero, as the phase of a row is arbitrary.
         cross = self.covariances.mixed(np.asarray(tx_pos_m, float), self.tx_pos_m, self.weight)
         mean = np.einsum("cqi,ci->qc", cross, self._solved)
         whitened = (system.whiten(part.conj().T) for system, part in zip(self._systems, cross, strict=True))
@@ -241,6 +226,7 @@ class SignalProcess:
         return np.asarray(self.weight.sum(axis=1) + self.noise)
 
     def _posterior(self, mean: ComplexArray, variance: FloatArray) -> Posterior:
+        # Noise included, below which rounding must not take the variance.
         return Posterior(mean @ self.basis.T, np.maximum(variance, self.noise), self.basis, self.prior)
 
     def held_out(self, radius_m: float, rows: IntArray) -> Posterior:
@@ -273,21 +259,16 @@ def fit_signals(
     seed: int = 0,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> SignalProcess:
-    """Align rows and fit the process.
+    """Align signals [n, m] of rows, of any phase and scale, and fit the process.
 
-    Args:
-        signals: signals of each row, any phase and scale, [n, m].
-        tx_pos_m: [n, 3], metres.
-        elements_m: [m, 3].
-        covariances: the dictionary.
-        seed: seed of the choice of rows where there are more than `MOST_ROWS`.
-        on_progress: progress callback: fraction done.
+    Positions [n, 3] and elements [m, 3] are in metres; ``seed`` chooses rows where there are more than `MOST_ROWS`.
     """
     unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
     opposite = mirror_order(elements_m)
     aligned = align_signals(unit, tx_pos_m, elements_m)
     chosen = chosen_rows(len(unit), MOST_ROWS, seed)
     dictionary = RowCovariances(covariances, tx_pos_m[chosen])
+    # A mirror-symmetric array leaves two solutions for all rows at once: both are fitted, the likelier one wins.
     exchanges = [aligned] if opposite is None else [aligned, aligned[:, opposite].conj()]
     fits = []
     for turn, exchange in enumerate(exchanges):
@@ -301,9 +282,10 @@ def fit_signals(
     _, process = min(fits, key=lambda fit: fit[0])
     if len(chosen) == len(unit):
         return process
+    # The rows that were not fitted are aligned with their predictions from those that were.
     metric, predicted = np.eye(unit.shape[1], dtype=complex), process.predict(tx_pos_m).mean
-    whole = np.stack([_aligned(row, metric, target, opposite) for row, target in zip(unit, predicted, strict=True)])
-    return SignalProcess(tx_pos_m, whole, covariances, process.basis, process.weight, process.noise)
+    every = np.stack([_aligned(row, metric, target, opposite) for row, target in zip(unit, predicted, strict=True)])
+    return SignalProcess(tx_pos_m, every, covariances, process.basis, process.weight, process.noise)
 
 
 def _fit(
@@ -311,7 +293,7 @@ def _fit(
 ) -> tuple[float, SignalProcess]:
     """Fit of the shares of each principal component, and its cost."""
     basis = np.linalg.eigh(rows.T @ rows.conj() / len(rows))[1][:, ::-1]
-    straight = slice(None, None, len(covariances.turns))
+    straight = slice(None, None, len(covariances.turns))  # the first turn of each length is zero
     components = (rows @ basis.conj()).T
 
     def fit_component(c: int) -> tuple[FloatArray, float, float]:
@@ -331,6 +313,7 @@ def realigned(process: SignalProcess, opposite: IntArray | None) -> ComplexArray
     components = rows @ basis.conj()
     for _ in range(SWEEPS):
         for i in range(len(rows)):
+            # Each row from all others by the rows of the precision (Dubrule, 1983), component by component.
             certainty = precision[:, i, i].real
             others = components[i] - np.einsum("cj,jc->c", precision[:, i], components) / certainty
             rows[i] = _aligned(rows[i], (basis * certainty) @ basis.conj().T, others @ basis.T, opposite)
@@ -340,9 +323,10 @@ def realigned(process: SignalProcess, opposite: IntArray | None) -> ComplexArray
 
 def _aligned(row: ComplexArray, metric: ComplexArray, target: ComplexArray, opposite: IntArray | None) -> ComplexArray:
     """The row, or its mirrored conjugate, times the phase that brings it nearest to a target."""
-    found: list[tuple[float, ComplexArray]] = []
+    candidates: list[tuple[float, ComplexArray]] = []
     for choice in [row] if opposite is None else [row, row[opposite].conj()]:
+        # |t - r e^jp|^2 in the metric is least at the phase p of r^H M t, and then falls by 2 |r^H M t| - r^H M r.
         overlap = np.vdot(choice, metric @ target)
         gain = 2 * float(np.abs(overlap)) - float(np.vdot(choice, metric @ choice).real)
-        found.append((gain, choice * np.exp(1j * np.angle(overlap))))
-    return max(found, key=lambda pair: pair[0])[1]
+        candidates.append((gain, choice * np.exp(1j * np.angle(overlap))))
+    return max(candidates, key=lambda candidate: candidate[0])[1]

@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from scipy.special import i0e, i1e
 
 from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray, pixel_directions
-from ...core.settings import Count, Positive
+from ...core.settings import Count
 from ...parallel.threads import one_blas_thread
 from ...receivers.array import array_response
 from ...receivers.lags import Lags
@@ -39,7 +39,7 @@ from ...tasks.scores import REAL_90
 from ...training.session import OnProgress
 from ..model import Arrays, field_arrays, from_field_arrays, keyed
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import KrigingSettings, UncertainKriged, fit_generic, load_generic
+from .kriging import GenericKriging, KrigingSettings, UncertainKriged, kriged
 from .kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
@@ -47,28 +47,20 @@ logger = logging.getLogger(__name__)
 
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Radii in wavelengths around a held-out row within which no row is used while the weights are fitted."""
-HELD_OUT = 80
-"""Held-out training rows at most."""
-INTERVAL = 0.9
-"""Share of errors that calibrated intervals cover."""
-UNSCALED_PER_CHUNK = 128
-"""Spectra whose element signals are retrieved together."""
-CHUNK = 16
-"""Transmitters predicted together, which bounds the memory of images with draws."""
+HELD_OUT = 80  # held-out training rows at most
+INTERVAL = 0.9  # share of errors that calibrated intervals cover
+UNSCALED_PER_CHUNK = 128  # spectra whose element signals are retrieved together
+CHUNK = 16  # transmitters predicted together, which bounds the memory of images with draws
+# Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
+# Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
 MOST_COVARIANCES = 6.4e7
-"""Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
-Signals of a part of the rows would know less than the spectra nearby, and their weight rests on the contrary.
-"""
-STARTS = 60
-"""Starts of the phase retrieval of one spectrum, at most."""
-LEAST_ROWS = 8
-"""Least number of spectra for a covariance of signals."""
+STARTS = 60  # starts of the phase retrieval of one spectrum, at most
+LONGEST, SHORTEST = 4.6, 0.25  # lengths over which a wave stays coherent, in wavelengths
+LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
-FREQUENCY = "frequency_hz"
-"""Key of the arrays that generic kriging has not."""
+FREQUENCY = "frequency_hz"  # key of the arrays that generic kriging has not
 DRAWS = 64
-COARSE = 0.1
-"""Spacing of the directions of draws as a share of a lobe's width, wavelength over aperture."""
+COARSE = 0.1  # spacing of the directions of draws as a share of a lobe's width, wavelength over aperture
 CLEAR = 100.0
 """Ratio above which the Rician's moments are taken from their series, which has six digits where differences cancel."""
 
@@ -82,28 +74,20 @@ class SpectrumKrigingSettings(KrigingSettings):
     Attributes:
         cone_deg: greatest angle between the line of sight and waves that leave the transmitter.
         directions: directions on the whole sphere, of which those in the cone are used.
-        longest: greatest length over which a wave stays coherent, in wavelengths.
-        shortest: least such length.
-        lengths: number of lengths, evenly spaced on a logarithmic scale.
+        lengths: number of lengths of coherence from `SHORTEST` to `LONGEST`, evenly spaced on a logarithmic scale.
     """
 
     cone_deg: Annotated[float, Field(gt=0, le=180, description="more than 0 and at most 180")] = 80.0
     directions: Count = 120
-    longest: Positive = 4.6
-    shortest: Positive = 0.25
     lengths: Count = 4
-
-    def __post_init__(self) -> None:
-        """Refuse settings out of range (`InputError`)."""
-        super().__post_init__()
-        if self.shortest > self.longest:
-            raise InputError(f"setting shortest: {self.shortest} is out of range, choose at most longest")
+    FIXED: ClassVar[Mapping[str, float]] = {"longest": LONGEST, "shortest": SHORTEST}
 
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of abs(z), z complex Gaussian with E z = mean, E |z - mean|^2 = variance."""
     # In double precision: the spread is the difference of two squares that may be 2 CLEAR times as large.
     mean, variance, kind = mean.astype(complex), variance.astype(float), variance.dtype
+    # E|z| = sqrt(pi v) / 2 exp(-h) ((1 + 2 h) I0(h) + 2 h I1(h)), h = |m|^2 / (2 v); i0e and i1e hold the exponential.
     power = np.abs(mean) ** 2
     # Without variance the ratio is large; without mean and variance it is 0.
     half = power / np.maximum(2 * variance, 1e-9 * power + np.finfo(power.dtype).tiny)
@@ -159,8 +143,6 @@ class ExpectedSpectrum:
 class KrigedSpectra:
     """Fitted model of one receiver.
 
-    A spectrum has no scale on which the transmitter's pattern could act, so headings change nothing.
-
     Attributes:
         signals, nearby, report: process of the signals, kriging of the spectra, and expected spectrum of signals.
         half: c, the share of unknown variance at which the signals have half of the weight.
@@ -186,6 +168,7 @@ class KrigedSpectra:
         mean = nearby + weight * difference
         if nearby_std is None:
             return mean, None
+        # Variance of a mixture of two distributions: that within both, and that between their means.
         variance = weight * deviation**2 + (1 - weight) * nearby_std**2 + weight * (1 - weight) * difference**2
         return mean, np.sqrt(variance)
 
@@ -241,7 +224,7 @@ class KrigedSpectra:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedSpectra:
         """The model that `arrays` stored."""
-        assert receiver.array_m is not None, "see `fit_spectra`"
+        assert receiver.array_m is not None, "see `SpectrumKriging`"
         process = SignalProcess.from_arrays(arrays, "signals/")
         nearby = from_field_arrays(AnisotropicKriging, arrays, "nearby/")
         height, width = (int(v) for v in arrays["shape"])
@@ -252,36 +235,6 @@ class KrigedSpectra:
 def signal_weight(ignorance: FloatArray, half: float) -> FloatArray:
     """Weight of the signals [q] for their shares of unknown variance [q] and c."""
     return ignorance**2 / (ignorance**2 + half**2) * (1 - ignorance)
-
-
-def fit_spectra(rows: ReceiverRows) -> Single:
-    """Kriging of the spectra of one receiver.
-
-    Signals mixed with the spectra nearby where array and single carrier are known, the array's spectra determine its
-    signals, and their covariances fit into the memory. Else the generic kriging, with standard deviations where array
-    and carrier are known.
-
-    Raises:
-        InputError: no row that was received.
-    """
-    record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
-    if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
-        return fit_generic(rows)
-    position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
-    frequency_hz = float(frequencies_hz[0])
-    with one_blas_thread():
-        if len(observed) >= LEAST_ROWS:
-            try:
-                lags = Lags(receiver.array_m, frequency_hz, *observed.shape[1:])
-                if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
-                    raise InputError(f"{len(observed)} rows are too many for a process of element signals")
-                signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
-            except InputError as error:  # or a line of elements, or elements too far apart for lags
-                what = f"{record.name}, receiver {receiver.name}"
-                logger.warning("%s: the spectra themselves are kriged: %s", what, error)
-            else:
-                return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
-        return UncertainKriged.of(fit_generic(rows), observed)
 
 
 def _retrieved(observed: NDArray[Any], lags: Lags, seed: int, on_progress: OnProgress) -> ComplexArray:
@@ -308,7 +261,7 @@ def _fit_signals_and_nearby(
     receiver_m = rows.receiver.position_m
     towards = line_of_sight(position_m, receiver_m)
     covariances = Covariances(
-        np.geomspace(settings.longest, settings.shortest, settings.lengths) * wavelength,
+        np.geomspace(LONGEST, SHORTEST, settings.lengths) * wavelength,
         departures(towards, 2 * np.pi / wavelength, settings.cone_deg, settings.directions),
     )
 
@@ -323,14 +276,6 @@ def _fit_signals_and_nearby(
     return kriged
 
 
-def load_spectra(receiver: Receiver, arrays: Arrays) -> Single:
-    """The model of a receiver that `fit_spectra` made."""
-    if FREQUENCY not in arrays:
-        return load_generic(receiver, arrays)
-    with one_blas_thread():  # factors to the last digit those of the fit
-        return KrigedSpectra.from_arrays(arrays, receiver)
-
-
 def _fit_weights(
     kriged: KrigedSpectra,
     observed: NDArray[np.float32],
@@ -343,6 +288,7 @@ def _fit_weights(
     Where rows lie so close that none is beyond any gap, both keep their values.
     """
     drawn = np.sort(np.random.default_rng([seed, 2]).permutation(len(observed))[:HELD_OUT])
+    # A row that has no row beyond the gap would be predicted by the mean of all.
     farthest = cdist(kriged.nearby.tx_pos_m[drawn], kriged.nearby.tx_pos_m).max(axis=1)
     predictions: list[tuple[Image, tuple[Image, Image], FloatArray, Image, Image]] = []
     terms: list[tuple[Any, Any, Any]] = []
@@ -366,6 +312,7 @@ def _fit_weights(
     # between others and do not show the error of a process outside of them.
     shares = ignorance**2 / (ignorance**2 + grid[:, None] ** 2)
     kriged.half = float(grid[((shares**2 * square) - 2 * shares * product).sum(axis=1).argmin()])
+    # Every fifth pixel along either side: neighbours within a lobe's width have the same error.
     ratios = []
     for truth, reported, unknown, nearby, nearby_std in predictions:
         mean, std = kriged.mixed(reported, unknown, nearby, nearby_std)
@@ -373,3 +320,45 @@ def _fit_weights(
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))
     kriged.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / REAL_90)
+
+
+class SpectrumKriging(GenericKriging):
+    """Kriging of spectra: element signals mixed with the spectra nearby where the array is known, else generic."""
+
+    settings = SpectrumKrigingSettings
+    headings = False  # a spectrum has no scale on which the transmitter's pattern could act
+
+    def fit_single(self, rows: ReceiverRows) -> Single:
+        """Kriging of the spectra of one receiver.
+
+        Signals are used where array and single carrier are known, the array's spectra determine its signals, and their
+        covariances fit into the memory. Generic kriging states standard deviations where array and carrier are known.
+
+        Raises:
+            InputError: no row that was received.
+        """
+        record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
+        if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
+            return kriged(rows)
+        position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
+        frequency_hz = float(frequencies_hz[0])
+        with one_blas_thread():
+            if len(observed) >= LEAST_ROWS:
+                try:
+                    lags = Lags(receiver.array_m, frequency_hz, *observed.shape[1:])
+                    if len(receiver.array_m) * len(observed) ** 2 > MOST_COVARIANCES:
+                        raise InputError(f"{len(observed)} rows are too many for a process of element signals")
+                    signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
+                except InputError as error:  # or a line of elements, or elements too far apart for lags
+                    what = f"{record.name}, receiver {receiver.name}"
+                    logger.warning("%s: the spectra themselves are kriged: %s", what, error)
+                else:
+                    return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
+            return UncertainKriged.of(kriged(rows), observed)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
+        """The model of a receiver from its arrays."""
+        if FREQUENCY not in arrays:
+            return super().load_single(receiver, arrays)
+        with one_blas_thread():  # factors to the last digit those of the fit
+            return KrigedSpectra.from_arrays(arrays, receiver)

@@ -36,31 +36,20 @@ Result = TypeVar("Result")
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
 
-THREADED_ROWS = 1000
-"""Rows of all receivers from which these are computed on threads."""
-JITTER = 1e-9
-"""Noise added to coincident inputs, as a share of the field's variance."""
-DEGREES = 4.0
-"""Degrees of freedom of the noise's Student-t distribution: fades are deep."""
-FREE_SPACE = 2.0
-"""Exponent of the distance in free space."""
+THREADED_ROWS = 1000  # rows of all receivers from which these are computed on threads
+JITTER = 1e-9  # noise added to coincident inputs, as a share of the field's variance
+DEGREES = 4.0  # degrees of freedom of the noise's Student-t distribution: fades are deep
+FREE_SPACE = 2.0  # exponent of the distance in free space
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
-BUFFER = 0.25
-"""Share of a stretch that is left out on either side of it, as consecutive rows share noise."""
-LEAST_GAIN_DB = 0.005
-"""Least reduction of the held-out error by which the search changes a parameter."""
-MOST_STEPS = 5
-"""Steps of one parameter in one direction."""
-TRUST = 500.0
-"""Number of held-out values that weigh as much as the prior in estimates from their distribution."""
-SKEW_TRUST = 2000.0
-"""The same number for the middle of their narrowest half, which is less certain than a mean."""
-RATIO = (0.5, 2.0)
-"""Bounds of the ratio of a receiver's noise to that of all."""
-COVERED = 0.9
-"""Share of residuals that calibrated intervals cover."""
+BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
+LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
+MOST_STEPS = 5  # steps of one parameter in one direction
+TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
+SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
+RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
+COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
 def _of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:
@@ -105,6 +94,7 @@ class PooledProcess:
 
         self._systems = _of_each(system, parts, sum(len(p.value) for p in parts))
         pairs = list(zip(self._systems, parts, strict=True))
+        # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
         self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
         self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
@@ -129,6 +119,7 @@ class PooledProcess:
         def reweighted(receiver: int) -> Part:
             part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
             scale = variance[receiver]
+            # y - f = V K^-1 (y - B beta); the field's posterior variance is the diagonal of V - V K^-1 V.
             precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
             residual = part.variance * weights
             square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
@@ -155,7 +146,7 @@ class PriorMean:
         """Expected dBm [n], columns [n, k] of its corrections, and their prior standard deviations [k]."""
         if self.traced is not None:
             power = self.traced(poses.position_m, receiver)
-            level = power - float(np.median(self.traced.power_dbm))
+            level = power - float(np.median(self.traced.power_dbm))  # centred, so that factor and offset are apart
         else:
             distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
             at_1m = 20 * np.log10(speed_of_light / self.frequency_hz / (4 * np.pi))
@@ -179,6 +170,7 @@ class Field:
             received = np.isfinite(stops.value_dbm[receiver])
             poses = stops.poses.take(received).moved(h.lever_m)
             expected, columns, sd = prior.columns(poses, receiver)
+            # Reports of a stop average their own noise out, but not the fading that persists during the stop.
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
             parts.append(Part(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
         self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
@@ -240,8 +232,8 @@ class Fit:
             ) -> tuple[FloatArray, FloatArray]:
                 return field.predict(self._measured.poses.take(received[receiver]), receiver)
 
-            found = _of_each(predicted, range(len(mean)), sum(map(len, received)))
-            for receiver, (value, variance) in enumerate(found):
+            predictions = _of_each(predicted, range(len(mean)), sum(map(len, received)))
+            for receiver, (value, variance) in enumerate(predictions):
                 mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(variance)
         return mean, std
 
@@ -253,6 +245,7 @@ class Fit:
         received = [row[np.isfinite(row)] for row in np.abs(self._residual(hyperparameters))]
         spread = np.array([np.median(row) if len(row) else 1 for row in received])
         count = np.array([len(row) for row in received])
+        # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
 
     def search(self, hyperparameters: Hyperparameters, on_progress: Callable[[float], None]) -> Hyperparameters:
@@ -267,6 +260,7 @@ class Fit:
         names = ["shadow_db", "shadow_m", NOISE]
         if self._measured.poses.heading_rad is not None:
             names += ["body_db", "body_m", "lever_m"]
+        # Each error fits all folds anew, a Cholesky factor for every receiver: only a few steps are affordable.
         best = error_db(hyperparameters)
         for done, name in enumerate(names, start=1):
             for sign in (1, -1):

@@ -24,18 +24,14 @@ from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
 
-NEAREST_M = 0.05
-"""Least distance between antennas in the law of distance."""
+NEAREST_M = 0.05  # least distance between antennas in the law of distance
 HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
 RX_HARMONICS = 2
-GAP = 5
-"""A stop ends where so many rows of the record are not among the given rows."""
-SEARCH_STEP = 1.5
-"""Factor of one step of the search for hyperparameters."""
+GAP = 5  # a stop ends where so many rows of the record are not among the given rows
+SEARCH_STEP = 1.5  # factor of one step of the search for hyperparameters
 LEVER_STEP_M = 0.1
-NOISE = "noise"
-"""Name of both noise terms in the search."""
+NOISE = "noise"  # name of both noise terms in the search
 MOST_PAIRS = 2
 """Pairs of a distinct position and a distinct heading, relative to the poses, up to which all pairs are evaluated."""
 
@@ -98,29 +94,30 @@ class Hyperparameters:
         names = ("drift_db", "noise_db") if name == NOISE else (name,)
         return replace(self, **{key: getattr(self, key) * SEARCH_STEP**sign for key in names})
 
-    def covariance(self, here: Poses, there: Poses) -> FloatArray:
+    def covariance(self, a: Poses, b: Poses) -> FloatArray:
         """Covariance of the field [n, m] between poses, dB^2."""
-        distance = cdist(here.position_m, there.position_m)
+        distance = cdist(a.position_m, b.position_m)
         covariance = self.shadow_db**2 * np.exp(-distance / self.shadow_m)
-        if here.heading_rad is not None and there.heading_rad is not None:
-            turn = np.cos(here.heading_rad[:, None] - there.heading_rad[None]) - 1
+        if a.heading_rad is not None and b.heading_rad is not None:
+            turn = np.cos(a.heading_rad[:, None] - b.heading_rad[None]) - 1
             covariance += self.body_db**2 * np.exp(self.concentration * turn - distance / self.body_m)
         return np.asarray(covariance)
 
-    def weighted_covariance(self, here: Poses, there: Poses, weights: FloatArray) -> FloatArray:
+    def weighted_covariance(self, a: Poses, b: Poses, weights: FloatArray) -> FloatArray:
         """Covariances times weights [m], shape [n]; positions and headings that repeat are evaluated once."""
-        places, place = np.unique(here.position_m, axis=0, return_inverse=True)
-        headings = np.zeros(len(here)) if here.heading_rad is None else here.heading_rad
+        places, place = np.unique(a.position_m, axis=0, return_inverse=True)
+        headings = np.zeros(len(a)) if a.heading_rad is None else a.heading_rad
         turns, turn = np.unique(headings, return_inverse=True)
-        if len(places) * len(turns) > MOST_PAIRS * len(here):
-            return np.asarray(self.covariance(here, there) @ weights)
-        distance = cdist(places, there.position_m)
-        found = np.asarray(self.shadow_db**2 * (np.exp(-distance / self.shadow_m) @ weights))[place.ravel()]
-        if here.heading_rad is not None and there.heading_rad is not None:
-            shares = np.exp(self.concentration * (np.cos(turns[:, None] - there.heading_rad) - 1)) * weights
+        if len(places) * len(turns) > MOST_PAIRS * len(a):
+            return np.asarray(self.covariance(a, b) @ weights)
+        # A map has every position at every heading: the body's part factors into one of positions and one of headings.
+        distance = cdist(places, b.position_m)
+        total = np.asarray(self.shadow_db**2 * (np.exp(-distance / self.shadow_m) @ weights))[place.ravel()]
+        if a.heading_rad is not None and b.heading_rad is not None:
+            shares = np.exp(self.concentration * (np.cos(turns[:, None] - b.heading_rad) - 1)) * weights
             body = self.body_db**2 * (np.exp(-distance / self.body_m) @ shares.T)
-            found = found + body[place.ravel(), turn]
-        return found
+            total = total + body[place.ravel(), turn]
+        return total
 
     def variance(self, headings: bool) -> float:
         """Variance of the field, with or without the part that depends on headings, dB^2."""
@@ -154,7 +151,7 @@ def basis(
     columns: list[FloatArray] = []
     deviations: list[float] = []
     for column, common, each in terms:
-        if common > 0:
+        if common > 0:  # a deviation of 0 says that there is no such term
             columns.append(column)
             deviations.append(common)
         if each > 0:
@@ -214,6 +211,7 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     number = np.zeros(len(rows), np.int64)
     first = 0
     for k in range(1, len(rows)):
+        # From the first row of the stop, not the previous one: a slow walk is many stops.
         far = np.linalg.norm(position[k] - position[first]) > reach_m
         turned = heading is not None and abs(np.angle(np.exp(1j * (heading[k] - heading[first])))) > turn_rad
         if far or turned or k - first >= most or rows[k] - rows[k - 1] > GAP:
@@ -226,6 +224,7 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
         return np.bincount(number, values, minlength=count) / size
 
     centre = np.stack([mean(axis) for axis in position.T], axis=-1)
+    # Headings are averaged as unit vectors: they wrap around.
     direction = None if heading is None else np.arctan2(mean(np.sin(heading)), mean(np.cos(heading)))
     begins = np.searchsorted(number, np.arange(count + 1))
     value = np.full((len(value_dbm), count), np.nan)
@@ -235,6 +234,7 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
         for receiver, reports in enumerate(value_dbm[:, chunk]):
             known = np.isfinite(reports)
             if known.any():
+                # A median, as fades skew the reports of a stop.
                 share = weight[receiver, chunk][known]
                 value[receiver, stop], total[receiver, stop] = _median(reports[known], share), share.sum()
     return Stops(Poses(centre, direction), value, total, mean(rows.astype(float)))

@@ -7,16 +7,16 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
-from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...tasks import require
 from ...training.session import OnProgress, quiet
@@ -29,27 +29,21 @@ from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
 
-HEADINGS = 8
-"""Headings over which the prediction is averaged where the heading is unknown."""
-CHUNK = 1024
-"""Transmitters predicted together, which bounds the memory of their covariances with the rows."""
+HEADINGS = 8  # headings over which the prediction is averaged where the heading is unknown
+CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
-WIDER = 2.0
-"""Factor of the stops' extent during the search, which takes a third of the time for the same choice."""
-SKEW_DB = 0.4
-"""Shift of predictions a priori, as fades reach deeper than peaks."""
-OFFSET_SD_DB = 10.0
-"""Standard deviation of the common offset of all receivers about the transmit power a priori."""
+WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
+SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
+STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
+RECEIVER_SD_DB = 4.0  # standard deviation of each receiver's offset from the common one: antennas and their mounting
+OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
-TRACED_SD = (0.5, 0.2)
-"""Likewise of the factor of the traced decibels about 1."""
-BODY_PATTERN_DB = (1.0, 0.2)
-"""Likewise of the first harmonic of the transmitter's pattern."""
-RECEIVER_PATTERN_DB = 2.0
-"""Standard deviation of the first harmonic of each receiver's pattern."""
+TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
+BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
+RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
 
 
 @dataclass(frozen=True)
@@ -59,41 +53,32 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
-        receiver_sd_db: standard deviation of each receiver's offset from the common one.
         search_rows: least number of training rows with which held-out rows choose hyperparameters.
-        stop_m: consecutive rows within that distance are joined.
-        stop_rad: and within that turn.
-        stop_rows: and at most so many.
     """
 
     transmit_dbm: float | None = None
-    receiver_sd_db: Positive = 4.0
     search_rows: int = 500
-    stop_m: float = 0.1
-    stop_rad: float = 0.2
-    stop_rows: Count = 20
+    FIXED: ClassVar[Mapping[str, float]] = {
+        "receiver_sd_db": RECEIVER_SD_DB,
+        "stop_m": STOP_M,
+        "stop_rad": STOP_RAD,
+        "stop_rows": STOP_ROWS,
+    }
 
     @property
     def hyperparameters(self) -> Hyperparameters:
         """Start of the search."""
-        return Hyperparameters(**{one.name: getattr(self, one.name) for one in fields(Hyperparameters)})
+        return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
 
 
 @dataclass(eq=False, repr=False)
 class Strengths(Fitted):
-    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report.
-
-    Attributes:
-        field: posterior of the signal strengths.
-        shift_db: shift of predictions.
-        widen: factor of each receiver's standard deviations [n_rx].
-        fit_facts: numbers of the fit for `facts`.
-    """
+    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report."""
 
     field: Field
     shift_db: float
-    widen: FloatArray
-    fit_facts: dict[str, float]
+    widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
+    fit_facts: dict[str, float]  # numbers of the fit for `facts`
 
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""
@@ -109,6 +94,7 @@ class Strengths(Fitted):
         mean, std = np.empty((2, len(position_m)))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             means, variances = zip(*(self.field.predict(each, receiver) for each in poses), strict=True)
+            # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
         return Prediction(mean, std)
@@ -207,9 +193,7 @@ def fit_strengths(
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
 ) -> Strengths:
-    """Fit signal strengths to some rows of a record.
-
-    Nothing is drawn, so there is no seed.
+    """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
     Args:
         record: signal strengths with a single, known carrier.
@@ -237,7 +221,7 @@ def fit_strengths(
     hyperparameters = settings.hyperparameters
 
     def join(rows: Measured, factor: float = 1.0) -> Stops:
-        stops = stops_of(rows, factor * settings.stop_m, factor * settings.stop_rad, settings.stop_rows)
+        stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
         return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
 
     ratio, widen = np.ones((2, len(values)))
@@ -271,7 +255,7 @@ def _prior(record: Record, measured: Measured, power_map: Traced | None, setting
     assert record.frequencies_hz is not None
     receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     traced_sd = np.multiply(TRACED_SD, power_map is not None)
-    sd = np.array([(OFFSET_SD_DB, settings.receiver_sd_db), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
+    sd = np.array([(OFFSET_SD_DB, RECEIVER_SD_DB), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
     carrier_hz = float(np.mean(record.frequencies_hz))
     at_0_dbm = PriorMean(receivers_m, 0.0, carrier_hz, power_map, sd, RECEIVER_PATTERN_DB)
     transmit_dbm = settings.transmit_dbm

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError
+from ...core import InputError, Receiver, Record
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from .by_receiver import model_by_receiver, observed_rows
+from ..model import Arrays
+from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,8 @@ class Trees(CheckedSettings):
     ) -> GrownTrees:
         """Grow the trees, whose cuts are random, on the rows that were observed.
 
-        Args:
-            tx_pos: shape [n, 3], metres.
-            observation: real, shape [n]; NaN, where nothing was received, is left out.
-            tx_heading_rad: shape [n], or None to leave headings out.
-            seed: seed of the cuts.
+        Positions [n, 3] are in metres; real observations [n] are NaN where nothing was received; None leaves headings
+        [n] out.
 
         Raises:
             InputError: no rows, none that was observed, different numbers of them, or complex observations.
@@ -79,27 +77,16 @@ class Trees(CheckedSettings):
 
 @dataclass(frozen=True)
 class GrownTrees:
-    """Trees as plain arrays, over all nodes of all trees.
+    """Trees as plain arrays, over all nodes of all trees: a run file holds arrays, not pickled objects."""
 
-    Attributes:
-        root: first node of each tree.
-        left: next node where the feature is at most the threshold; of a leaf, itself.
-        right: next node where it is more.
-        feature: number of the feature that decides.
-        threshold: threshold of the feature.
-        value: mean of the training rows in the node.
-        depth: longest path from a root to a leaf.
-        like: empty array [0, features] of the observations' type.
-    """
-
-    root: NDArray[np.int32]
-    left: NDArray[np.int32]
-    right: NDArray[np.int32]
-    feature: NDArray[np.int8]
+    root: NDArray[np.int32]  # first node of each tree
+    left: NDArray[np.int32]  # next node where the feature is at most the threshold; of a leaf, itself
+    right: NDArray[np.int32]  # next node where it is more
+    feature: NDArray[np.int8]  # number of the feature that decides
     threshold: FloatArray
-    value: FloatArray
-    depth: NDArray[Any]
-    like: NDArray[Any]
+    value: FloatArray  # mean of the training rows in the node
+    depth: NDArray[Any]  # longest path from a root to a leaf
+    like: NDArray[Any]  # empty array [0, features] of the observations' type
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
         """Average of the trees [m] at positions [m, 3] and, if and only if the fit had headings, headings [m].
@@ -110,6 +97,7 @@ class GrownTrees:
         # scikit-learn cuts features in single precision.
         single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
         rows = np.arange(len(single))
+        # All trees [trees, m] descend together, as many steps as the deepest has.
         node = np.broadcast_to(self.root[:, None], (len(self.root), len(single)))
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
@@ -134,12 +122,26 @@ def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray
     return np.column_stack([positions, np.cos(heading), np.sin(heading)])
 
 
-MODEL = model_by_receiver(
-    "trees",
-    ("rssi",),
-    Trees,
-    lambda rows: rows.problem.settings.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed),
-    lambda receiver, arrays: GrownTrees(**arrays),
-    "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'",
-    lambda record, settings: settings.heading,
-)
+class TreesModel(ByReceiverModel):
+    """Extremely randomised trees of each receiver."""
+
+    name, settings = "trees", Trees
+    source = "Geurts, Ernst and Wehenkel, 'Extremely randomized trees'"
+    summary = "extremely randomised trees"
+    tasks = ("rssi",)
+
+    def takes_headings(self, record: Record, settings: Trees) -> bool:
+        """As the settings say."""
+        return settings.heading
+
+    def fit_single(self, rows: ReceiverRows) -> GrownTrees:
+        """Grow the trees of a receiver."""
+        trees: Trees = rows.problem.settings
+        return trees.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed)
+
+    def load_single(self, receiver: Receiver, arrays: Arrays) -> GrownTrees:
+        """The trees of a receiver."""
+        return GrownTrees(**arrays)
+
+
+MODEL = TreesModel()

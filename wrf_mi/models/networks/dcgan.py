@@ -22,9 +22,9 @@ layer?", 2016): `finer`. A convolution of stride two is the reverse: `coarser`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -40,14 +40,12 @@ from .layers import GAIN, Linear, Module, columns, feature_count, relu
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 
-NORM_FLOOR = 1e-5
-"""Added to variances: an image may be flat."""
-LEVELS = 3
-"""Convolutions of stride two in either network."""
-leaky = nn.LeakyReLU(0.2)
-"""Activation of the discriminator (Radford et al.)."""
-MOMENTUM = 0.5
-"""Adam's decay of the first moment (Radford et al.)."""
+NORM_FLOOR = 1e-5  # added to variances: an image may be flat
+LEVELS = 3  # convolutions of stride two in either network
+leaky = nn.LeakyReLU(0.2)  # activation of the discriminator (Radford et al.)
+ADVERSARY_RATE = 2e-4  # learning rate of the discriminator (Radford et al.)
+L1 = 100.0  # weight of the mean absolute difference against the adversarial term (Isola et al., pix2pix)
+MOMENTUM = 0.5  # Adam's decay of the first moment (Radford et al.)
 
 
 @dataclass(frozen=True)
@@ -55,26 +53,23 @@ class DcganSettings(NetworkSettings):
     """Settings of the adversarial network and of the training loop.
 
     Attributes:
-        adversary_rate: learning rate of the discriminator.
         noise: number of inputs that are drawn from -1 to 1.
         hidden: neurons before the coarse grid.
         channels: channels of the coarse grid; halved at each finer grid.
         octaves: octaves of the position's encoding.
         scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
-        l1: weight of the mean absolute difference against the adversarial term.
     """
 
     steps: int = 1875
     batch: int = 8
     validate_every: int = 188
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    adversary_rate: Positive = 2e-4
+    FIXED: ClassVar[Mapping[str, float]] = {"adversary_rate": ADVERSARY_RATE, "l1": L1}
     noise: Count = 8
     hidden: Count = 64
     channels: Annotated[int, Field(ge=2**LEVELS, description=f"{2**LEVELS} or more")] = 32
     octaves: int = 4
     scale_m: Positive = 1.0
-    l1: float = 100.0
 
 
 @dataclass(frozen=True)
@@ -298,53 +293,53 @@ def softplus(x: Any) -> Any:
     return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
 
 
-def duel_loss(dcgan: Dcgan, data: Any, given: Any, s: DcganSettings) -> Any:
+def duel_loss(dcgan: Dcgan, data: Any, drawn: Any) -> Any:
     """Sum of the losses of generator and discriminator, each with gradients of its own weights alone.
 
-    Args:
-        dcgan: both networks.
-        data: ``truth``, spectra one after the other, and ``where`` [features, n].
-        given: ``rows`` [batch] and ``noise`` [k, batch] of the step.
-        s: settings.
+    ``data`` has ``truth``, spectra one after the other, and ``where`` [features, n]; ``drawn`` has ``rows`` [batch] and
+    ``noise`` [k, batch] of the step.
     """
-    chosen, flat, shape = given["rows"], data["truth"], dcgan.g.shape
+    chosen, flat, shape = drawn["rows"], data["truth"], dcgan.g.shape
     pixels = shape[0] * shape[1]
     slot = dr.arange(type(chosen), dr.width(chosen) * pixels)
     index = dr.gather(type(chosen), chosen, slot // pixels) * pixels + slot % pixels
     real = type(data["where"])(dr.gather(type(flat), flat, index), (1, dr.width(slot)))
     where = columns(data["where"], chosen)
-    fake = dcgan.g(given["noise"], where)
+    fake = dcgan.g(drawn["noise"], where)
+    # -log D(real) - log (1 - D(fake)) by logits; detached, as the generator must not learn from it.
     right = dr.mean(softplus(-dcgan.d(real, where, shape)), axis=None)
     right += dr.mean(softplus(dcgan.d(dr.detach(fake), where, shape)), axis=None)
+    # -log D(fake) in place of log (1 - D(fake)), which is flat where the discriminator wins (Goodfellow et al., 2014).
     fixed = dcgan.d.with_state({path: dr.detach(weight) for path, weight in dcgan.d.state().items()})
     fooled = dr.mean(softplus(-fixed(fake, where, shape)), axis=None)
-    return (right + fooled + s.l1 * dr.mean(dr.abs(fake - real), axis=None)).array
+    return (right + fooled + L1 * dr.mean(dr.abs(fake - real), axis=None)).array
 
 
-def network(rows: ReceiverRows, s: DcganSettings, rng: np.random.Generator) -> Network:
-    """Generator and discriminator of a receiver, to be trained together."""
-    data = {"where": rows.where, "truth": to_float(rows.spectra)}
-    dr.make_opaque(data)
-    dcgan = Dcgan(s, rows.spectra.shape[1:], rng)
-    # The generator starts near the mean grey of the rows that it may learn from.
-    grey = float(np.clip(rows.spectra[: rows.train].mean(dtype=np.float64), 0.01, 0.99))
-    dcgan.g.layers[-1].bias += np.float32(np.log(grey / (1 - grey)))
+class DcganModel(SpectrumNetwork):
+    """A generator and a discriminator for each receiver."""
 
-    def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (s.noise, len(chosen))))}
+    name, settings, summary = "dcgan", DcganSettings, "generative adversarial network"
+    source = (
+        "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), "
+        "with pix2pix's second term (2017)"
+    )
+    generator_class, generator, at_once = Generator, "g", 16
 
-    both = rows.network(KIND, dcgan, partial(duel_loss, s=s), data, draw)
-    rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), s.adversary_rate)
-    return replace(both, rates=rates, momentum=MOMENTUM)
+    def network(self, rows: ReceiverRows, settings: DcganSettings, rng: np.random.Generator) -> Network:
+        """Generator and discriminator of a receiver, to be trained together."""
+        data = {"where": rows.where, "truth": to_float(rows.spectra)}
+        dr.make_opaque(data)
+        dcgan = Dcgan(settings, rows.spectra.shape[1:], rng)
+        # The generator starts near the mean grey of the rows that it may learn from.
+        grey = float(np.clip(rows.spectra[: rows.train].mean(dtype=np.float64), 0.01, 0.99))
+        dcgan.g.layers[-1].bias += np.float32(np.log(grey / (1 - grey)))
+
+        def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            return {"rows": opaque_rows(chosen), "noise": to_tensor(rng.uniform(-1, 1, (settings.noise, len(chosen))))}
+
+        both = self.trained_on(rows, dcgan, duel_loss, data, draw)
+        rates = dict.fromkeys((f"d.{path}" for path in dcgan.d.state()), ADVERSARY_RATE)
+        return replace(both, rates=rates, momentum=MOMENTUM)
 
 
-KIND = SpectrumNetwork(
-    "dcgan",
-    DcganSettings,
-    network,
-    Generator,
-    "g",
-    16,
-    "Radford, Metz and Chintala (2016), conditioned as by Mirza and Osindero (2014), with pix2pix's second term (2017)",
-)
-MODEL = KIND.model()
+MODEL = DcganModel()

@@ -19,8 +19,7 @@ from ...gaussians.encoding import encode, encoded_size
 
 GAIN = float(np.sqrt(2.0))
 """Deviation of initial weights times the root of a layer's inputs, where a rectifier follows (He et al. 2015)."""
-LEAST_M = 1e-3
-"""Smallest extent that coordinates are divided by: all rows may lie at one height."""
+LEAST_M = 1e-3  # smallest extent that coordinates are divided by: all rows may lie at one height
 relu = nn.ReLU()
 
 
@@ -34,9 +33,9 @@ class Module:
 
     def state(self) -> dict[str, Any]:
         """All weights by path."""
-        found: dict[str, Any] = {}
-        _mapped(self, "", lambda path, weight: found.setdefault(path, weight))
-        return found
+        weights: dict[str, Any] = {}
+        _mapped(self, "", lambda path, weight: weights.setdefault(path, weight))
+        return weights
 
     def with_state(self, weights: Mapping[str, Any]) -> Self:
         """The same network with other weights, by path."""
@@ -59,9 +58,9 @@ class Module:
             InputError: a weight that is missing, of another shape, or not finite.
         """
         for path, like in self.state().items():
-            found = weights.get(path)
-            if found is None or found.shape != tuple(like.shape) or not np.isfinite(found).all():
-                text = "missing" if found is None else f"of shape {found.shape}, or not finite"
+            weight = weights.get(path)
+            if weight is None or weight.shape != tuple(like.shape) or not np.isfinite(weight).all():
+                text = "missing" if weight is None else f"of shape {weight.shape}, or not finite"
                 raise InputError(f"weight {path} is {text}, where the settings need {tuple(like.shape)}")
 
 
@@ -70,6 +69,7 @@ def _mapped(value: Any, path: str, change: Callable[[str, Any], Any]) -> Any:
     if isinstance(value, Module):
         changed, start = copy(value), f"{path}." if path else ""
         for name, inner in vars(value).items():
+            # An attribute such as ``in_`` has the underscore because Python keeps the word.
             setattr(changed, name, _mapped(inner, start + name.removesuffix("_"), change))
         return changed
     if isinstance(value, list):
@@ -107,6 +107,7 @@ class Linear(Module):
 
     def __call__(self, *hidden: Any, **parts: Any) -> Any:
         """Outputs [outputs, n] of the inputs [size, n] by name."""
+        # Matrices of named inputs spare joining them: W [a; b] = W_a a + W_b b.
         products = [getattr(self, name) @ x for name, x in [*(("hidden", x) for x in hidden), *parts.items()]]
         return sum(products[1:], products[0] + self.bias)
 
@@ -134,15 +135,10 @@ def columns(x: Any, picked: Any) -> Any:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """A frame of positions, fitted on training rows.
+    """A frame of positions, fitted on training rows."""
 
-    Attributes:
-        centre_m: mean of the training positions [3].
-        extent_m: largest distance from it along an axis, metres.
-    """
-
-    centre_m: FloatArray
-    extent_m: float
+    centre_m: FloatArray  # mean of the training positions [3]
+    extent_m: float  # largest distance from it along an axis, metres
 
     @classmethod
     def of(cls, positions_m: ArrayLike) -> Coordinates:

@@ -62,17 +62,16 @@ from ..model import (
     known_positions,
     received_rows,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
 from .layers import Coordinates, columns, feature_count
-from .nerf2_march import Nerf2Network, Networks, Seen, constant_parts, look, march
+from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
 from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 
-DB_UNIT = 10.0
-"""Unit of the loss of signal strengths, dB."""
-POINTS_PER_CHUNK = 1 << 15
-"""Points whose attenuation is evaluated together in predictions."""
+DB_UNIT = 10.0  # unit of the loss of signal strengths, dB
+POINTS_PER_CHUNK = 1 << 15  # points whose attenuation is evaluated together in predictions
 PAIRS_PER_CHUNK = 1 << 18
 """Pairs of a point and a condition that are evaluated together in predictions: bounds the memory."""
 
@@ -144,9 +143,8 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
 class Field(Fitted):
     """A fitted field, evaluated in two steps that are recorded once.
 
-    Rays go through the pixels of spectra (`wrf_mi.core.angles`); for other tasks they cover the full sphere.
-
-    Rays end at ``far_m`` metres; ``scales`` are the units of the receivers' channels, [n_rx].
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`), or cover the full sphere, and end at ``far_m`` metres;
+    ``scales`` are the units of the receivers' channels, [n_rx].
 
     Attributes:
         groups: indices of the receivers that share networks.
@@ -164,7 +162,7 @@ class Field(Fitted):
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
         self.outputs, self.task, self._shape = outputs_of(record), task_of(record), record.observation.shape[2:]
         self.networks: list[Nerf2Network] = []
-        self._seen: tuple[int, list[Seen]] | None = None
+        self._points: tuple[int, list[RayPoints]] | None = None
         receivers = placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
         self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
@@ -182,7 +180,7 @@ class Field(Fitted):
             "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
         }
         self.data = {name: to_tensor(values) for name, values in parts.items()}
-        dr.make_opaque(self.data)
+        dr.make_opaque(self.data)  # literals would be compiled into the kernels of each receiver anew
         self.network = self.initial(np.random.default_rng(0))
         network, s = self.network, settings
 
@@ -192,10 +190,10 @@ class Field(Fitted):
                 return look(network.with_state(params), rays)
 
         @Recorded
-        def marched(params: dict[str, Any], seen: Seen, condition: Any, receiver: Any) -> Any:
+        def marched(params: dict[str, Any], points: RayPoints, condition: Any, receiver: Any) -> Any:
             with dr.suspend_grad():
-                batch, rays = condition.shape[1], seen.first.shape[1] // s.samples
-                parts = march(network.with_state(params), seen, condition, s.samples)
+                batch, rays = condition.shape[1], points.first.shape[1] // s.samples
+                parts = march(network.with_state(params), points, condition, s.samples)
                 return report(params["offset"], parts, self.task, (self.outputs.count, batch, rays), receiver)
 
         self._looked, self._marched = looked, marched
@@ -212,11 +210,11 @@ class Field(Fitted):
             InputError: fitted to uplink channels, and there are none.
         """
         network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
-        if self._seen is None or self._seen[0] != receiver:
+        if self._points is None or self._points[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
-            self._seen = receiver, self.look(network, receiver)
+            self._points = receiver, self.look(network, receiver)
         condition, divisor = self.condition_of(inputs, receiver)
-        values, shape = self.march(network, self._seen[1], condition, receiver), (len(inputs), *self._shape)
+        values, shape = self.march(network, self._points[1], condition, receiver), (len(inputs), *self._shape)
         return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -231,7 +229,7 @@ class Field(Fitted):
             arrays |= keyed(f"group{g}/", network.arrays())
         return arrays
 
-    def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[Seen]:
+    def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[RayPoints]:
         """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
         index = dr.opaque(mi.UInt32, receiver)
         everything = np.arange(self.n_rays) if rays is None else rays
@@ -242,15 +240,14 @@ class Field(Fitted):
         dr.eval(parts)
         return [self._looked(network.state(), part) for part in parts]
 
-    def march(self, network: Nerf2Network, seen: list[Seen], condition: Any, receiver: int) -> NDArray[np.float32]:
+    def march(self, network: Nerf2Network, rays: list[RayPoints], condition: Any, receiver: int) -> NDArray[np.float32]:
         """Reports of the instrument for conditions [features, m]: [m, values]."""
-        m, index = condition.shape[1], dr.opaque(mi.UInt32, receiver)
-        blocks = []
-        at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in seen))
-        for start in range(0, m, at_once):
-            chosen = columns(condition, opaque_rows(np.arange(start, min(m, start + at_once))))
+        index, blocks = dr.opaque(mi.UInt32, receiver), []
+        at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in rays))
+        for rows in slices(condition.shape[1], at_once):
+            chosen = columns(condition, opaque_rows(np.arange(rows.start, rows.stop)))
             dr.eval(chosen)
-            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in seen]
+            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in rays]
             blocks.append(np.concatenate(reports, axis=1))
         return np.concatenate(blocks)
 
@@ -268,58 +265,33 @@ class Field(Fitted):
         return where, float(self.scales[receiver])
 
 
-def step_loss(network: Nerf2Network, data: Mapping[str, Any], given: Mapping[str, Any], field: Field) -> Any:
+def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str, Any], field: Field) -> Any:
     """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
 
-    Args:
-        network: both networks.
-        data: `Field.data`, ``condition`` [features, n] and ``truth`` [n_rx * n, values].
-        given: ``rows``, ``rays`` and ``receiver``, indices.
-        field: field to be trained.
+    ``data`` has that of the field, ``condition`` [features, n] and ``truth`` [n_rx * n, values]; ``drawn`` has indices:
+    ``rows``, ``rays`` and ``receiver``.
     """
-    tensor, rays = type(data["direction"]), dr.width(given["rays"])
-    seen = look(network, rays_of(data, given["receiver"], given["rays"], field.n_rays))
-    condition = columns(data["condition"], given["rows"])
+    tensor, rays = type(data["direction"]), dr.width(drawn["rays"])
+    points = look(network, rays_of(data, drawn["receiver"], drawn["rays"], field.n_rays))
+    condition = columns(data["condition"], drawn["rows"])
     batch = condition.shape[1]
-    parts = march(network, seen, condition, field.settings.samples)
-    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), given["receiver"])
+    parts = march(network, points, condition, field.settings.samples)
+    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), drawn["receiver"])
+    # Truths of the batch: spectra at the step's rays, other reports in whole.
     values = data["truth"].shape[1]
     reported = predicted.shape[1]
-    slot = dr.arange(type(given["rows"]), batch * reported)
-    row = dr.gather(type(slot), given["rows"], slot // reported) + given["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), given["rays"], slot % reported) if field.task.image else slot % reported
+    slot = dr.arange(type(drawn["rows"]), batch * reported)
+    row = dr.gather(type(slot), drawn["rows"], slot // reported) + drawn["receiver"] * data["condition"].shape[1]
+    column = dr.gather(type(slot), drawn["rays"], slot % reported) if field.task.image else slot % reported
     truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
     error = predicted - truth
     if field.task.in_decibel:
-        error = error * (1 / DB_UNIT)
+        error = error * (1 / DB_UNIT)  # of size one, as greys are: one learning rate serves both
     return dr.mean(error * error, axis=None).array
 
 
-SCORED_RAYS = 512
-"""Pixels of each validation spectrum by which steps are chosen."""
-FAR_M = 10.0
-"""Length of rays if positions are not known: the size of a large room."""
-
-
-def fit(problem: Problem, split: Split, session: FitSession) -> Field:
-    """Fit the networks.
-
-    Raises:
-        InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
-    """
-    record, known = problem.record, split.all_train
-    outputs, settings = outputs_of(record), problem.settings
-    where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
-    known_rx = np.stack([receiver.position_m for receiver in record.receivers])
-    rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
-    if np.isfinite(where).all() and np.isfinite(known_rx).all():
-        farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
-    else:
-        where, farthest = rx, FAR_M
-    scales = channel_scales(record, known)
-    field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-    field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
-    return field
+SCORED_RAYS = 512  # pixels of each validation spectrum by which steps are chosen
+FAR_M = 10.0  # length of rays if positions are not known: the size of a large room
 
 
 def _fit_group(
@@ -338,6 +310,7 @@ def _fit_group(
     dr.make_opaque(data)
     initial = field.initial(rng)
     if field.task.in_decibel:
+        # Offsets start at the mean level: the networks then learn differences of a few dB.
         for r in members:
             initial.offset[r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
     n_rays, spectrum = field.n_rays, field.task.image
@@ -348,6 +321,7 @@ def _fit_group(
         rays = opaque_rows(rng.choice(n_rays, min(s.rays, n_rays), replace=False)) if spectrum else all_rays
         return {"rows": opaque_rows(chosen), "rays": rays, "receiver": dr.opaque(mi.UInt32, members[member])}
 
+    # The same pixels at every validation, as scores are compared between steps.
     scored = np.sort(np.random.default_rng(0).choice(n_rays, min(SCORED_RAYS, n_rays), replace=False))
 
     def score(network: Nerf2Network) -> float:
@@ -355,10 +329,10 @@ def _fit_group(
         for r in members:
             validation = conditions_of(rows[r][1], outputs)
             if len(validation):
-                seen = field.look(network, r, scored if spectrum else None)
-                found = field.march(network, seen, columns(condition, opaque_rows(validation)), r)
+                points = field.look(network, r, scored if spectrum else None)
+                predicted = field.march(network, points, columns(condition, opaque_rows(validation)), r)
                 wanted = truth[r * condition.shape[1] + validation]
-                errors.append(np.square(found - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
+                errors.append(np.square(predicted - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
 
     train = [conditions_of(rows[r][0], outputs) for r in members]
@@ -371,15 +345,42 @@ def _fit_group(
     return trained
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> Field:
-    """The fields that `Field.arrays` described."""
-    settings = stored_settings(Nerf2Settings, arrays, "nerf2")
-    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
-    field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-    field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
-    return field
+class Nerf2Model(Model):
+    """NeRF2."""
+
+    name, settings = "nerf2", Nerf2Settings
+    source = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
+    summary = "neural field of voxels, marched along rays"
+    tasks = ("spectrum", "rssi", "csi")
+    uplink, headings = "optional", True
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Field:
+        """Fit the networks.
+
+        Raises:
+            InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
+        """
+        record, known = problem.record, split.all_train
+        outputs, settings = outputs_of(record), problem.settings
+        where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
+        known_rx = np.stack([receiver.position_m for receiver in record.receivers])
+        rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
+        if np.isfinite(where).all() and np.isfinite(known_rx).all():
+            farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
+        else:
+            where, farthest = rx, FAR_M
+        scales = channel_scales(record, known)
+        field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
+        field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
+        return field
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Field:
+        """The fields that `Field.arrays` described."""
+        settings = stored_settings(Nerf2Settings, arrays, "nerf2")
+        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+        field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+        return field
 
 
-SOURCE = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
-TASKS = "spectrum", "rssi", "csi"
-MODEL = Model("nerf2", TASKS, Nerf2Settings, fit, load, SOURCE, uplink="optional", headings=True)
+MODEL = Nerf2Model()

@@ -34,8 +34,7 @@ from ...core.settings import Count, Positive
 from ...gaussians.parameters import logistic
 from .layers import Linear, Mlp, Module, feature_count, relu, with_encoding
 
-LEAK = 0.01
-"""Slope of the leaky ReLU below zero, PyTorch's default."""
+LEAK = 0.01  # slope of the leaky ReLU below zero, PyTorch's default
 
 
 @dataclass(frozen=True)
@@ -82,27 +81,19 @@ class Nerf2Network(Module):
 
 
 @dataclass
-class Seen:
-    """Everything about the points of some rays that does not depend on the transmitter.
+class RayPoints:
+    """Everything about the points of some rays that does not depend on the transmitter."""
 
-    Attributes:
-        weight_re: real part of the factor of s_s in the sum, tensor [outputs, rays * S].
-        weight_im: its imaginary part.
-        first: sum of the inputs of the radiance network's first layer but the condition, [width, rays * S].
-    """
-
-    weight_re: Any
-    weight_im: Any
-    first: Any
+    weight_re: Any  # real part of the factor of s_s in the sum, tensor [outputs, rays * S]
+    weight_im: Any  # its imaginary part
+    first: Any  # sum of the inputs of the radiance network's first layer but the condition, [width, rays * S]
 
 
-def look(network: Nerf2Network, rays: Mapping[str, Any]) -> Seen:
+def look(network: Nerf2Network, rays: Mapping[str, Any]) -> RayPoints:
     """Evaluate the attenuation network on all points of some rays.
 
-    Args:
-        network: both networks.
-        rays: tensors of `constant_parts`, ``direction`` (unit vectors in the world [3, rays]) and ``origin`` (starting
-            point [3, 1], metres from the frame's centre).
+    ``rays`` has tensors of `constant_parts`, ``direction`` (unit vectors in the world [3, rays]) and ``origin``
+    (starting point [3, 1], metres from the frame's centre).
     """
     sizes, radiance = network.sizes, network.radiance.layers[0]
     count, samples = rays["direction"].shape[1], rays["distance"].shape[1]
@@ -133,36 +124,32 @@ def look(network: Nerf2Network, rays: Mapping[str, Any]) -> Seen:
         for w in (rays["wave_re"], rays["wave_im"])
     ]
     wave_re, wave_im = waves
+    # (D / r) exp(-j k r) times exp(-sum (a + j b) D): a turn by minus the phase that the cells before have added.
     re = amplitude * (wave_re * cosine + wave_im * sine)
     im = amplitude * (wave_im * cosine - wave_re * sine)
     seen_from: Any = dr.reshape(radiance.view @ view, (sizes.width, count, 1))
+    # The radiance network's first layer is linear in its inputs: all of it but the condition is summed here, once.
     total = dr.reshape(radiance.feature @ network.feature(hidden), (sizes.width, count, samples)) + seen_from
-    return Seen(re, im, dr.reshape(total, (sizes.width, n)) + radiance.bias)
+    return RayPoints(re, im, dr.reshape(total, (sizes.width, n)) + radiance.bias)
 
 
-def march(network: Nerf2Network, seen: Seen, condition: Any, samples: int) -> tuple[Any, Any]:
-    """Signal of each ray for each condition.
+def march(network: Nerf2Network, points: RayPoints, condition: Any, samples: int) -> tuple[Any, Any]:
+    """Signal of each ray of S samples for conditions [features, batch]: real and imaginary part.
 
-    Args:
-        network: both networks.
-        seen: result of `look`.
-        condition: features of transmitters for the radiance network, [features, batch].
-        samples: S.
-
-    Returns:
-        Real and imaginary part, flat arrays [outputs * batch * rays].
+    Both are flat arrays [outputs * batch * rays]; ``points`` is the result of `look`.
     """
-    width, n = seen.first.shape
-    outputs, batch = seen.weight_re.shape[0], condition.shape[1]
+    width, n = points.first.shape
+    outputs, batch = points.weight_re.shape[0], condition.shape[1]
     first, second = network.radiance.layers
     assert network.radiance.out is not None
+    # Pairs of a condition and a point: the sum of both shares of the first layer, then the rest of the network.
     sender: Any = dr.reshape(first.condition @ condition, (width, batch, 1))
-    hidden = relu(dr.reshape(dr.reshape(seen.first, (width, 1, n)) + sender, (width, batch * n)))
+    hidden = relu(dr.reshape(dr.reshape(points.first, (width, 1, n)) + sender, (width, batch * n)))
     out = network.radiance.out(relu(second(hidden)))
     amplitude: Any = dr.reshape(strength(out[:outputs, :]), (outputs, batch, n))
     angle: Any = dr.reshape(phase(out[outputs:, :]), (outputs, batch, n))
     sine, cosine = dr.sincos(angle)
-    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (seen.weight_re, seen.weight_im))
+    w_re, w_im = (cast(Any, dr.reshape(w, (outputs, 1, n))) for w in (points.weight_re, points.weight_im))
     re = amplitude * (cosine * w_re - sine * w_im)
     im = amplitude * (cosine * w_im + sine * w_re)
     return dr.block_sum(re.array, samples), dr.block_sum(im.array, samples)
@@ -188,6 +175,7 @@ def constant_parts(
         triangular ones [S, S], transposed: sums over the cells before each; ``wave_re`` and ``wave_im``: parts of
         (D / r_s) exp(-j k r_s), [outputs, S]; ``extent``: unit of plain coordinates [1], metres.
     """
+    # In double precision: k r is thousands of radians, of which float32 keeps three digits behind the point at most.
     cell = (far_m - near_m) / samples
     distance = near_m + (np.arange(samples, dtype=np.float64) + 0.5) * cell
     wavenumber = 2 * np.pi * np.asarray(frequencies_hz, float)[:, None] / speed_of_light

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from ..model import (
     known_positions,
     received_rows,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
@@ -40,69 +40,78 @@ SPECTRUM = TASKS["spectrum"]
 
 @dataclass(frozen=True)
 class ReceiverRows:
-    """Rows that a receiver's network learns from, and after them those that choose the number of steps.
-
-    Attributes:
-        receiver: name of the receiver.
-        spectra: greys [n, height, width].
-        where: features of the transmitters [features, n].
-        train: number of rows that train while the others choose.
-    """
+    """Rows that a receiver's network learns from, and after them those that choose the number of steps."""
 
     receiver: str
-    spectra: NDArray[np.float32]
-    where: Any
-    train: int
+    spectra: NDArray[np.float32]  # greys [n, height, width]
+    where: Any  # features of the transmitters [features, n]
+    train: int  # number of rows that train while the others choose
 
-    def network(self, kind: SpectrumNetwork, module: Any, loss: Any, data: Any, draw: Any) -> Network:
-        """Training of a network on these rows, scored by the median structural similarity of those that choose."""
-        count = len(self.spectra) - self.train
+
+class SpectrumNetwork(Model):
+    """A model with a network for each receiver."""
+
+    tasks = ("spectrum",)
+    uplink, headings = "optional", True
+    generator: str  # attribute of the trained network that makes spectra; no other part is stored
+    # Its class: ``generator_class(settings, (height, width), rng)``. The method ``spectra`` makes greys [m * height *
+    # width], a flat array, from features of positions [features, m]
+    generator_class: Any
+    at_once: int  # spectra that are predicted together, which bounds the memory
+
+    @abstractmethod
+    def network(self, rows: ReceiverRows, settings: Any, rng: np.random.Generator) -> Network:
+        """Training of a network on a receiver's rows; ``settings`` have ``octaves`` and ``scale_m``."""
+
+    def trained_on(self, rows: ReceiverRows, module: Any, loss: Any, data: Any, draw: Any) -> Network:
+        """Training of a network on rows, scored by the median structural similarity of those that choose."""
+        count = len(rows.spectra) - rows.train
 
         def score(module: Any) -> float:
-            asked, truth = to_tensor(self.where.numpy()[:, self.train :]), to_float(self.spectra[self.train :])
+            asked, truth = to_tensor(rows.where.numpy()[:, rows.train :]), to_float(rows.spectra[rows.train :])
             with dr.suspend_grad():
-                predicted = getattr(module, kind.generator).spectra(asked)
-            return float(np.median(ssim(predicted, truth, count, *self.spectra.shape[1:]).numpy()))
+                predicted = getattr(module, self.generator).spectra(asked)
+            return float(np.median(ssim(predicted, truth, count, *rows.spectra.shape[1:]).numpy()))
 
-        rows = [np.arange(self.train)], [np.arange(len(self.spectra))], score if count else None
-        name = f"{kind.name} {self.receiver}"
-        return Network(name, module, loss, data, draw, *rows, SPECTRUM.label, SPECTRUM.higher_is_better)
+        samples = [np.arange(rows.train)], [np.arange(len(rows.spectra))], score if count else None
+        name = f"{self.name} {rows.receiver}"
+        return Network(name, module, loss, data, draw, *samples, SPECTRUM.label, SPECTRUM.higher_is_better)
 
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
+        """Train the networks of all receivers in turn.
 
-@dataclass(frozen=True)
-class SpectrumNetwork:
-    """A kind of network.
+        Raises:
+            InputError: unknown positions, or a receiver with fewer than two rows.
+        """
+        record, settings, seed = problem.record, problem.settings, problem.seed
+        coordinates = Coordinates.of(known_positions(record, split.all_train, self.name))
+        generators = []
+        for r, receiver in enumerate(record.receivers):
+            train, validation = received_rows(record, split, r, self.name)
+            known = np.concatenate([train, validation])
+            where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
+            rows = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
+            network = self.network(rows, settings, np.random.default_rng([seed, r]))
+            generators.append(getattr(train_network(network, settings, (seed, r), session)[0], self.generator))
+        height, width = record.observation.shape[-2:]
+        return FittedNetworks(self, settings, coordinates, generators, (height, width))
 
-    Attributes:
-        name: name of the method.
-        settings: class of its settings, which have ``octaves`` and ``scale_m``.
-        network: training of a network, from a receiver's rows, settings and a generator of random numbers.
-        make: generator of spectra from settings, a spectrum's height and width, and random numbers; its method
-            ``spectra`` makes greys [m * height * width], a flat array, from features of positions [features, m].
-        generator: attribute of the trained network that is such a generator; no other part is stored.
-        at_once: spectra that are predicted together, which bounds the memory.
-        source: publication.
-    """
-
-    name: str
-    settings: type
-    network: Callable[[ReceiverRows, Any, np.random.Generator], Network]
-    make: Callable[[Any, tuple[int, int], np.random.Generator], Any]
-    generator: str
-    at_once: int
-    source: str
-
-    def model(self) -> Model:
-        """Entry of the registry."""
-        how = partial(_fit, self), partial(_load, self), self.source
-        return Model(self.name, ("spectrum",), self.settings, *how, uplink="optional", headings=True)
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
+        """The networks that `FittedNetworks.arrays` described."""
+        settings: Any = stored_settings(self.settings, arrays, self.name)
+        height, width = (int(side) for side in arrays["shape"])
+        initial = self.generator_class(settings, (height, width), np.random.default_rng(0))
+        prefixes = (f"receiver{r}/{self.generator}." for r in range(len(problem.record.receivers)))
+        generators = [initial.on_device(under(prefix, arrays)) for prefix in prefixes]
+        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        return FittedNetworks(self, settings, coordinates, generators, (height, width))
 
 
 @dataclass(frozen=True)
 class FittedNetworks(Fitted):
     """Fitted networks: a generator for each receiver, of spectra of ``shape`` (height, width)."""
 
-    kind: SpectrumNetwork
+    model: SpectrumNetwork
     settings: Any
     coordinates: Coordinates
     generators: list[Any]
@@ -111,43 +120,16 @@ class FittedNetworks(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], float32."""
         s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
-        for first in range(0, len(inputs), self.kind.at_once):
-            part = slice(first, first + self.kind.at_once)
+        for part in slices(len(inputs), self.model.at_once):
             where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
             with dr.suspend_grad():
                 out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
         return Prediction(out)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> Arrays:
         """Settings, frame and weights."""
         arrays = {"settings": settings_array(self.settings), "shape": np.asarray(self.shape)}
         arrays |= field_arrays(self.coordinates, "frame/")
         for r, generator in enumerate(self.generators):
-            arrays |= keyed(f"receiver{r}/{self.kind.generator}.", generator.arrays())
+            arrays |= keyed(f"receiver{r}/{self.model.generator}.", generator.arrays())
         return arrays
-
-
-def _fit(kind: SpectrumNetwork, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
-    record, settings, seed = problem.record, problem.settings, problem.seed
-    coordinates = Coordinates.of(known_positions(record, split.all_train, kind.name))
-    generators = []
-    for r, receiver in enumerate(record.receivers):
-        train, validation = received_rows(record, split, r, kind.name)
-        known = np.concatenate([train, validation])
-        where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
-        rows = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
-        network = kind.network(rows, settings, np.random.default_rng([seed, r]))
-        generators.append(getattr(train_network(network, settings, (seed, r), session)[0], kind.generator))
-    height, width = record.observation.shape[-2:]
-    return FittedNetworks(kind, settings, coordinates, generators, (height, width))
-
-
-def _load(kind: SpectrumNetwork, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
-    settings: Any = stored_settings(kind.settings, arrays, kind.name)
-    height, width = (int(side) for side in arrays["shape"])
-    made = kind.make(settings, (height, width), np.random.default_rng(0))
-    generators = [
-        made.on_device(under(f"receiver{r}/{kind.generator}.", arrays)) for r in range(len(problem.record.receivers))
-    ]
-    coordinates = from_field_arrays(Coordinates, arrays, "frame/")
-    return FittedNetworks(kind, settings, coordinates, generators, (height, width))

@@ -29,10 +29,8 @@ from ...training.state import FitState
 from ..model import keyed, under
 from .layers import Module
 
-HOLD_OUT = 0.8
-"""Share of the steps with a constant rate and validation rows kept out of training."""
-FINISHED = "finished/"
-"""Prefix in ``checkpoint.npz`` of the arrays of networks whose training has ended."""
+HOLD_OUT = 0.8  # share of the steps with a constant rate and validation rows kept out of training
+FINISHED = "finished/"  # prefix in ``checkpoint.npz`` of the arrays of networks whose training has ended
 
 
 def network_adam(rate: float = 1e-3) -> AdamConfig:
@@ -56,36 +54,24 @@ class NetworkSettings(LoopConfig):
 
 @dataclass(frozen=True)
 class Network:
-    """A network with its loss, data and score.
+    """A network with its loss, data and score."""
 
-    Attributes:
-        name: name for progress and checkpoint.
-        module: network with its initial weights.
-        loss: ``loss(module, data, given)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`).
-        data: Dr.Jit arrays that the loss needs in every step.
-        draw: ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in
-            ``train`` and a generator of random numbers.
-        train: samples of each receiver that train while others validate.
-        everything: all samples of each receiver.
-        score: score of a module on the validation rows; None: there are no such rows.
-        label: name of that score.
-        higher_is_better: whether a higher score is better.
-        rates: learning rates by path of a weight; `AdamConfig.network` for all others.
-        momentum: Adam's decay of the first moment.
-    """
-
-    name: str
-    module: Module
+    name: str  # name for progress and checkpoint
+    module: Module  # network with its initial weights
+    # ``loss(module, data, drawn)``, one Dr.Jit float. It must capture no array and read no value (`dr.freeze`)
     loss: Callable[[Any, Any, Any], Any]
-    data: Any
+    data: Any  # Dr.Jit arrays that the loss needs in every step
+    # ``draw(rows, receiver, rng)``: Dr.Jit arrays of a step, from its batch, the number of its receiver in ``train``
+    # and a generator of random numbers
     draw: Callable[[IntArray, int, np.random.Generator], Any]
-    train: Sequence[IntArray]
-    everything: Sequence[IntArray]
-    score: Callable[[Any], float] | None
+    train: Sequence[IntArray]  # samples of each receiver that train while others validate
+    everything: Sequence[IntArray]  # all samples of each receiver
+    score: Callable[[Any], float] | None  # score of a module on the validation rows; None: there are no such rows
     label: str
     higher_is_better: bool = False
+    # Learning rates by path of a weight; `AdamConfig.network` for all others
     rates: Mapping[str, float] = field(default_factory=dict)
-    momentum: float = 0.9
+    momentum: float = 0.9  # Adam's decay of the first moment
 
 
 class NetworkTrainer(TrainingLoop):
@@ -112,12 +98,13 @@ class NetworkTrainer(TrainingLoop):
         rates, module = {name: special.get(name, rate) for name in self.state.adam}, self.network.module
 
         def step(
-            adam: Adam, mean: Params, data: Any, given: Any, factor: Any, decay: Any, t: Any, report: NonFiniteReport
+            adam: Adam, mean: Params, data: Any, drawn: Any, clock: Any, report: NonFiniteReport
         ) -> tuple[Params, NonFiniteReport, Any]:
+            factor, decay, t = clock
             params = rated_params(adam, rates, factor)
-            loss = loss_of(module.with_state(params), data, given)
+            loss = loss_of(module.with_state(params), data, drawn)
             mean, report, _ = guarded_step(adam, params, loss, mean, decay, t, report)
-            loss = dr.detach(loss)
+            loss = dr.detach(loss)  # the graph behind it would keep the step's arrays alive
             dr.eval(adam, mean, report, loss)
             return mean, report, loss
 
@@ -128,14 +115,15 @@ class NetworkTrainer(TrainingLoop):
         state, schedule, t = self.state, self.schedule, self.state.step
         # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
+        # Opaque, so that the recorded kernels take them as arguments instead of being compiled for each value.
+        factor, decay = (dr.opaque(mi.Float, float(values[t])) for values in (schedule.factor, schedule.decay))
+        clock = factor, decay, dr.opaque(mi.UInt32, t + 1)
         state.mean, trouble, loss = self._step(
             state.adam,
             state.mean,
             self.network.data,
             self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
-            dr.opaque(mi.Float, float(schedule.factor[t])),
-            dr.opaque(mi.Float, float(schedule.decay[t])),
-            dr.opaque(mi.UInt32, t + 1),
+            clock,
             trouble,
         )
         return loss, trouble
@@ -166,6 +154,7 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
         return network.module.on_device(under(f"{finished}/mean/", stored)), float(stored[f"{finished}/score"])
     beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
     beside["network"] = np.asarray(network.name)
+    # A checkpoint of another network of this fit says which have finished, and nothing of this one.
     begun = "network" in stored and str(stored["network"]) == network.name
     if begun:
         network.module.check(under("param/", stored))
@@ -190,4 +179,4 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
 
 def opaque_rows(rows: IntArray) -> Any:
     """Indices as an evaluated Dr.Jit array."""
-    return mi.UInt32(np.asarray(rows).tolist())
+    return mi.UInt32(np.asarray(rows).tolist())  # of a list: an array that wraps NumPy's memory is read beyond its end

@@ -13,21 +13,29 @@ output representation using deep conditional generative models" (2015). Chosen h
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.device import to_tensor
-from ...core.settings import Count, Positive, Share
+from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...gaussians.parameters import logistic
 from .layers import Linear, Mlp, Module, columns, feature_count
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, opaque_rows
+
+POOL = 6  # largest side of the blocks of pixels whose means the encoder sees
+NOISE = 0.1  # standard deviation of the likelihood, in grey levels from 0 to 1
+BETA = 3e-2  # weight of the divergence against the mean over pixels, which are far from independent (Higgins et al.)
+PRIOR_SHARE = (
+    0.8  # share of the reconstruction whose z is drawn from the prior, so that it learns the position's effect
+)
 
 
 @dataclass(frozen=True)
@@ -38,34 +46,25 @@ class VaeSettings(NetworkSettings):
         latent: size of z.
         width: neurons of the hidden layers.
         last: neurons of the decoder's second hidden layer, which precedes the pixels: most weights lie behind it.
-        pool: largest side of the blocks of pixels whose means the encoder sees.
         octaves: octaves of the position's encoding.
         scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
-        noise: standard deviation of the likelihood, in grey levels from 0 to 1.
-        beta: weight of the Kullback-Leibler divergence against the mean over pixels.
-        prior_share: share of the reconstruction whose z is drawn from the prior.
     """
 
     steps: int = 3750
     batch: int = 16
     validate_every: int = 375
+    FIXED: ClassVar[Mapping[str, float]] = {"pool": POOL, "noise": NOISE, "beta": BETA, "prior_share": PRIOR_SHARE}
     latent: Count = 16
     width: Count = 256
     last: Count = 64
-    pool: Count = 6
     octaves: int = 4
     scale_m: Positive = 1.0
-    noise: Positive = 0.1
-    beta: float = 3e-2
-    prior_share: Share = 0.8
 
 
 def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:
-    """Means over square blocks of pixels, [n, cells], whose side is the largest up to ``pool`` that divides both sides.
+    """Means of spectra [n, height, width] over square blocks of pixels, [n, cells].
 
-    Args:
-        spectra: [n, height, width].
-        pool: largest side.
+    The blocks' side is the largest up to ``pool`` that divides both sides.
     """
     n, height, width = spectra.shape
     side = max(s for s in range(1, pool + 1) if height % s == 0 and width % s == 0)
@@ -101,54 +100,50 @@ def normal_divergence(mean: Any, log_variance: Any) -> Any:
     return 0.5 * dr.sum(mean * mean + dr.exp(log_variance) - 1 - log_variance, axis=None)
 
 
-def elbo_loss(vae: Vae, data: Any, given: Any, s: VaeSettings) -> Any:
-    """Negative evidence lower bound a pixel, mixed with the likelihood under the prior.
+def elbo_loss(vae: Vae, data: Any, drawn: Any, latents: int) -> Any:
+    """Negative evidence lower bound a pixel, mixed with the likelihood under the prior, for z of ``latents`` numbers.
 
-    Args:
-        vae: network.
-        data: ``cells`` [cells, n], ``where`` [features, n] and ``pixels`` [pixels, n] of all rows.
-        given: ``rows`` [batch] and two draws of a normal distribution, ``noise`` and ``prior`` [latent, batch].
-        s: settings.
+    ``data`` has ``cells`` [cells, n], ``where`` [features, n] and ``pixels`` [pixels, n] of all rows; ``drawn`` has
+    ``rows`` [batch] and two draws of a normal distribution, ``noise`` and ``prior`` [latents, batch].
     """
-    cells, where, truth = (columns(data[name], given["rows"]) for name in ("cells", "where", "pixels"))
+    cells, where, truth = (columns(data[name], drawn["rows"]) for name in ("cells", "where", "pixels"))
     out = vae.q(image=cells, position=where)
-    mean, log_variance = out[: s.latent, :], out[s.latent :, :]
-    latent = mean + dr.exp(0.5 * log_variance) * given["noise"]
+    mean, log_variance = out[:latents, :], out[latents:, :]
+    latent = mean + dr.exp(0.5 * log_variance) * drawn["noise"]  # reparametrised: gradients reach mean and variance
     divergence = normal_divergence(mean, log_variance)
     # One product for both, since the decoder's last matrix is the large one.
-    latent, both = dr.concat([latent, given["prior"]], axis=1), dr.concat([where, where], axis=1)
+    latent, both = dr.concat([latent, drawn["prior"]], axis=1), dr.concat([where, where], axis=1)
     greys, batch = logistic(vae.p(latent=latent, position=both)), mean.shape[1]
     error = dr.mean(dr.square(greys[:, :batch] - truth), axis=None)
     free = dr.mean(dr.square(greys[:, batch:] - truth), axis=None)
-    likelihood = ((1 - s.prior_share) * error + s.prior_share * free) / (2 * s.noise * s.noise)
-    return (likelihood + (s.beta / batch) * divergence).array
+    # -log p of a Gaussian likelihood, by z of the encoder and of the prior (Sohn et al.'s hybrid objective).
+    likelihood = ((1 - PRIOR_SHARE) * error + PRIOR_SHARE * free) / (2 * NOISE * NOISE)
+    return (likelihood + (BETA / batch) * divergence).array
 
 
-def network(rows: ReceiverRows, s: VaeSettings, rng: np.random.Generator) -> Network:
-    """Encoder and decoder of a receiver, to be trained."""
-    cells, flat = pooled(rows.spectra, s.pool), rows.spectra.reshape(len(rows.spectra), -1)
-    data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
-    dr.make_opaque(data)
-    vae = Vae(s, cells.shape[1], rows.spectra.shape[1:], rng)
-    # The decoder starts at the mean spectrum of the rows that it may learn from.
-    mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
-    assert vae.p.out is not None
-    vae.p.out.bias = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
+class VaeModel(SpectrumNetwork):
+    """A variational autoencoder for each receiver."""
 
-    def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        noise, prior = rng.standard_normal((2, s.latent, len(chosen)))
-        return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+    name, settings, summary = "vae", VaeSettings, "variational autoencoder"
+    source = "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)"
+    generator_class, generator, at_once = Decoder, "p", 64
 
-    return rows.network(KIND, vae, partial(elbo_loss, s=s), data, draw)
+    def network(self, rows: ReceiverRows, settings: VaeSettings, rng: np.random.Generator) -> Network:
+        """Encoder and decoder of a receiver, to be trained."""
+        cells, flat = pooled(rows.spectra, POOL), rows.spectra.reshape(len(rows.spectra), -1)
+        data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}
+        dr.make_opaque(data)
+        vae = Vae(settings, cells.shape[1], rows.spectra.shape[1:], rng)
+        # The decoder starts at the mean spectrum of the rows that it may learn from.
+        mean = np.clip(flat[: rows.train].mean(axis=0, dtype=np.float64), 0.01, 0.99)
+        assert vae.p.out is not None
+        vae.p.out.bias = np.log(mean / (1 - mean)).astype(np.float32)[:, None]
+
+        def draw(chosen: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            noise, prior = rng.standard_normal((2, settings.latent, len(chosen)))
+            return {"rows": opaque_rows(chosen), "noise": to_tensor(noise), "prior": to_tensor(prior)}
+
+        return self.trained_on(rows, vae, partial(elbo_loss, latents=settings.latent), data, draw)
 
 
-KIND = SpectrumNetwork(
-    "vae",
-    VaeSettings,
-    network,
-    Decoder,
-    "p",
-    64,
-    "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)",
-)
-MODEL = KIND.model()
+MODEL = VaeModel()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import received_rows
+from ..model import Model, received_rows
 
 FLAT = 0.01
 """Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
@@ -20,21 +20,14 @@ wave's direction along that axis."""
 
 @dataclass(frozen=True)
 class Bands:
-    """Two bands and the array that observes them.
+    """Two bands and the array that observes them."""
 
-    Attributes:
-        uplink_hz: frequency of each uplink subcarrier [f].
-        downlink_hz: frequency of each downlink subcarrier [g].
-        antennas: number of antennas.
-        known: whether the frequencies come with the data.
-        elements_m: positions of the antennas about the centre of the array, along its q principal axes [antennas, q],
-            metres; None: unknown.
-    """
-
-    uplink_hz: FloatArray
-    downlink_hz: FloatArray
+    uplink_hz: FloatArray  # frequency of each uplink subcarrier [f]
+    downlink_hz: FloatArray  # frequency of each downlink subcarrier [g]
     antennas: int
-    known: bool
+    known: bool  # whether the frequencies come with the data
+    # Positions of the antennas about the centre of the array, along its q principal axes [antennas, q], metres; None:
+    # unknown
     elements_m: FloatArray | None = None
 
     @property
@@ -82,19 +75,25 @@ def principal_axes(elements_m: FloatArray) -> FloatArray:
     return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
 
 
-def known_rows(name: str, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-    """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
+class UplinkModel(Model):
+    """A model of the downlink from the uplink of an array."""
 
-    Raises:
-        InputError: several receivers, no axis of antennas, or fewer than two rows.
-    """
-    shape = record.observation.shape
-    if len(shape) != 4 or shape[0] != 1:
-        raise InputError(
-            f"{record.name}: channel coefficients {list(shape)}; {name} needs one receiver with the antennas "
-            "that the uplink has, [1, rows, antennas, subcarriers]"
-        )
-    return received_rows(record, split, 0, name)
+    tasks = ("csi",)
+    uplink, headings = "required", True
+
+    def known_rows(self, record: Record, split: Split) -> tuple[IntArray, IntArray]:
+        """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
+
+        Raises:
+            InputError: several receivers, no axis of antennas, or fewer than two rows.
+        """
+        shape = record.observation.shape
+        if len(shape) != 4 or shape[0] != 1:
+            raise InputError(
+                f"{record.name}: channel coefficients {list(shape)}; {self.name} needs one receiver with the antennas "
+                "that the uplink has, [1, rows, antennas, subcarriers]"
+            )
+        return received_rows(record, split, 0, self.name)
 
 
 def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:

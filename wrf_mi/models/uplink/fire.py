@@ -17,10 +17,10 @@ are divided by the uplink's scale and phase. Chosen here:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import drjit as dr
 import numpy as np
@@ -36,26 +36,26 @@ from ..model import (
     Arrays,
     Fitted,
     Inputs,
-    Model,
     Problem,
     field_arrays,
     from_field_arrays,
     keyed,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, bands_of, known_rows, relative_error
+from .csi_bands import Bands, UplinkModel, bands_of, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
-CHUNK_SIZE = 4096
-"""Samples that are predicted together: bounds the memory."""
+CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
 leaky = nn.LeakyReLU(0.1)
-WEAK = 0.3
-"""Share of the root mean square below which a sum over subcarriers has no reliable phase."""
+ROW_BATCH = 64  # rows of a step, at most, where a sample is a row
+BETA = 1e-4  # weight of the divergence against the relative squared error of a sample
+WEAK = 0.3  # share of the root mean square below which a sum over subcarriers has no reliable phase
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,8 @@ class FireSettings(NetworkSettings):
     Attributes:
         batch: antennas of a step, at most, where a sample is an antenna.
         sample: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows.
-        row_batch: rows of a step, at most, where a sample is a row.
         latent: number of latent variables.
         width: neurons of the hidden layers.
-        beta: weight of the Kullback-Leibler divergence against the mean squared error of a sample.
         spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
     """
 
@@ -76,10 +74,9 @@ class FireSettings(NetworkSettings):
     batch: int = 256
     validate_every: int = 500
     sample: Sample = "auto"
-    row_batch: Count = 64
+    FIXED: ClassVar[Mapping[str, float]] = {"row_batch": ROW_BATCH, "beta": BETA}
     latent: Count = 32
     width: Count = 256
-    beta: float = 1e-4
     spacing_hz: Positive = 312.5e3
 
 
@@ -132,21 +129,18 @@ class Fire(Module):
         self.p = Mlp(hidden, Linear(s.width, outputs, rng, gain=1.0), leaky)
 
 
-def fire_loss(fire: Fire, data: Any, given: Any, beta: float) -> Any:
+def fire_loss(fire: Fire, data: Any, drawn: Any) -> Any:
     """Relative squared error of the downlink and divergence of the latent distribution, means over the batch.
 
-    Args:
-        fire: network.
-        data: ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
-            the square of these units over the energy of their row.
-        given: ``rows`` [batch] and normal draws ``noise`` [latent, batch].
-        beta: weight of the divergence.
+    ``data`` has ``uplink`` and ``downlink`` [values, n] of all samples in units of their uplink, and ``weight`` [1, n],
+    the square of these units over the energy of their row; ``drawn`` has ``rows`` [batch] and normal draws ``noise``
+    [latent, batch].
     """
-    uplink, downlink, weight = (columns(data[name], given["rows"]) for name in ("uplink", "downlink", "weight"))
+    uplink, downlink, weight = (columns(data[name], drawn["rows"]) for name in ("uplink", "downlink", "weight"))
     mean, log_variance = fire.q(uplink)
-    latent = mean + dr.exp(0.5 * log_variance) * given["noise"]
+    latent = mean + dr.exp(0.5 * log_variance) * drawn["noise"]
     error = dr.sum(dr.square(fire.p(latent) - downlink) * weight, axis=None)
-    return ((error + beta * normal_divergence(mean, log_variance)) / mean.shape[1]).array
+    return ((error + BETA * normal_divergence(mean, log_variance)) / mean.shape[1]).array
 
 
 @dataclass(frozen=True)
@@ -177,27 +171,11 @@ def predict_samples(
     """Downlink [m, antennas of a sample, subcarriers] of uplink samples with their units."""
     scaled = parts(samples / unit[:, None, None])
     out = np.empty((len(samples), samples.shape[1] * subcarriers), complex)
-    for first in range(0, len(samples), CHUNK_SIZE):
-        some = slice(first, first + CHUNK_SIZE)
-        values = fire.p(fire.q(to_tensor(scaled[:, some]))[0]).numpy().T
+    for chunk in slices(len(samples), CHUNK_SIZE):
+        values = fire.p(fire.q(to_tensor(scaled[:, chunk]))[0]).numpy().T
         half = values.shape[1] // 2
-        out[some] = values[:, :half] + 1j * values[:, half:]
+        out[chunk] = values[:, :half] + 1j * values[:, half:]
     return out.reshape(len(samples), -1, subcarriers) * unit[:, None, None]
-
-
-def fit(problem: Problem, split: Split, session: FitSession) -> FittedFire:
-    """Fit a network, or two of which the better is kept."""
-    record, settings = problem.record, problem.settings
-    train, validation = known_rows(MODEL.name, record, split)
-    bands = bands_of(record, settings.spacing_hz)
-    kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
-    few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
-    unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
-    if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
-        kinds = ("antenna",)
-    fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
-    network, _, kind = max(fits, key=lambda fit: fit[1])
-    return FittedFire(kind, network, bands, settings)
 
 
 def _fit(
@@ -228,24 +206,45 @@ def _fit(
 
     def score(fire: Fire) -> float:
         predicted = predict_samples(fire, uplink[judges], unit[judges], downlink.shape[-1])
-        found, truth = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
-        return float(np.median(relative_error(found, truth)))
+        rows = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
+        return float(np.median(relative_error(*rows)))
 
     first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
     rows_of = draw, first, everything, score if len(validation) else None
-    network = Network(f"fire {sample}", fire, partial(fire_loss, beta=s.beta), data, *rows_of, "relative error")
-    config = s if sample == "antenna" else replace(s, batch=s.row_batch)
+    network = Network(f"fire {sample}", fire, fire_loss, data, *rows_of, "relative error")
+    config = s if sample == "antenna" else replace(s, batch=ROW_BATCH)
     return train_network(network, config, seeds, session)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
-    """The network that `FittedFire.arrays` described."""
-    settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
-    weights = under("network/", arrays)
-    sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
-    fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)
-    return FittedFire(str(arrays["sample"]), fire, bands, settings)
+class FireModel(UplinkModel):
+    """FIRE."""
+
+    name, settings = "fire", FireSettings
+    source = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
+    summary = "variational autoencoder from uplink to downlink"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedFire:
+        """Fit a network, or two of which the better is kept."""
+        record, settings = problem.record, problem.settings
+        train, validation = self.known_rows(record, split)
+        bands = bands_of(record, settings.spacing_hz)
+        kinds = ("antenna", "row") if settings.sample == "auto" else (settings.sample,)
+        # A network of whole rows has that many more weights, which fewer rows than coefficients do not determine.
+        few = len(train) + len(validation) <= bands.antennas * len(bands.uplink_hz)
+        unscored = not len(validation) or not settings.patience or not settings.holdout_steps_fraction
+        if settings.sample == "auto" and (few or unscored or bands.antennas == 1):
+            kinds = ("antenna",)
+        fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
+        network, _, kind = max(fits, key=lambda fit: fit[1])
+        return FittedFire(kind, network, bands, settings)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
+        """The network that `FittedFire.arrays` described."""
+        settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
+        weights = under("network/", arrays)
+        sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
+        fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)
+        return FittedFire(str(arrays["sample"]), fire, bands, settings)
 
 
-SOURCE = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
-MODEL = Model("fire", ("csi",), FireSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = FireModel()

@@ -27,15 +27,13 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays
-from .csi_bands import known_rows, relative_error
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
+from .csi_bands import UplinkModel, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
-JUDGES = 5
-"""Without validation rows, every so-many-th training row chooses the penalty."""
-CHUNK_SIZE = 256
-"""Rows whose products are added together: bounds the memory beside the data."""
+JUDGES = 5  # without validation rows, every so-many-th training row chooses the penalty
+CHUNK_SIZE = 256  # rows whose products are added together: bounds the memory beside the data
 
 
 @dataclass(frozen=True)
@@ -68,17 +66,11 @@ class LinearMap(Fitted):
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations: sums over rows and antennas of weighted products.
+    """Normal equations: sums over rows and antennas of weighted products."""
 
-    Attributes:
-        values: eigenvalues of the uplink's products x^H x, [f].
-        vectors: their eigenvectors, [f, f].
-        right: products of uplink and downlink, x^H y, [f, g].
-    """
-
-    values: NDArray[np.float64]
-    vectors: NDArray[np.complex128]
-    right: NDArray[np.complex128]
+    values: NDArray[np.float64]  # eigenvalues of the uplink's products x^H x, [f]
+    vectors: NDArray[np.complex128]  # their eigenvectors, [f, f]
+    right: NDArray[np.complex128]  # products of uplink and downlink, x^H y, [f, g]
 
     @classmethod
     def of(cls, record: Record, rows: IntArray) -> Normal:
@@ -90,9 +82,9 @@ class Normal:
         assert record.uplink is not None
         up, down = record.uplink.shape[2], record.observation.shape[3]
         left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
-        for first in range(0, len(rows), CHUNK_SIZE):
-            some = rows[first : first + CHUNK_SIZE]
-            x, y = record.uplink[some].astype(complex), record.observation[0, some].astype(complex)
+        for part in slices(len(rows), CHUNK_SIZE):
+            chunk = rows[part]
+            x, y = record.uplink[chunk].astype(complex), record.observation[0, chunk].astype(complex)
             energy = np.square(np.abs(y)).sum(axis=(1, 2))
             # A row without energy has no relative error.
             scale = np.where(energy > 0, 1 / np.sqrt(np.where(energy > 0, energy, 1)), 0)[:, None, None]
@@ -105,6 +97,7 @@ class Normal:
 
     def matrix(self, penalty: float) -> NDArray[np.complex128]:
         """The map [f, g] that solves them with a penalty in units of the mean eigenvalue."""
+        # Ridge regression by eigenvectors: each penalty costs one product. Rounding leaves values below 0.
         damped = np.maximum(self.values, 0) + penalty * self.values.mean()
         return np.asarray(self.vectors @ ((self.vectors.conj().T @ self.right) / damped[:, None]))
 
@@ -123,24 +116,29 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
     return PENALTIES[int(np.argmin(errors))]
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> LinearMap:
-    """Choose the penalty, then fit the map to all training rows."""
-    record, settings = problem.record, problem.settings
-    train, validation = known_rows(MODEL.name, record, split)
-    known = np.concatenate([train, validation])
-    if not len(validation):
-        picked = np.arange(len(train)) % JUDGES == 0
-        train, validation = train[~picked], train[picked]
-    penalty = settings.penalty or choose(record, train, validation, session.report)
-    matrix = Normal.of(record, known).matrix(penalty)
-    session.report(f"linear: penalty {penalty:.2g}", 1.0)
-    return LinearMap(matrix, record.observation.shape[2], penalty)
+class LinearModel(UplinkModel):
+    """The linear estimator."""
+
+    name, settings = "linear", LinearSettings
+    source = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
+    summary = "linear map from uplink to downlink"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> LinearMap:
+        """Choose the penalty, then fit the map to all training rows."""
+        record, settings = problem.record, problem.settings
+        train, validation = self.known_rows(record, split)
+        known = np.concatenate([train, validation])
+        if not len(validation):
+            picked = np.arange(len(train)) % JUDGES == 0
+            train, validation = train[~picked], train[picked]
+        penalty = settings.penalty or choose(record, train, validation, session.report)
+        matrix = Normal.of(record, known).matrix(penalty)
+        session.report(f"linear: penalty {penalty:.2g}", 1.0)
+        return LinearMap(matrix, record.observation.shape[2], penalty)
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
+        """The map that `LinearMap.arrays` described."""
+        return from_field_arrays(LinearMap, arrays)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
-    """The map that `LinearMap.arrays` described."""
-    return from_field_arrays(LinearMap, arrays)
-
-
-SOURCE = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
-MODEL = Model("linear", ("csi",), LinearSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = LinearModel()

@@ -17,9 +17,10 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -37,28 +38,25 @@ from ...training.session import FitSession
 from ..model import (
     Arrays,
     Inputs,
-    Model,
     Problem,
     field_arrays,
     from_field_arrays,
     keyed,
     settings_array,
+    slices,
     stored_settings,
     under,
 )
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
-from .csi_bands import Bands
+from .csi_bands import Bands, UplinkModel
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import ArrayWaves, Complex, Mask, Waves, waves_of
 
-FLOOR_DB = 30.0
-"""Range of maps, dB: 0 is this far below the strongest path, 1 the strongest path."""
-BLUR = 1.0
-"""Width of a path in the map to be learned, in cells."""
-CHUNK_SIZE = 256
-"""Maps that are made together: bounds the memory."""
+FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
+BLUR = 1.0  # width of a path in the map to be learned, in cells
+CHUNK_SIZE = 256  # maps that are made together: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,11 @@ class Simulation:
 def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
     """Matched filters of uplinks [n, antennas, f]: [n, distances, cells] in 0..1, logarithmic."""
     out = np.empty((len(h), len(waves.grid), len(waves.cosines)), np.float32)
-    for first in range(0, len(h), CHUNK_SIZE):
-        power = waves.power(h[first : first + CHUNK_SIZE])
+    for chunk in slices(len(h), CHUNK_SIZE):
+        power = waves.power(h[chunk])
         brightest = np.maximum(power.max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
         decibels = 10 * np.log10(np.maximum(power / brightest, 1e-9))
-        out[first : first + CHUNK_SIZE] = (1 + decibels / FLOOR_DB).clip(0, 1)
+        out[chunk] = (1 + decibels / FLOOR_DB).clip(0, 1)
     return out
 
 
@@ -97,11 +95,11 @@ def simulate(
     The number of paths, their directions, phases and powers in decibels are uniform; so are distances, or with
     spherical waves their logarithms.
     """
-    seen, truth = [], []
+    filtered, truth = [], []
     axes = waves.cosines.shape[1]
     near = max(float(waves.grid[0]), 0.0)
-    for first in range(0, simulation.channels, CHUNK_SIZE):
-        n, k = min(CHUNK_SIZE, simulation.channels - first), simulation.paths
+    for chunk in slices(simulation.channels, CHUNK_SIZE):
+        n, k = chunk.stop - chunk.start, simulation.paths
         present = np.arange(k) < rng.integers(1, k + 1, (n, 1))
         far = float(waves.grid[-1])
         d = near * (far / near) ** rng.random((n, k)) if waves.spherical else rng.uniform(near, far, (n, k))
@@ -122,9 +120,9 @@ def simulate(
         ratio = rng.uniform(*simulation.noise_db, (n, 1, 1))
         noise = np.sqrt(np.square(np.abs(h)).mean(axis=(1, 2), keepdims=True) * 10 ** (-ratio / 10) / 2)
         h += noise * (rng.standard_normal((*h.shape, 2)) @ np.array([1, 1j]))
-        seen.append(maps_of(waves, h))
+        filtered.append(maps_of(waves, h))
         truth.append(_target(waves, theta, level, present))
-    return np.concatenate(seen), np.concatenate(truth)
+    return np.concatenate(filtered), np.concatenate(truth)
 
 
 def _target(waves: Waves, theta: FloatArray, level_db: FloatArray, present: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -164,13 +162,14 @@ class PathMap(Module):
         """Up to ``count`` paths of each uplink: parameters [n, count, p] and which of them rise above ``threshold``."""
         waves = self.waves
         n, channels, cells = len(h), len(waves.grid), len(waves.cosines)
-        found = self(side_by_side(maps_of(waves, h)), to_uint(waves.around)).numpy()
-        found = found.reshape(channels, n, cells).transpose(1, 0, 2)
+        maps = self(side_by_side(maps_of(waves, h)), to_uint(waves.around)).numpy()
+        maps = maps.reshape(channels, n, cells).transpose(1, 0, 2)
+        # A peak is as high as all its neighbours in distance and direction; beyond the map there is nothing.
         padded = np.full((n, channels + 2, cells + 1), -np.inf, np.float32)
-        padded[:, 1:-1, :-1] = found
+        padded[:, 1:-1, :-1] = maps
         highest = padded[:, :, waves.around].max(axis=2)
         highest = np.maximum(np.maximum(highest[:, :-2], highest[:, 1:-1]), highest[:, 2:])
-        peaks = np.where((found >= highest) & (found > threshold), found, -np.inf).reshape(n, -1)
+        peaks = np.where((maps >= highest) & (maps > threshold), maps, -np.inf).reshape(n, -1)
         count = min(count, peaks.shape[1])
         best = np.argsort(-peaks, axis=1, kind="stable")[:, :count]
         at, direction = np.unravel_index(best, (channels, cells))
@@ -187,8 +186,8 @@ def _patches(x: Any, around: Any, cells: int) -> Any:
     channels, total = x.shape
     count = dr.width(around) // cells
     slot = dr.arange(mi.UInt32, count * channels * total)
-    column, rest = slot % total, slot // total
-    channel, number = rest % channels, rest // channels
+    column, line = slot % total, slot // total
+    channel, number = line % channels, line // channels
     neighbour = dr.gather(mi.UInt32, around, number * cells + column % cells)
     source = channel * total + (column // cells) * cells + neighbour
     return type(x)(dr.gather(type(x.array), x.array, source, neighbour < cells), (count * channels, total))
@@ -199,8 +198,9 @@ def side_by_side(maps: NDArray[np.float32]) -> Any:
     return to_tensor(maps.transpose(1, 0, 2).reshape(maps.shape[1], -1))
 
 
-MAX_VALIDATION = 100
-"""Most maps that validate."""
+AT_ONCE = 10  # most paths of a map
+THRESHOLD = 0.15  # least height of a peak in the network's map, whose range is 0 to 1: 4.5 dB above its floor
+MAX_VALIDATION = 100  # most maps that validate
 
 
 @dataclass(frozen=True)
@@ -211,8 +211,6 @@ class OptMLSettings(PathSettings, NetworkSettings):
         simulation: simulated channels to learn from.
         width: channels of the network.
         rounds: maps of the residual.
-        at_once: most paths of a map.
-        threshold: least height of a peak in the network's map, whose range is 0 to 1.
     """
 
     steps: int = 1875
@@ -222,8 +220,7 @@ class OptMLSettings(PathSettings, NetworkSettings):
     simulation: Simulation = field(default_factory=Simulation)
     width: Count = 48
     rounds: Count = 5
-    at_once: Count = 10
-    threshold: float = 0.15
+    FIXED: ClassVar[Mapping[str, float]] = {"at_once": AT_ONCE, "threshold": THRESHOLD}
     max_paths: Count = 40
     between: int = 3
     final: int = 5
@@ -248,11 +245,11 @@ class OptML(R2F2):
             return prune(waves, h[rows], theta[rows], present[rows], s.between, s.max_paths)
 
         for _ in range(s.rounds):
-            chunks = [residual[i : i + ROWS] for i in range(0, len(h), ROWS)]
-            proposals = [self.network.propose(chunk, s.at_once, s.threshold) for chunk in chunks]
-            fresh, found = (np.concatenate(part) for part in zip(*proposals, strict=True))
+            chunks = [residual[rows] for rows in slices(len(h), ROWS)]
+            proposals = [self.network.propose(chunk, AT_ONCE, THRESHOLD) for chunk in chunks]
+            fresh, is_peak = (np.concatenate(part) for part in zip(*proposals, strict=True))
             theta = waves.limit(np.concatenate([theta, fresh], axis=1))
-            present = np.concatenate([present, found], axis=1)
+            present = np.concatenate([present, is_peak], axis=1)
             theta, present, residual = (np.concatenate(p) for p in zip(*in_parts(pruned, len(h)), strict=True))
         return refine_paths(waves, h, theta, present, s.final)
 
@@ -274,64 +271,72 @@ def prune(
     count = h.shape[1] * h.shape[2]
     diagonal = np.arange(present.shape[1])
     loaded = solved.gram.copy()
-    loaded[:, diagonal, diagonal] += 1e-9 * count
+    loaded[:, diagonal, diagonal] += 1e-9 * count  # two equal paths: either is worth nothing beside the other
     inverse = np.linalg.inv(loaded)[:, diagonal, diagonal].real
     strength = np.square(np.abs(solved.gains)).reshape(*present.shape, -1).sum(axis=2)
     rise = strength / np.maximum(inverse, np.finfo(float).tiny)
     energy = np.maximum(solved.energy, np.finfo(float).tiny)[:, None]
+    # 2 N log of the energy's ratio against freedom log(2 N), as in the search of `find_paths`.
     worth = present & (2 * count * np.log1p(rise / energy) > waves.freedom * np.log(2 * count))
     order = np.argsort(-np.where(worth, rise, -1), axis=1, kind="stable")[:, :most]
-    kept = np.take_along_axis(worth, order, axis=1)
+    present = np.take_along_axis(worth, order, axis=1)
     theta = np.take_along_axis(theta, order[..., None], axis=1)
-    return theta, kept, waves.solve(theta, kept, h).residual
+    return theta, present, waves.solve(theta, present, h).residual
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> OptML:
-    """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
-    settings: OptMLSettings = problem.settings
-    kind, bands = choose(MODEL.name, problem.record, split, settings, session.report)
-    waves = waves_of(kind, bands, settings.max_distance_m)
-    session.report("simulating channels", 0.0)
-    rng = np.random.default_rng(problem.seed)
-    seen, truth = simulate(waves, settings.simulation, bands, rng)
-    channels, cells = seen.shape[1:]
-    judges = int(np.clip(len(seen) // 10, 1, MAX_VALIDATION))
-    around = to_uint(waves.around)
-    # One column a map, so that a batch is a choice of columns.
-    flat = {name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("seen", seen), ("truth", truth))}
-    data = flat | {"around": around}
-    dr.make_opaque(data)
+class OptMLModel(UplinkModel):
+    """OptML."""
 
-    def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-        return opaque_rows(rows)
+    name, settings = "optml", OptMLSettings
+    source = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
+    summary = "paths fitted to the uplink, started by a network"
 
-    def chosen(maps: Any, rows: Any) -> Any:
-        x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
-        return dr.reshape(x, (channels, dr.width(rows) * cells))
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> OptML:
+        """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
+        settings: OptMLSettings = problem.settings
+        kind, bands = choose(self.known_rows(problem.record, split), problem.record, settings, session.report)
+        waves = waves_of(kind, bands, settings.max_distance_m)
+        session.report("simulating channels", 0.0)
+        rng = np.random.default_rng(problem.seed)
+        filtered, truth = simulate(waves, settings.simulation, bands, rng)
+        channels, cells = filtered.shape[1:]
+        judges = int(np.clip(len(filtered) // 10, 1, MAX_VALIDATION))
+        around = to_uint(waves.around)
+        # One column a map, so that a batch is a choice of columns.
+        flat = {
+            name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("filtered", filtered), ("truth", truth))
+        }
+        data = flat | {"around": around}
+        dr.make_opaque(data)
 
-    def loss(network: PathMap, data: Any, rows: Any) -> Any:
-        x, y = chosen(data["seen"], rows), chosen(data["truth"], rows)
-        return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
+        def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
+            return opaque_rows(rows)
 
-    asked, wanted = side_by_side(seen[:judges]), side_by_side(truth[:judges]).numpy()
+        def chosen(maps: Any, rows: Any) -> Any:
+            x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
+            return dr.reshape(x, (channels, dr.width(rows) * cells))
 
-    def score(network: PathMap) -> float:
-        return float(np.square(network(asked, around).numpy() - wanted).mean())
+        def loss(network: PathMap, data: Any, rows: Any) -> Any:
+            x, y = chosen(data["filtered"], rows), chosen(data["truth"], rows)
+            return dr.mean(dr.square(network(x, data["around"]) - y), axis=None).array
 
-    rows = [np.arange(judges, len(seen))], [np.arange(len(seen))]
-    maps = Network("paths", PathMap(waves, settings.width, rng), loss, data, draw, *rows, score, "mean squared error")
-    network = train_network(maps, settings, (problem.seed,), session)[0]
-    return OptML(kind, bands, settings, network)
+        asked, wanted = side_by_side(filtered[:judges]), side_by_side(truth[:judges]).numpy()
+
+        def score(network: PathMap) -> float:
+            return float(np.square(network(asked, around).numpy() - wanted).mean())
+
+        rows = [np.arange(judges, len(filtered))], [np.arange(len(filtered))]
+        initial = PathMap(waves, settings.width, rng)
+        maps = Network("paths", initial, loss, data, draw, *rows, score, "mean squared error")
+        return OptML(kind, bands, settings, train_network(maps, settings, (problem.seed,), session)[0])
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> OptML:
+        """The model that `OptML.arrays` described."""
+        settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
+        bands = from_field_arrays(Bands, arrays)
+        waves = waves_of(kind, bands, settings.max_distance_m)
+        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
+        return OptML(kind, bands, settings, network)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> OptML:
-    """The model that `OptML.arrays` described."""
-    settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
-    bands = from_field_arrays(Bands, arrays)
-    waves = waves_of(kind, bands, settings.max_distance_m)
-    network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
-    return OptML(kind, bands, settings, network)
-
-
-SOURCE = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
-MODEL = Model("optml", ("csi",), OptMLSettings, fit, load, SOURCE, uplink="required", headings=True)
+MODEL = OptMLModel()

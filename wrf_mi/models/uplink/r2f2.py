@@ -35,25 +35,21 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count, Positive
+from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, field_arrays, from_field_arrays, keyed, under
-from .csi_bands import Bands, bands_of, known_rows, principal_axes, relative_error
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
+from .csi_bands import Bands, UplinkModel, bands_of, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Complex, Waves, waves_of
 
-CHUNK_SIZE = 256
-"""Positions that are traced together."""
+CHUNK_SIZE = 256  # positions that are traced together
 LENGTH_SD_M, COSINE_SD = 0.3, 0.03
 """Standard deviations of a path's length and its direction's cosines, by a mesh that is some centimetres off."""
-ALIKE_M, ALIKE_COSINE = 0.02, 0.01
-"""Paths that differ by less count as one."""
-FAINT = 10 ** (-50 / 20)
-"""Least amplitude of a path, as a share of the root mean square of all."""
-MOST = 70
-"""Most traced paths of a row, the strongest."""
-NEEDED = 1e-4
-"""Least power of a path in the uplink, as a share of the strongest path's."""
+ALIKE_M, ALIKE_COSINE = 0.02, 0.01  # paths that differ by less count as one
+FAINT = 10 ** (-50 / 20)  # least amplitude of a path, as a share of the root mean square of all
+MOST = 70  # most traced paths of a row, the strongest
+NEEDED = 1e-4  # least power of a path in the uplink, as a share of the strongest path's
 
 
 class ScenePaths:
@@ -92,6 +88,7 @@ class ScenePaths:
             solved = waves.solve(theta[part], present[part], h[part])
             return expected_gains(waves, h[part], present[part], solved)[1]
 
+        # The scene has more paths than matter: those that the uplink, too, gives power to.
         power = np.concatenate(in_parts(needed, len(h)))
         present &= power > NEEDED * power.max(axis=1, keepdims=True)
         order = np.argsort(~present, axis=1, kind="stable")[:, : max(1, int(present.sum(axis=1).max()))]
@@ -103,17 +100,17 @@ class ScenePaths:
         """Lengths and direction cosines [k, p] of each transmitter's paths, seen from the middle of the array."""
         from ...tracing.paths.traced_field import TracedField
 
-        for start in range(0, len(tx_pos_m), CHUNK_SIZE):
-            part = slice(start, start + CHUNK_SIZE)
+        for part in slices(len(tx_pos_m), CHUNK_SIZE):
             turned = None if heading_rad is None else heading_rad[part]
-            given = tx_pos_m[part], self._receiver, self._options, turned
             self._prepared.check(tx_pos_m[part], (self._receiver,))
-            traced = TracedField(self._scene, *given, prepared=self._prepared)
-            found = traced({})
-            shape = found.batch, found.each
-            amplitude = np.hypot(*(part.numpy() for part in found.gain)).reshape(shape)
-            arrival = np.stack([u.numpy() for u in found.arrival], axis=-1).reshape(*shape, 3)
-            source = arrival * found.length_m.numpy().reshape(*shape, 1) - self._centre
+            link = tx_pos_m[part], self._receiver, self._options, turned
+            traced = TracedField(self._scene, *link, prepared=self._prepared)
+            paths = traced({})
+            shape = paths.batch, paths.each
+            amplitude = np.hypot(*(component.numpy() for component in paths.gain)).reshape(shape)
+            arrival = np.stack([u.numpy() for u in paths.arrival], axis=-1).reshape(*shape, 3)
+            # The image source, from which a spherical wave has the length and direction of the path.
+            source = arrival * paths.length_m.numpy().reshape(*shape, 1) - self._centre
             length = np.linalg.norm(source, axis=-1, keepdims=True)
             every = np.concatenate([length, source / length @ self._axes.T], axis=-1)
             for strength, row in zip(amplitude * traced.exists.reshape(shape), every, strict=True):
@@ -124,19 +121,19 @@ def distinct(theta: FloatArray, strength: FloatArray) -> FloatArray:
     """The strongest different paths [k, p] among some with strengths [m], 0 for place holders."""
     order = np.argsort(-strength, kind="stable")
     least = FAINT * np.sqrt(np.square(strength).sum())
-    kept: list[int] = []
+    chosen: list[int] = []
     for place in order[strength[order] > least]:
-        apart = np.abs(theta[kept] - theta[place])
+        # Nearly equal paths would share a gain, which an uplink cannot divide between them.
+        apart = np.abs(theta[chosen] - theta[place])
         if not ((apart[:, 0] < ALIKE_M) & (apart[:, 1:] < ALIKE_COSINE).all(axis=1)).any():
-            kept.append(int(place))
-        if len(kept) == MOST:
+            chosen.append(int(place))
+        if len(chosen) == MOST:
             break
-    return theta[kept]
+    return theta[chosen]
 
 
 Kind = Literal["auto", "spherical", "plane", "free"]
-BOTH_GAPS = (1, 2)
-"""Spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown."""
+BOTH_GAPS = (1, 2)  # spacings between the last uplink and the first downlink subcarrier, where frequencies are unknown
 
 
 @dataclass(frozen=True)
@@ -166,17 +163,21 @@ class PathSettings(SpecularOptions, CheckedSettings):
 
 
 def choose(
-    name: str, record: Record, split: Split, settings: PathSettings, on_progress: OnProgress, directions: bool = False
+    rows: tuple[IntArray, IntArray],
+    record: Record,
+    settings: PathSettings,
+    on_progress: OnProgress,
+    directions: bool = False,
 ) -> tuple[str, Bands]:
     """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
 
-    The criterion is the median over rows and antennas. Without validation rows, training rows decide. ``directions``:
-    among the wave models whose paths have a direction.
+    The criterion is the median over rows and antennas. Of ``rows`` that train and that validate, the latter decide
+    where there are any. ``directions``: among the wave models whose paths have a direction.
 
     Raises:
-        InputError: as `bands_of` and `known_rows`, or a wave front that needs elements where there are none.
+        InputError: as `bands_of`, or a wave front that needs elements where there are none.
     """
-    train, validation = known_rows(name, record, split)
+    train, validation = rows
     first = bands_of(record, settings.spacing_hz)
     if directions and (first.elements_m is None or settings.wavefront == "free"):
         text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
@@ -196,7 +197,7 @@ def choose(
         for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
         for kind in kinds
     ]
-    if len(options) == 1:
+    if len(options) == 1:  # nothing to choose, and no row needs a downlink
         return options[0]
     judges = validation if len(validation) else train
     judges = judges[np.linspace(0, len(judges) - 1, min(settings.choice_rows, len(judges))).round().astype(int)]
@@ -222,8 +223,8 @@ class R2F2(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
         paths = self.paths(np.asarray(inputs.uplink, complex), inputs)
-        found = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
-        return Prediction(found.astype(np.complex64))
+        downlink = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
+        return Prediction(downlink.astype(np.complex64))
 
     def paths(self, h: Complex, inputs: Inputs) -> Paths:
         """Paths of uplinks [m, antennas, f] from the positions of ``inputs``."""
@@ -238,14 +239,6 @@ class R2F2(Fitted):
         return {"wavefront": np.array(self.kind)} | field_arrays(self.bands) | keyed("settings/", settings)
 
 
-def fit(problem: Problem, split: Split, session: FitSession) -> R2F2:
-    """Choose the wave model and, where frequencies are unknown, the bands."""
-    settings, record = problem.settings, problem.record
-    with_scene = problem.scene is not None
-    chosen = choose(MODEL.name, record, split, settings, session.report, with_scene)
-    return R2F2(*chosen, settings, _scene_paths(problem, settings))
-
-
 def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
     if problem.scene is None:
         return None
@@ -253,12 +246,25 @@ def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
     return ScenePaths(problem.opened_scene, record.receivers[0], record.tx_antenna, settings.options)
 
 
-def load(arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
-    """The model that `R2F2.arrays` described."""
-    settings = {name: value.item() for name, value in under("settings/", arrays).items()}
-    found = PathSettings(**settings)
-    return R2F2(str(arrays["wavefront"]), from_field_arrays(Bands, arrays), found, _scene_paths(problem, found))
+class R2F2Model(UplinkModel):
+    """R2F2, from the paths of a scene where there is one."""
+
+    name, settings = "r2f2", PathSettings
+    source = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
+    summary = "paths fitted to the uplink"
+    scene = "optional"
+
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> R2F2:
+        """Choose the wave model and, where frequencies are unknown, the bands."""
+        settings, rows = problem.settings, self.known_rows(problem.record, split)
+        kind, bands = choose(rows, problem.record, settings, session.report, directions=problem.scene is not None)
+        return R2F2(kind, bands, settings, _scene_paths(problem, settings))
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
+        """The model that `R2F2.arrays` described."""
+        settings = PathSettings(**{name: value.item() for name, value in under("settings/", arrays).items()})
+        bands = from_field_arrays(Bands, arrays)
+        return R2F2(str(arrays["wavefront"]), bands, settings, _scene_paths(problem, settings))
 
 
-SOURCE = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
-MODEL = Model("r2f2", ("csi",), PathSettings, fit, load, SOURCE, scene="optional", uplink="required", headings=True)
+MODEL = R2F2Model()

@@ -21,51 +21,35 @@ import numpy as np
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...parallel.threads import on_threads
+from ..model import slices
 from .uplink_waves import SINGULAR, Complex, Mask, Solved, Waves, products, strongest
 
 T = TypeVar("T")
 
-PASSES = 8
-"""Passes of `expected_gains`."""
+PASSES = 8  # passes of `expected_gains`
 
-ROWS = 16
-"""Rows refined together: more leave the processor's cache."""
-FIRST_STEPS = 4
-"""Steps of refinement of a new path before all are refined."""
-ACCURACY = 1e-26
-"""Share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums."""
-CONVERGED = 1e-9
-"""Relative fall of the residual's energy below which a refinement has converged."""
+ROWS = 16  # rows refined together: more leave the processor's cache
+FIRST_STEPS = 4  # steps of refinement of a new path before all are refined
+ACCURACY = 1e-26  # share of the energy at which a fit is perfect: the squared rounding of float64 times that of sums
+CONVERGED = 1e-9  # relative fall of the residual's energy below which a refinement has converged
 
 
 @dataclass
 class Paths:
-    """Paths of n rows.
+    """Paths of n rows."""
 
-    Attributes:
-        theta: parameters [n, k, p], see `Waves`.
-        present: whether a row has each of the k paths, [n, k].
-        gains: complex gains [n, k, antennas], or [n, k, 1] for all antennas.
-    """
-
-    theta: FloatArray
-    present: Mask
-    gains: Complex
+    theta: FloatArray  # parameters [n, k, p], see `Waves`
+    present: Mask  # whether a row has each of the k paths, [n, k]
+    gains: Complex  # complex gains [n, k, antennas], or [n, k, 1] for all antennas
 
 
 @dataclass
 class Start:
-    """Paths of n rows that are known before the search, such as those of a scene.
+    """Paths of n rows that are known before the search, such as those of a scene."""
 
-    Attributes:
-        theta: expected parameters [n, k, p], see `Waves`.
-        present: whether a row has each of the k paths, [n, k].
-        precision: inverse variances of the parameters [n, k, p]; 0: nothing is known.
-    """
-
-    theta: FloatArray
-    present: Mask
-    precision: FloatArray
+    theta: FloatArray  # expected parameters [n, k, p], see `Waves`
+    present: Mask  # whether a row has each of the k paths, [n, k]
+    precision: FloatArray  # inverse variances of the parameters [n, k, p]; 0: nothing is known
 
     @classmethod
     def none(cls, rows: int, parameters: int) -> Start:
@@ -104,7 +88,7 @@ def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, ste
 
 def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
     """Results of ``work(rows)`` for `ROWS` rows at a time, in order, on all processors that this process may use."""
-    return on_threads(work, [slice(start, start + ROWS) for start in range(0, count, ROWS)])
+    return on_threads(work, slices(count, ROWS))
 
 
 def join_paths(parts: list[Paths]) -> Paths:
@@ -146,12 +130,13 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, kn
         refined, solved = refine(waves, h[active], theta[active], trial, between, known[active])
         left = solved.energy
         floor = ACCURACY * energy[active]
+        # Bayesian information criterion (Schwarz, 1978), of noise whose power is unknown.
         gain = 2 * count * np.log(np.maximum(best[active], floor) / np.maximum(left, floor))
         better = gain > waves.freedom * np.log(2 * count)
-        kept = active[better]
-        theta[kept], present[kept, -1], best[kept] = refined[better], True, left[better]
-        residual[kept] = solved.residual[better]
-        active = kept[best[kept] > ACCURACY * energy[kept]]
+        improved = active[better]
+        theta[improved], present[improved, -1], best[improved] = refined[better], True, left[better]
+        residual[improved] = solved.residual[better]
+        active = improved[best[improved] > ACCURACY * energy[improved]]
         if not len(active):
             break
     return _finish(waves, h, theta, present, final, known)
@@ -177,14 +162,15 @@ def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> t
     right = products(solved.atoms, h)
     tiny = np.finfo(float).tiny
     noise = solved.energy / np.maximum(count - present.sum(axis=1) * waves.freedom / 2, 1)
-    whole = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
-    power = np.where(present, whole[:, None], 0.0)
+    mean_power = np.maximum(np.square(np.abs(h)).mean(axis=(1, 2)), tiny)
+    power = np.where(present, mean_power[:, None], 0.0)
     for _ in range(PASSES):
         ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
         loaded = solved.gram.copy()
         loaded[:, diagonal, diagonal] += ridge + SINGULAR * solved.atoms.shape[2]
         inverse = np.linalg.inv(loaded)
         gains = inverse @ right
+        # Expectation: the gains' posterior mean and variance; maximisation: a power of their expected square.
         variance = noise[:, None] * inverse[:, diagonal, diagonal].real
         mean = np.square(np.abs(gains)).reshape(*present.shape, -1).mean(axis=2)
         power = np.where(present, mean + np.maximum(variance, 0), 0.0)
@@ -205,8 +191,8 @@ def refine(
     noise = solved.energy / (h.shape[1] * h.shape[2])
     known = replace(known, precision=known.precision * noise[:, None, None])
     damping = np.full(len(h), 1e-3)
-    energy, whole = solved.energy + known.cost(theta), np.square(np.abs(h)).sum(axis=(1, 2))
-    active = np.flatnonzero(energy > ACCURACY * whole)
+    energy, total = solved.energy + known.cost(theta), np.square(np.abs(h)).sum(axis=(1, 2))
+    active = np.flatnonzero(energy > ACCURACY * total)
     for _ in range(steps):
         if not len(active):
             break
@@ -216,6 +202,7 @@ def refine(
         normal[:, diagonal, diagonal] += precision.reshape(len(active), -1)
         right = right + (precision * (known.theta[active] - theta[active])).reshape(len(active), -1)
         scale = np.maximum(normal[:, diagonal, diagonal], 0)
+        # An absent path has no derivatives: its diagonal must not vanish.
         scale = np.maximum(scale, 1e-12 * scale.max(axis=1, keepdims=True, initial=0) + np.finfo(float).tiny)
         normal[:, diagonal, diagonal] += damping[active, None] * scale
         # In units of the diagonal: distances and cosines differ by orders of magnitude.
@@ -226,12 +213,13 @@ def refine(
         left = tried.energy + known[active].cost(trial)
         better = left < energy[active]
         converged = better & (left > (1 - CONVERGED) * energy[active])
-        kept = active[better]
-        theta[kept] = trial[better]
-        for values, found in zip(vars(solved).values(), vars(tried).values(), strict=True):
-            values[kept] = found[better]
-        energy[kept] = left[better]
+        improved = active[better]
+        theta[improved] = trial[better]
+        for values, new_values in zip(vars(solved).values(), vars(tried).values(), strict=True):
+            values[improved] = new_values[better]
+        energy[improved] = left[better]
+        # Towards Gauss and Newton after a success, towards steepest descent after a failure (Marquardt, 1963).
         damping[active] = np.where(better, damping[active] / 5, damping[active] * 8).clip(1e-12, 1e6)
-        done = converged | (energy[active] <= ACCURACY * whole[active]) | (damping[active] >= 1e6)
+        done = converged | (energy[active] <= ACCURACY * total[active]) | (damping[active] >= 1e6)
         active = active[~done]
     return theta, solved

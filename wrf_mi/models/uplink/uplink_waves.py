@@ -26,31 +26,21 @@ from .csi_bands import Bands
 Complex = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-AXIS_POINTS = 64
-"""Most points of the first search along one axis of the array: larger arrays start from a coarser grid."""
-FINE = 4
-"""Grid points of the first search in one resolution cell of distance."""
+AXIS_POINTS = 64  # most points of the first search along one axis of the array: larger arrays start from a coarser grid
+FINE = 4  # grid points of the first search in one resolution cell of distance
 UNIFORM = 1e-9
 """Distance from a grid, in spacings, of uniform subcarriers: a phase below the rounding of a path of 100 m."""
-SINGULAR = 1e-12
-"""Added to normal matrices, of the power of one path: two equal paths then share their gain."""
+SINGULAR = 1e-12  # added to normal matrices, of the power of one path: two equal paths then share their gain
 
 
 @dataclass
 class Solved:
-    """Best gains for some paths.
+    """Best gains for some paths."""
 
-    Attributes:
-        gains: complex gains [n, paths, antennas], or [n, paths, 1] for all antennas.
-        residual: uplink minus the paths [n, antennas, f].
-        atoms: `Waves.unit` of the paths, 0 for absent ones.
-        gram: products of the atoms [n, paths, paths].
-    """
-
-    gains: Complex
-    residual: Complex
-    atoms: Complex
-    gram: Complex
+    gains: Complex  # complex gains [n, paths, antennas], or [n, paths, 1] for all antennas
+    residual: Complex  # uplink minus the paths [n, antennas, f]
+    atoms: Complex  # `Waves.unit` of the paths, 0 for absent ones
+    gram: Complex  # products of the atoms [n, paths, paths]
 
     @property
     def energy(self) -> FloatArray:
@@ -143,6 +133,7 @@ class Waves:
         tilt = solved.atoms * self.slope
         cross = solved.atoms.conj() @ tilt.transpose(0, 2, 1)
         products = tilt.conj() @ tilt.transpose(0, 2, 1)
+        # Kaufman's variable projection: derivatives of the atoms without their share in the span of the atoms.
         projected = products - cross.conj().transpose(0, 2, 1) @ _solve(solved.gram, cross, len(self.slope))
         shared = solved.gains.conj() @ solved.gains.transpose(0, 2, 1)
         right = (solved.gains.conj() * (tilt.conj() @ solved.residual.transpose(0, 2, 1))).sum(axis=-1)
@@ -179,7 +170,7 @@ class ArrayWaves(Waves):
             points.append(np.linspace(-1, 1, int(min(2 * np.ceil(half_cells) + 1, AXIS_POINTS))))
         where = np.array(list(np.ndindex(*(len(p) for p in points))), np.int64).reshape(-1, axes)
         cosines = np.stack([p[where[:, axis]] for axis, p in enumerate(points)], axis=-1) if axes else np.zeros((1, 0))
-        visible = np.square(cosines).sum(axis=1) <= 1.01
+        visible = np.square(cosines).sum(axis=1) <= 1.01  # directions of real angles, those of the grid's rim included
         self.cosines, self.lattice = cosines[visible], where[visible]
         if spherical:
             # Curvature changes with 1 / d near the array, delay with d far from it.
@@ -197,12 +188,14 @@ class ArrayWaves(Waves):
         """Distance, projections p . psi [n, k, a] and, of spherical waves, distances s from the elements."""
         d = theta[..., :1]
         along = theta[..., 1:] @ self.elements.T
+        # Not below a tenth of the distance: within the array the amplitude d / s would grow without bound.
         root = np.sqrt(np.maximum(d * d - 2 * d * along + self.square, (0.1 * d) ** 2)) if self.spherical else None
         return d, along, root
 
     def atoms(self, theta: FloatArray, frequencies_hz: FloatArray) -> Complex:
         """Coefficients of paths of unit gain, [n, k, antennas, frequencies]."""
         d, along, s = self._phase(theta)
+        # s - d by the difference of squares: for distant sources both have more digits in common than float64 has.
         excess = -along if s is None else (self.square - 2 * d * along) / (s + d)
         k = 2 * np.pi / speed_of_light
         carrier = _turn(k * self.reference_hz * excess)
@@ -211,12 +204,12 @@ class ArrayWaves(Waves):
         offset = frequencies_hz - self.reference_hz
         spacing = float(np.diff(np.sort(offset)).min()) if len(offset) > 1 else 1.0
         steps = (offset - offset.min()) / spacing
-        whole = steps.round()
+        grid_steps = steps.round()
         length = k * (d + excess)
-        if np.abs(steps - whole).max() > UNIFORM or whole.max() > AXIS_POINTS:
+        if np.abs(steps - grid_steps).max() > UNIFORM or grid_steps.max() > AXIS_POINTS:
             return np.asarray(carrier[..., None] * _turn(length[..., None] * offset))
         # Subcarriers on a grid, split into eights and ones: a third of the sines.
-        order = whole.astype(int)
+        order = grid_steps.astype(int)
         carrier *= _turn(length * offset.min())
         ones = _turn(length[..., None] * (spacing * np.arange(8)))
         eights = _turn(length[..., None] * (spacing * 8 * np.arange(order.max() // 8 + 1))) * carrier[..., None]
@@ -232,7 +225,7 @@ class ArrayWaves(Waves):
         if s is None:
             excess[:, :, 1:] = -self.elements.T
         else:
-            by_d = (d - along) / s
+            by_d = (d - along) / s  # ds / dd, and -(d / s) p = ds / dpsi, of s^2 = d^2 - 2 d p . psi + |p|^2
             excess[:, :, 0] = by_d - 1
             amplitude[:, :, 0] = 1 / d - by_d / s
             excess[:, :, 1:] = -(d / s)[:, :, None] * self.elements.T

@@ -1,0 +1,195 @@
+"""A fitted hybrid: weighted predictions of its parts and kriging of what the scene's side leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import InputError, Prediction, Split
+from ...core.angles import FloatArray
+from ...core.types import IntArray
+from ...tasks import task_of
+from ..held_out import RowDistance, predicted_rows
+from ..intervals import LEAST, Intervals, expected_size
+from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed
+from .mixture import Mixture
+from .parts import PATHS, TRACED, UPLINK_PARTS
+from .paths import by_stage
+from .residuals import Residuals
+from .scene_side import SceneSide
+
+NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
+STATED, PREDICTED = "stated", "predicted"
+"""Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
+
+
+class FittedHybrid(Fitted):
+    """A fitted hybrid.
+
+    Args:
+        problem: problem of the hybrid.
+        known: training rows that determine distances [n].
+        parts: fitted parts with a weight, by name.
+        mixture: weights of these parts, and, if there are ``residuals``, of the scene's side with them as the last.
+        residuals: what the scene's side leaves; None: it has no weight.
+        intervals: standard deviations; None: none are stated.
+        facts: further entries of ``metrics.json``.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        known: IntArray,
+        parts: Mapping[str, Fitted],
+        mixture: Mixture,
+        residuals: Residuals | None,
+        intervals: Intervals | None,
+        facts: dict[str, Any],
+    ) -> None:
+        self._problem, self._known, self._facts = problem, known, facts
+        self._distance = RowDistance(problem.record, known)
+        self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
+
+    @property
+    def _states_sizes(self) -> bool:
+        return bool(self._facts["sizes"] == STATED)
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
+        self._check(inputs)
+
+        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
+            if self._states_sizes:
+                return Decomposition(part.predict(inputs.rows(rows), receiver))
+            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
+
+        return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, by parts that save time without standard deviations."""
+        self._check(inputs)
+
+        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
+            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
+
+        return self._mixed(inputs.tx_pos_m, receiver, predicted, std=False).whole.mean
+
+    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
+        """Predictions of rows of the record; parts use what they have stored."""
+        record = self._problem.record
+
+        def stored(part: Fitted, places: IntArray) -> Decomposition:
+            return Decomposition(predicted_rows(part, record, rows[places], receiver))
+
+        return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """The prediction; what the scene's side and the others predict by themselves, NaN where they have no weight;
+        and the traced paths.
+        """
+        self._check(inputs)
+
+        def decomposed(part: Fitted, rows: IntArray) -> Decomposition:
+            return part.decompose(inputs.rows(rows), receiver, std and self._states_sizes)
+
+        return self._mixed(inputs.tx_pos_m, receiver, decomposed, std)
+
+    @property
+    def depends_on_heading(self) -> bool:
+        """Whether the predictions of a part depend on the heading of the transmitter."""
+        return any(part.depends_on_heading for part in self.parts.values())
+
+    def _check(self, inputs: Inputs) -> None:
+        needed = [name for name in self.parts if name.partition("-")[0] in UPLINK_PARTS]
+        if needed and inputs.uplink is None:
+            raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
+
+    def _mixed(
+        self,
+        tx_pos_m: FloatArray,
+        receiver: int,
+        predict: Callable[[Fitted, IntArray], Decomposition],
+        std: bool = True,
+    ) -> Decomposition:
+        """Weighted mean of the parts' ``predict(part, rows)`` and of the residuals, and both sides of it."""
+        if not np.isfinite(tx_pos_m).all():
+            raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
+        distance_m, observed = self._distance(tx_pos_m, receiver), self._problem.record.observation
+        shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
+        weights = self._weights(distance_m)
+        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
+        sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
+        paths, size = None, np.zeros((len(tx_pos_m), *shape))
+        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
+            # Residuals are about the scene's side, which is therefore a part of what they predict.
+            share = weight + residual_weight if name == PATHS else weight
+            rows = np.flatnonzero(share)
+            if not len(rows):
+                continue
+            by_part = predict(part, rows)
+            side = int(name in TRACED)
+            sides[side, rows] += _spread(share[rows], shape) * by_part.whole.mean
+            totals[side, rows] += share[rows]
+            if by_part.whole.std is not None:
+                size[rows] += _spread(share[rows], shape) * by_part.whole.std
+            if paths is None and by_part.paths is not None:
+                paths = by_part.paths.placed(rows, len(tx_pos_m))
+        mean = sides.sum(axis=0)
+        rows = np.flatnonzero(residual_weight)
+        if len(rows) and self.residuals is not None:
+            residual = self.residuals(tx_pos_m[rows], receiver, shape)
+            mean[rows] += _spread(residual_weight[rows], shape) * residual
+        if task_of(self._problem.record).image:
+            mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
+        prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
+        if not (totals[0].any() and totals[1].any()):
+            return Decomposition(prediction, paths=paths)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
+        return Decomposition(prediction, traced, learned, paths)
+
+    def _weights(self, distance_m: FloatArray) -> FloatArray:
+        """Weights of the parts and, as the last, of the residuals, [m, k]; 0 where a part is not worth its time."""
+        weights = self.mixture(distance_m)
+        weights = np.where(weights < NEGLIGIBLE, 0, weights)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def _with_intervals(self, mean: NDArray[Any], size: FloatArray, distance_m: FloatArray) -> Prediction:
+        """Means [m, ...] with calibrated standard deviations, from the mixed ones that the parts state, if they do."""
+        if self.intervals is None:
+            return Prediction(mean)
+        if self._states_sizes:
+            factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
+            return Prediction(mean, np.maximum(size * factor, LEAST))
+        return self.intervals(mean, expected_size(task_of(self._problem.record), Prediction(mean)), distance_m)
+
+    def arrays(self) -> Arrays:
+        """Weights, residuals, intervals, training rows, and the arrays of the parts."""
+        arrays: Arrays = {"known": self._known, "names": np.asarray(list(self.parts))}
+        arrays["facts"] = np.asarray(json.dumps(self._facts))
+        arrays |= field_arrays(self.mixture, "mixture/")
+        if self.intervals is not None:
+            arrays |= field_arrays(self.intervals, "intervals/")
+        if self.residuals is not None:
+            arrays |= keyed("residuals/", self.residuals.arrays())
+        for name, fitted in self.parts.items():
+            arrays |= keyed(f"{name}/", fitted.arrays())
+        return arrays
+
+    def by_stage(self, split: Split) -> dict[str, PredictAll]:
+        """Predictions of the stages up to each but the last."""
+        side, used = self.parts.get(PATHS), [report["stage"] for report in self._facts["stages"] if report["kept"]]
+        return by_stage(self._problem, split, side, used) if isinstance(side, SceneSide) and used else {}
+
+    def facts(self) -> dict[str, Any]:
+        """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
+        return self._facts
+
+
+def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Values [m] with an axis of length one for each of an observation."""
+    return values.reshape(-1, *[1] * len(shape))
