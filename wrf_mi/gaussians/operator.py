@@ -29,7 +29,7 @@ from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
 from .footprint import Footprints, depth_order, project
 from .parameters import Gaussians
-from .recurrence import SMALLEST_FACTOR, forward_step
+from .recurrence import forward_step
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -274,31 +274,3 @@ class PixelOperator(_Operator):
     def composed(self, factors: ArrayLike) -> Images:
         """The images [K, pixels] of signals S = C c, for factors C [n, K]."""
         return Images((self.weights @ np.asarray(factors, self.kind)).T, self.height, self.width)
-
-
-def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> NDArray[np.float64]:
-    """Sum over the plane's pixels of |change of R| on removal of one Gaussian, [n].
-
-    In the terms of `wrf_mi.gaussians.recurrence`: removal of Gaussian i takes away w_i T_i S_i, and scales the sum Q_i
-    behind it, which it hides, by 1 / b_i. With the weights B_i = w_i T_i of `pixel_weights`, the transmittance is
-    T_i = 1 - sum_{k < i} B_k (alpha blending) or 1 - sum_{k < i} B_k (1 - delta_k) (product blending).
-    """
-    weights = pixel_weights(gaussians, pose, plane)
-    gaussian, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)
-    delta = [np.array(part, float) for part in gaussians.attenuation or (np.zeros(gaussians.count),) * 2]
-    re, im = (np.array(part, float) for part in gaussians.signal)
-    sent, hidden = (weights.data * values[gaussian] for values in (re + 1j * im, 1 - delta[0] - 1j * delta[1]))
-
-    def before(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Sum over the entries before each in its pixel."""
-        total = np.concatenate([[0], np.cumsum(values)])
-        return total[:-1] - np.repeat(total[start], length)
-
-    # T_{i+1} = T_i - B_i (1 - delta_i), with delta = 0 under alpha blending: sums of the entries in front.
-    transmittance = 1 - before(hidden)
-    # b_i = 1 - B_i (1 - delta_i) / T_i; without Gaussian i, what it hides grows from Q_i to Q_i / b_i.
-    hides = np.divide(hidden, transmittance, out=np.zeros_like(hidden), where=transmittance != 0)
-    factor = 1 - hides
-    behind = np.repeat(weights @ (re + 1j * im), length) - before(sent) - sent
-    quotient = behind * np.conj(factor) / np.maximum(np.abs(factor), SMALLEST_FACTOR) ** 2
-    return np.asarray(np.bincount(gaussian, np.abs(sent - hides * quotient), gaussians.count), float)

@@ -29,7 +29,6 @@ from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
 from ...training.judging import HeldOutReports
 from ...training.loop import Progress
-from ...training.packed import PACKED, pack_params, unpack_params
 from ...training.predictor import Predictor
 from ...training.reach import Reach
 from ...training.state import FitState
@@ -113,7 +112,7 @@ class FittedField(Fitted):
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
         self._arrays, self._problem, self._store = arrays, problem, store
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
-        self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
+        self.params: Params = under(PARAM, arrays)
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
         used = problem.scene is None or "position" in self.params
         self.field = field_of(config, self.form) if used else None
@@ -165,14 +164,9 @@ class FittedField(Fitted):
 
     def without_gaussians(self) -> FittedField:
         """The same paths without the Gaussians beside them."""
-        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, PACKED, REACH))}
+        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, REACH))}
         params = {name: values for name, values in self.params.items() if name.startswith(TRACED_NAMES)}
         return FittedField(other | keyed(PARAM, params), self.config, self._problem, self._store)
-
-    def packed(self, params: Params, precision: str) -> Arrays:
-        """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
-        kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, PACKED))}
-        return kept | pack_params(params, precision)
 
 
 def _reach_arrays(reach: Reach | None) -> Arrays:
