@@ -112,7 +112,7 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "both": partial(direct.pixels, tx[0]),
         }
         if field.static_geometry:
-            predictor = Predictor(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
+            predictor = Predictor.of_field(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
             calls |= {"operator": partial(predictor, tx[:1]), f"operator, {BATCH}": partial(predictor, tx)}
         times = interleaved(calls, REPEATS, most_s=30)
         found[name] = {key: bootstrap(t / (BATCH if key.endswith(str(BATCH)) else 1)) for key, t in times.items()}

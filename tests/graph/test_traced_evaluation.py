@@ -176,7 +176,7 @@ def made_record(rows: int = 60) -> tuple[Record, Any]:
     values = field.init(start, rng)
     values |= {name: 4 * value for name, value in values.items() if name.startswith("deform.signal.")}
     tx, every = np.random.default_rng(1).uniform(-1, 1, (rows, 3)), np.arange(rows)
-    spectra = Predictor(field, values, RECEIVERS[:1], *SIZE)(tx)
+    spectra = Predictor.of_field(field, values, RECEIVERS[:1], *SIZE)(tx)
     spectra = np.minimum(spectra / spectra.max(), 1)[None]
     own = {"official": (every[:40], every[40:])}
     return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, **own), start

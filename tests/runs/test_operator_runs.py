@@ -20,6 +20,7 @@ from wrf_mi.gaussians import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaus
 from wrf_mi.gaussians.static_signals import recorded_signals, static_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
 from wrf_mi.training import static_operator as still
+from wrf_mi.training.evaluator import OperatorReports
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.static_operator import StaticOperator, read_weights
 
@@ -50,8 +51,8 @@ MODELS = ["wrf-gs", "factorised", "wrf-gs+ still"]
 @pytest.mark.parametrize("model", MODELS)
 def test_operator_predicts_as_splatting_does(model: str) -> None:
     field, params = made(model)
-    direct = Predictor(field, params, RECEIVERS, *SIZE)
-    by_operator = Predictor(field, params, RECEIVERS, *SIZE, operator=True)
+    direct = Predictor.of_field(field, params, RECEIVERS, *SIZE)
+    by_operator = Predictor.of_field(field, params, RECEIVERS, *SIZE, operator=True)
     for receiver in range(2):
         expected = direct(TX, receiver)
         assert np.abs(expected - expected[:1]).max() > 0.01
@@ -59,8 +60,8 @@ def test_operator_predicts_as_splatting_does(model: str) -> None:
     # Other parameters: everything is built anew.
     params["position"] = params["position"] + np.float32(0.2)
     for predictor in (direct, by_operator):
-        predictor.update({name: direct._params[name] * 1 for name in params})
-        predictor.update(Predictor(field, params, RECEIVERS, *SIZE)._params)
+        predictor.update({name: direct.evaluate.params[name] * 1 for name in params})
+        predictor.update(Predictor.of_field(field, params, RECEIVERS, *SIZE).evaluate.params)
     assert np.abs(direct(TX) - expected).max() > 0.01
     np.testing.assert_allclose(by_operator(TX), direct(TX), atol=GREYS)
 
@@ -68,9 +69,9 @@ def test_operator_predicts_as_splatting_does(model: str) -> None:
 def test_moving_geometry_is_splatted() -> None:
     """WRF-GS+ turns and stretches its Gaussians with the transmitter."""
     field, params = true_field("wrf-gs+")
-    asked = Predictor(field, params, RECEIVERS, *SIZE, operator=True)
-    np.testing.assert_array_equal(asked(TX), Predictor(field, params, RECEIVERS, *SIZE)(TX))
-    assert asked._still is None
+    asked = Predictor.of_field(field, params, RECEIVERS, *SIZE, operator=True)
+    np.testing.assert_array_equal(asked(TX), Predictor.of_field(field, params, RECEIVERS, *SIZE)(TX))
+    assert not isinstance(asked.evaluate, OperatorReports)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_changed_geometry_rebuilds_the_operator(what: str, tmp_path: Path) -> No
     field, params, receiver, size = CHANGES[what](field, params, RECEIVERS[0], SIZE)
     after = StaticOperator(field, params, [receiver], *size, tmp_path)
     assert after.key(0) != before.key(0)
-    expected = Predictor(field, params, [receiver], *size)(TX)
+    expected = Predictor.of_field(field, params, [receiver], *size)(TX)
     np.testing.assert_allclose(after(np.float32(TX), 0), expected, atol=GREYS)
     # Stored in place of the one before.
     count = params["position"].shape[1]
@@ -223,10 +224,10 @@ def test_operator_works_in_a_read_only_folder(tmp_path: Path) -> None:
 def test_too_large_operator_is_replaced_by_splatting(monkeypatch: pytest.MonkeyPatch) -> None:
     field, params = made("factorised")
     monkeypatch.setattr(still, "MOST_BYTES", 1000)
-    asked = Predictor(field, params, RECEIVERS[:1], *SIZE, operator=True)
+    asked = Predictor.of_field(field, params, RECEIVERS[:1], *SIZE, operator=True)
     with pytest.warns(UserWarning, match="operator: weights of 8 Gaussians take more than"):
         found = asked(TX)
-    np.testing.assert_array_equal(found, Predictor(field, params, RECEIVERS[:1], *SIZE)(TX))
+    np.testing.assert_array_equal(found, Predictor.of_field(field, params, RECEIVERS[:1], *SIZE)(TX))
     np.testing.assert_array_equal(asked(TX), found)  # and says so once
 
 

@@ -31,7 +31,7 @@ def read(values: Any, source: str = "config") -> TrainConfig:
 
 
 DEFAULTS = leaves(asdict(TrainConfig()))
-INSIDE = {"initial.opacity", "density.least_opacity", "density.reset_opacity"}
+INSIDE = {"initial.opacity"}
 """Shares that must be neither 0 nor 1: their logits are stored."""
 LARGEST = {
     "holdout_steps_fraction": 1.0,
@@ -203,8 +203,6 @@ def test_invalid_settings_are_refused(setting: str, message: str) -> None:
         "optimiser.ema_decay=1",
         "density.every=-1",
         "density.growth_fraction=2",
-        "density.least_opacity=0",
-        "density.reset_opacity=1",
     ],
 )
 def test_values_out_of_range(setting: str) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import yaml
@@ -101,10 +101,14 @@ def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) 
 def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}, setting {prefix[:-1] or 'top'}: expected a mapping, got {values!r}")
-    hints = typing.get_type_hints(kind)
+    hints = {
+        name: hint for name, hint in typing.get_type_hints(kind).items() if typing.get_origin(hint) is not ClassVar
+    }
     arguments = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
+        if (key, value) in getattr(kind, "CONSTANT", {}).items():
+            continue  # a setting of earlier versions in a run file, at the value that is a constant now
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")

@@ -61,7 +61,7 @@ alone, a part of any size costs as much as a few hundred positions."""
 
 
 @dataclass(frozen=True)
-class TracingSettings(LoopOptions, TraceOptions):
+class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its fields are made from others
     """Settings of tracing and calibration, and with ``calibration`` of the training loop.
 
     Attributes:

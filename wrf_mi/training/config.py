@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from numpy.typing import ArrayLike
 from pydantic import Field
@@ -136,10 +136,7 @@ class DensityConfig:
         growth_fraction: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a
             round.
         max_gaussians: largest number of Gaussians.
-        split_deg: size above which a growing Gaussian is split instead of cloned, degrees.
-        least_opacity: opacity below which a Gaussian is pruned (alpha blending).
         reset_every: rounds between two opacity resets; 0 turns them off.
-        reset_opacity: largest opacity after a reset.
     """
 
     every: int = 1000
@@ -147,10 +144,10 @@ class DensityConfig:
     stop: Share = 0.4
     growth_fraction: Share = 0.05
     max_gaussians: Count = 320
-    split_deg: Positive = 5.0
-    least_opacity: Inside = 0.005
     reset_every: int = 0
-    reset_opacity: Inside = 0.05
+
+    CONSTANT: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
+    """Constants of `wrf_mi.gaussians.density` that run files of earlier versions have as settings."""
 
 
 @dataclass(frozen=True)

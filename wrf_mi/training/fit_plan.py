@@ -11,10 +11,11 @@ from ..datasets.observations import check_observations
 from ..graph.graph import Field, Graph
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
+from ..tracing.paths.traced_field import TracedField
 from .config import TrainConfig
 from .fields import check_memory, field_of
-from .reach import hold_out_groups
 from .schedule import Schedule, density_rounds, plan
+from .selection import hold_out_groups
 from .targets import form_of, targets_of
 
 CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
@@ -78,6 +79,25 @@ class FitPlan:
         self.unjudged = self.in_groups and self.choosing is split
         self.schedule = self._planned()
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
+
+    @property
+    def chooses_stages(self) -> bool:
+        """Whether stages beside paths are chosen by groups of rows that are held out."""
+        return self.in_groups and self.graph.scene is not None
+
+    def traced(self) -> list[TracedField | None]:
+        """Traced side of the training rows at each port; None without a scene.
+
+        Raises:
+            InputError: a transmitter or receiver inside a solid.
+        """
+        record, rows, form = self.record, self.split.all_train, self.graph.form
+        self.graph.check(record.tx_pos_m)
+        headings = record.tx_heading_rad if form.headings else None
+        carriers = None if form.carriers_hz is None else record.carriers_hz
+        heading, carrier = (None if part is None else part[rows] for part in (headings, carriers))
+        receivers = range(len(record.receivers))
+        return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, heading, carrier)]
 
     def _stage_names(self) -> tuple[str, ...]:
         """Stages in their order: paths, Gaussians on surfaces, those of the field if there is one."""

@@ -7,29 +7,38 @@ that power. A mesh alone gives the surfaces that can scatter.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
+from ..backend.device import to_tensor
 from ..core import InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_gaussians
+from ..graph.graph import LEVEL, SHARE
 from ..scene.coordinates import require_near
 from ..scene.scan.points import read_points
 from ..tracing import open_scene, trace_paths
+from ..tracing.paths.traced_field import TracedField
 from ..tracing.search.surfaces import scene_surfaces
 from ..tracing.sionna.scenes import MESHES
 from .config import InitialConfig
+from .fit_plan import FitPlan
+from .step import Place, evaluated
 
 LEAST_SCALE_M = 0.02
 """Smallest starting scale, for a cluster of a single point."""
 LEAST_SHARE = 1e-3
 """Smallest starting power relative to the strongest cluster, so that weak Gaussians can grow."""
+LEVEL_ROWS = 64
+"""Observations of a receiver from which its starting level is estimated."""
 
 
 def gaussians_from_paths(
@@ -176,3 +185,48 @@ def initial_gaussians(
         distance_m = config.nearest_m, config.farthest_m
         start = random_gaussians(record.receivers, config.gaussians, rng, distance_m, config.size_deg, sphere=sphere)
     return replace(start, opacity=config.opacity, signal=config.signal)
+
+
+def starting_values(
+    plan: FitPlan, sides: Sequence[TracedField | None], places: Sequence[Place], initial: InitialGaussians | None
+) -> dict[str, NDArray[np.float32]]:
+    """Starting values of a fit: Gaussians, and gains and levels that match the observations on average.
+
+    Args:
+        plan: data and graph.
+        sides: traced side of each port.
+        places: places of the ports.
+        initial: Gaussians in place of those of the settings.
+    """
+    graph, config, targets = plan.graph, plan.config, plan.targets
+    rng = np.random.default_rng([config.seed, 0])
+    values: dict[str, NDArray[np.float32]] = {}
+    if graph.field is not None:
+        placed = replace(plan.record, receivers=graph.receivers)
+        start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
+        values = graph.field.init(start, rng)
+    values |= graph.parameters(sides) | graph.cover(sides)
+    gains: dict[str, list[NDArray[np.float32]]] = {}
+    for port, side in enumerate(sides):
+        if side is not None and side.gain_name in values and len(side):
+            observed = targets.truth[port // graph.carriers, plan.known[port]]
+            gains.setdefault(side.gain_name, []).append(graph.match_gain(port, side, observed))
+    values |= {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
+    if LEVEL in values:
+        ports = [plan.ports(receiver)[0] for receiver in range(len(plan.record.receivers))]
+        values[LEVEL][0] = [_level(plan, values, port, sides[port], places[port]) for port in ports]
+    return values
+
+
+def _level(
+    plan: FitPlan, values: Mapping[str, NDArray[np.float32]], port: int, side: TracedField | None, place: Place
+) -> float:
+    """Level at which Gaussians match a receiver's observations, or far below its paths' power, by one port."""
+    graph, targets = plan.graph, plan.targets
+    params = {name: to_tensor(value) for name, value in values.items()}
+    if side is not None:
+        return graph.power_level(side, params) + float(np.log(SHARE))
+    rows = targets.received(port, plan.known[port])[:LEVEL_ROWS]
+    reported = evaluated(graph.report(port, None), params, targets.condition[:, rows], place).numpy()
+    observed = targets.truth[port // graph.carriers, rows].astype(float)
+    return graph.models[port].missing_gain(reported.astype(float).reshape(observed.shape), observed)

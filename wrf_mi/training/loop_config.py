@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, make_dataclass
+from typing import Any, get_type_hints
 
 from ..core.settings import CheckedSettings, Count, Share, ShareBelow1
 
@@ -54,19 +55,19 @@ class LoopConfig(CheckedSettings):
     optimiser: AdamConfig = field(default_factory=AdamConfig)
 
 
-@dataclass(frozen=True)
-class LoopOptions:
-    """Settings of the loop (`LoopConfig`) of a model that may be trained; null: the default of the training."""
+_OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}
 
-    steps: int | None = None
-    batch: int | None = None
-    holdout_steps_fraction: float | None = None
-    patience: int | None = None
-    checkpoint_every: int | None = None
-    log_every: int | None = None
-    validate_every: int | None = None
 
-    def chosen(self) -> list[str]:
-        """Settings that are not null, as ``--set`` takes them."""
-        values = {field.name: getattr(self, field.name) for field in fields(LoopOptions)}
-        return [f"{name}={value}" for name, value in values.items() if value is not None]
+def _chosen(options: Any) -> list[str]:
+    """Settings that are not null, as ``--set`` takes them."""
+    values = {name: getattr(options, name) for name in _OPTIONAL}
+    return [f"{name}={value}" for name, value in values.items() if value is not None]
+
+
+LoopOptions: Any = make_dataclass(
+    "LoopOptions",
+    [(name, kind | None, None) for name, kind in _OPTIONAL.items()],
+    namespace={"chosen": _chosen},
+    frozen=True,
+)
+"""Base of settings of a model that may be trained: those of `LoopConfig`; null: the default of the training."""

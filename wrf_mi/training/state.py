@@ -43,7 +43,7 @@ class FitState:
         step: steps taken.
         view_gradient_norm: sum since the last round of density control of each Gaussian's directional gradient, [n].
         view_gradient_steps: steps in that sum.
-        reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
+        reach_m: reach of the Gaussians around training transmitters, metres (`Reach`); may be infinite.
         searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
         surface: whether Gaussians on surfaces are trained.
         phase_error: standard deviation of a reflection's phase in predictions, rad (`Graph.report`), once chosen.

@@ -22,15 +22,15 @@ from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
+from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
 from ...training.fields import check_params, field_of
 from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
-from ...training.judging import HeldOutReports
 from ...training.loop import Progress
 from ...training.predictor import Predictor
-from ...training.reach import Reach
+from ...training.stage_selection import HeldOutReports
 from ...training.state import FitState
 from ...training.trainer import Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
@@ -128,16 +128,8 @@ class FittedField(Fitted):
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
         graph.cover((), self.params)
-        common = self.field, self.params, self.receivers, *form.size
-        reach = _reach(self._arrays)
-        return Predictor(
-            *common,
-            operator=self._problem.operator,
-            store=self._store,
-            graph=graph,
-            reach=reach,
-            phase_error=float(self._arrays.get(PHASE_ERROR, 0.0)),
-        )
+        reach, phase_error = _reach(self._arrays), float(self._arrays.get(PHASE_ERROR, 0.0))
+        return Predictor(graph, self.params, self._problem.operator, self._store, reach, phase_error)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""

@@ -2,7 +2,7 @@
 
 Stages 1 to 5 (`wrf_mi.models.hybrid.paths`) predict from the scene, the last one interpolates: their residuals and the
 observations themselves, weighted by the distance to the nearest training row. One hold-out
-(`wrf_mi.models.held_out.hold_out`) chooses stages, weights and standard deviations (`wrf_mi.models.intervals`).
+(`wrf_mi.training.selection`) chooses stages, weights and standard deviations (`wrf_mi.training.by_distance`).
 
 parts/  in the run folder: files of the parts
 """
@@ -25,17 +25,19 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import task_of
-from .. import MODELS
-from ..held_out import (
-    HeldOut,
-    RowDistance,
-    fit_model,
-    held_out_predictions,
-    hold_out,
-    labelled,
-    predicted_rows,
+from ...training.by_distance import (
+    GAPS,
+    LEAST,
+    Intervals,
+    Mixture,
+    choose_weights,
+    constant,
+    expected_size,
+    fit_intervals,
 )
-from ..intervals import GAPS, LEAST, Intervals, expected_size, fit_intervals
+from ...training.selection import HeldOut, RowDistance, hold_out
+from .. import MODELS
+from ..held_out import fit_model, held_out_predictions, labelled, predicted_rows
 from ..model import (
     Arrays,
     Decomposition,
@@ -52,7 +54,6 @@ from ..model import (
     under,
 )
 from .contributions import by_stage
-from .mixture import Mixture, choose, constant
 from .parts import KRIGING, PATHS, TRACED, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
 from .residuals import Residuals
 from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
@@ -89,7 +90,7 @@ class FittedHybrid(Fitted):
         facts: dict[str, Any],
     ) -> None:
         self._problem, self._known, self._facts = problem, known, facts
-        self._distance = RowDistance(problem.record, known)
+        self._distance = RowDistance.of_rows(problem.record, known)
         self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -324,7 +325,7 @@ def _weights(
     def on_group(share: float) -> None:
         session.report("choosing weights", share)
 
-    form, mixture = choose(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
+    form, mixture = choose_weights(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
     mean = np.einsum("qk,kq...->q...", mixture(held.distance_m), means)
     stds = [one.std for one in predictions.values()]
     known = [std for std in stds if std is not None]

@@ -10,10 +10,11 @@ from ...core import Prediction, Split
 from ...core.settings import with_settings
 from ...tasks import task_of
 from ...training.config import TrainConfig, calibration_config, task_settings
+from ...training.selection import HeldOut
 from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..gaussian.model import check as check_graph
 from ..gaussian.model import fit as fit_graph
-from ..held_out import HeldOut, as_unseen
+from ..held_out import as_unseen
 from ..model import Arrays, Decomposition, Inputs, Problem, Session, settings_array, stored_settings
 from .scene_side import CALIBRATION, CORRECTED, FIELD, SURFACES, SceneSide, StageReport, corrected, in_scene, too_few
 

@@ -19,7 +19,7 @@ from drjit.opt import Adam
 from ...backend.recorded import Recorded
 from ...core import InputError
 from ...core.types import IntArray
-from ...training.adam import NonFiniteReport, Params, guarded_step, rated_params
+from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.loop import Progress, TrainingLoop
 from ...training.loop_config import AdamConfig, LoopConfig
@@ -112,11 +112,11 @@ class NetworkTrainer(TrainingLoop):
         rates, module = {name: special.get(name, rate) for name in self.state.adam}, self.network.module
 
         def step(
-            adam: Adam, mean: Params, data: Any, given: Any, factor: Any, decay: Any, t: Any, report: NonFiniteReport
+            adam: Adam, mean: Params, data: Any, given: Any, at: ScheduledStep
         ) -> tuple[Params, NonFiniteReport, Any]:
-            params = rated_params(adam, rates, factor)
+            params = rated_params(adam, rates, at.factor)
             loss = loss_of(module.with_state(params), data, given)
-            mean, report, _ = guarded_step(adam, params, loss, mean, decay, t, report)
+            mean, report, _ = guarded_step(adam, params, loss, mean, at)
             loss = dr.detach(loss)
             dr.eval(adam, mean, report, loss)
             return mean, report, loss
@@ -133,10 +133,7 @@ class NetworkTrainer(TrainingLoop):
             state.mean,
             self.network.data,
             self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
-            dr.opaque(mi.Float, float(schedule.factor[t])),
-            dr.opaque(mi.Float, float(schedule.decay[t])),
-            dr.opaque(mi.UInt32, t + 1),
-            trouble,
+            ScheduledStep.of(schedule, t, trouble),
         )
         return loss, trouble
 
