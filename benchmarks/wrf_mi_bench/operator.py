@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
-from wrf_mi.gaussians.operator import PixelOperator, pixel_weights
-from wrf_mi.gaussians.render import splat
-from wrf_mi.gaussians.static_signals import static_signals
+from wrf_mi.gaussians.blend import splat
+from wrf_mi.gaussians.operator import PixelOperator, pixel_weights, static_signals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.reports import SQUARED_MAGNITUDE_EPS
 from wrf_mi.synthetic.laboratory import RECEIVER

@@ -1,4 +1,4 @@
-"""Complex blending of footprints on the perception plane, and its hand-written derivative.
+"""Splatting: complex blending of footprints on the perception plane, and its hand-written derivative.
 
 The recurrence is that of `wrf_mi.gaussians.recurrence`; a lane of a vector register walks the list of its tile for a
 few pixels of one column. Under either rule a weight w_i T_i depends on geometry alone. Where transmitters share one
@@ -8,16 +8,17 @@ one Q: a further transmitter costs two products per pixel instead of a footprint
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from ..backend.device import quads
-from ..backend.vectors import Complex
-from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints
+from ..backend.vectors import Complex, Pose
+from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints, depth_order, project
+from .parameters import Gaussians
 from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
-from .tiles import LANE_ROWS, Plane, TileLists
+from .tiles import LANE_ROWS, Plane, TileLists, build_lists
 
 RECORD = 16
 """Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal."""
@@ -70,6 +71,8 @@ def along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
 
     All pixels of a lane share their azimuth (cosine, sine).
     """
+    # u = (cos e cos a, cos e sin a, sin e): x cos a + y sin a is common to the pixels of a column, which saves half of
+    # each pixel's products.
     cosine, sine = azimuth
     return [[dr.fma(x, cosine, y * sine), z] for x, y, z in (record[0:3], record[3:6], record[6:9])]
 
@@ -104,6 +107,7 @@ def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
 
 def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
     """Signals of a group for one Gaussian."""
+    # Packets of four floats hold two signals; an odd group leaves half a packet and reads its floats one by one.
     if group % 2:
         values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
     else:
@@ -139,6 +143,7 @@ def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = 
     """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
     index_type = type(lists.index)
     size = group_size(batch) if shared else 1
+    # Lanes of one group of transmitters follow each other, so that those of a register walk the same list.
     lane = dr.arange(index_type, batch // size * plane.lanes)
     inner, group = lane % plane.lanes, lane // plane.lanes
 
@@ -248,10 +253,12 @@ def _backward(
     size = group_size(batch) if shared else 1
     lanes = lanes_of(plane, lists, n, batch, shared)
     slopes, state = reverse_start(lanes.pixel, lanes.active, total, gradient)
+    # The targets of the loop's scatters exist before it: inside of a recorded loop nothing can be evaluated.
     out = dr.zeros(float_type, dr.width(table))
     out_signals = dr.zeros(float_type, dr.width(signals)) if shared else None
     dr.eval(out, out_signals, (slopes, state) if shared else None)
     copied = dr.width(table) + (dr.width(signals) if shared else 0) <= MOST_COPIED
+    # `Auto` sums into private copies of each thread, `Local` adds up within a register first and then in place.
     mode = dr.ReduceMode.Auto if copied else dr.ReduceMode.Local
     j = index_type(0)
     while j < lanes.end:
@@ -260,6 +267,7 @@ def _backward(
         record = read(table, i, fields if shared else fields + 2)
         sent = _read_signals(signals, slot, size) if shared else [tuple(record[fields:])]
         values, by_signal, is_seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
+        # Without a shared geometry a record ends with its signal, and one table takes all gradients.
         values, by_signal = (values, by_signal) if shared else (values + by_signal, [])
         for k in range(len(values)):
             dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, is_seen, mode=mode)
@@ -338,3 +346,26 @@ def blend(
     shared = batch > 1 and dr.width(footprints.radius) == n
     result: tuple[Any, Any] = dr.custom(_Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal)
     return result
+
+
+def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
+    """Received complex signal per direction for each transmitter of the batch.
+
+    Args:
+        gaussians: Gaussians of one field for ``batch`` transmitters.
+        pose: pose of the receiver.
+        plane: the receiver's perception plane, see `wrf_mi.gaussians.tiles.perception_plane`.
+
+    Returns:
+        Real and imaginary part, arrays [batch * height * width], row-major.
+    """
+    batch, signal = gaussians.batch, gaussians.signal
+    if not gaussians.count:
+        dark = type(gaussians.position[0])
+        return dr.zeros(dark, batch * plane.pixels), dr.zeros(dark, batch * plane.pixels)
+    # One geometry for all transmitters is projected once.
+    gaussians = replace(gaussians, batch=1) if gaussians.shared else gaussians.spread()
+    footprints = project(gaussians, pose)
+    order = depth_order(footprints.depth, gaussians.position)
+    lists = build_lists(footprints, order, plane, gaussians.batch)
+    return blend(footprints, signal, lists, plane, batch, gaussians.blending)

@@ -198,6 +198,8 @@ def check_entries(entries: int) -> int:
 
 def _meets_columns(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase, width: dr.ArrayBase) -> Any:
     """Whether a tile that begins at a column meets columns from ``first`` on, around the full circle."""
+    # Columns from the footprint's first one to the tile, counted forwards around the circle; a tile that begins before
+    # the seam and ends behind it meets footprints that start there.
     ahead = column - first
     ahead -= width * dr.floor(ahead / width)
     return (ahead <= span) | (ahead + (TILE_COLUMNS - 1) >= width)
@@ -211,6 +213,7 @@ def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> T
     index_type: Any = type(column)
     n = dr.width(column) // batch
     rows, row_of = np.unique(plane.tile_row.numpy(), return_inverse=True)
+    # A row of tiles at a time: most Gaussians meet few rows, and the tiles of a row share the list that is searched.
     parts, starts, total = [], [], 0
     for row in rows:
         hit = (boxes[0] <= float(row) + (TILE_ROWS - 1)) & (boxes[1] >= float(row))

@@ -60,6 +60,7 @@ def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[An
     if data is None:
         return mean
     observed, known = held.observed(record), data.knows(record.name, held.row)
+    # The scene was corrected by these rows, too: their errors are smaller than those of rows to be predicted.
     enlarged = observed + data.error_ratio * (mean - observed)
     if task_of(record).image:
         enlarged = np.maximum(enlarged, 0)
@@ -87,20 +88,20 @@ def held_out_predictions(
     Raises:
         InputError: rows that the model cannot be fitted to.
     """
-    record, kept = problem.record, session.folder / "held_out.npz"
-    if not kept.exists():
+    record, path = problem.record, session.folder / "held_out.npz"
+    if not path.exists():
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
-        found = [
+        predictions = [
             predicted_rows(fitted, record, held.row[held.receiver == receiver], place)
             for place, receiver in enumerate(numbers)
             if (held.receiver == receiver).any()
         ]
-        # Found receiver by receiver, while a fold may hold receivers out in any order.
+        # Predicted receiver by receiver, while a fold may hold receivers out in any order.
         order = np.argsort(np.argsort(held.receiver, kind="stable"), kind="stable")
-        arrays = {"mean": np.concatenate([one.mean for one in found])[order]}
-        if found[0].std is not None:
-            arrays["std"] = np.concatenate([one.stated_std for one in found])[order]
-        write_arrays(kept, arrays)
-    arrays = stored_arrays(kept)
+        arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
+        if predictions[0].std is not None:
+            arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
+        write_arrays(path, arrays)
+    arrays = stored_arrays(path)
     return Prediction(as_unseen(arrays["mean"], problem, held), arrays.get("std"))

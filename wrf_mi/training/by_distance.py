@@ -83,10 +83,11 @@ class Reach:
 
     def of_ports(self, carriers: int) -> Reach:
         """The reach by ports, as many for each receiver as there are carriers."""
-        return replace(self, known_m=tuple(known for known in self.known_m for _ in range(carriers)))
+        return replace(self, known_m=tuple(positions_m for positions_m in self.known_m for _ in range(carriers)))
 
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
+        # The longest reach is nearly 1 everywhere among held-out rows: beyond, nothing tells reaches apart.
         away = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]
         largest = float(np.max(np.concatenate(away), initial=0.0)) if away else 0.0
         return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
@@ -219,6 +220,7 @@ def choose_weights(
     for done, number in enumerate(folds):
         out = fold == number
         for name, form in forms.items():
+            # A single fold cannot be left out: forms are then scored on the rows that they are fitted to.
             mixture = form(score, distance_m, unit, every[~out] if len(folds) > 1 else every, count)
             scores[name][out] = score(mixture(distance_m[out]), every[out])
         on_fold((done + 1) / len(folds))
@@ -327,6 +329,7 @@ def fit_intervals(
 
     Source: Lei et al., "Distribution-free predictive inference for regression", 2018.
     """
+    # Half the width of a 90 % interval in standard deviations, of a real or a complex normal error.
     inside = COMPLEX_90 if np.iscomplexobj(observed) else REAL_90
     step = max(1, mean.size // MOST_ERRORS)
     sizes, error = (np.ravel(values)[::step] for values in (size, np.abs(mean - observed)))
@@ -338,9 +341,11 @@ def fit_intervals(
     floor = max(
         SMALLEST * float(np.median(error)), float(np.finfo(np.float32).eps * np.median(np.abs(observed))), LEAST
     )
+    # Groups by rows, not by values: the pixels of one image are no independent evidence.
     groups = max(1, len(np.unique(row)) // GROUP_ROWS)
     knots, std = _by_group(sizes, error, min(groups, SIZES), level)
     std = np.maximum(std / inside, floor)
+    # What the size leaves is a function of the distance: errors relative to the intervals so far.
     ratio = error / (inside * np.interp(sizes, knots, std))
     distances, factor = _by_group(distance, ratio, min(groups, DISTANCES), level)
     # Beyond the largest distance errors are those at it, never smaller than nearer ones.
@@ -355,6 +360,7 @@ def _by_group(by: FloatArray, values: FloatArray, count: int, level: float) -> t
     parts = np.array_split(np.argsort(by, kind="stable"), count)
     knots = np.array([np.median(by[part]) for part in parts])
     quantiles = np.array([np.quantile(values[part], level) for part in parts])
+    # Equal medians, as of strengths in whole decibels, are one knot: interpolation needs distinct ones.
     distinct, place = np.unique(knots, return_inverse=True)
     return distinct, np.array([quantiles[place == group].mean() for group in range(len(distinct))])
 

@@ -77,15 +77,14 @@ class NetworkConfig:
         terms: terms of a factorised field; 0: 32.
         static_geometry: WRF-GS+ moves only signals with the transmitter, not rotation and scale: the map from signals
             to the receiver is then the same for all transmitters.
-        phase_hz: carrier frequency of a phase of WRF-GS+'s signals by the distance of the transmitter's image (from
-            ``initial.paths``), else of the transmitter; 0: none.
     """
 
     width: int = 0
     layers: int = 0
     terms: int = 0
     static_geometry: bool = False
-    phase_hz: float = 0.0
+
+    CONSTANT: ClassVar[Mapping[str, float]] = {"phase_hz": 0.0}
 
 
 @dataclass(frozen=True)

@@ -11,31 +11,42 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from ..backend.device import to_float, to_tensor
 from ..backend.recorded import Recorded
 from ..core.angles import FloatArray
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.digest import content_digest
 from ..core.types import IntArray
+from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from ..gaussians.operator import Coefficients, Images, PixelOperator, pixel_weights, static_signals
 from ..gaussians.parameters import CHUNK_SIZE
-from ..graph.graph import Alone, Batch, Graph, Report
+from ..gaussians.tiles import perception_plane
+from ..graph.graph import Alone, Batch, Field, Graph, Report
 from ..graph.receivers import PIXEL
+from ..receivers.reports import SQUARED_MAGNITUDE_EPS
 from ..tracing.paths.traced_field import TracedField
+from ..version import __version__
 from .adam import Params
-from .static_operator import StaticOperator
-from .step import evaluated, places_of
+from .step import device_pose, evaluated, places_of
 
 TOGETHER = 16
 """Transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch."""
 TRACED_NUMBERS = 512
 """With paths, numbers in a batch of small observations."""
+FORMAT = 1
+"""Version of the file of an operator."""
+MOST_BYTES = 1 << 30
+"""Largest size of one receiver's weights; larger fields are evaluated directly."""
 
 
 @dataclass(frozen=True)
@@ -241,32 +252,97 @@ class TracedReports(_InBatches):
 class OperatorReports(Evaluator):
     """Magnitudes at each direction by the linear map from signals to pixels (`wrf_mi.gaussians.operator`).
 
+        operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
+
+    The file is a cache: its key is a digest of all that the weights depend on, including the package's version.
+
     Args:
         graph: Gaussians whose geometry and attenuation do not depend on the transmitter.
-        store: folder in which operators are stored; None: in memory only.
+        store: folder of the files; None: in memory only.
     """
 
     def __init__(self, graph: Graph, store: Path | None) -> None:
         super().__init__(graph)
-        self._store = store
-        self.operator: StaticOperator | None = None
+        self._store, self._field = store, cast(Field, graph.field)
+        self._ready: dict[int, Images | PixelOperator] = {}
+
+    @cached_property
+    def _arrays(self) -> dict[str, NDArray[np.float32]]:
+        return {name: dr.detach(values).numpy() for name, values in self.params.items()}
+
+    @cached_property
+    def _signals(self) -> tuple[NDArray[np.complex64] | None, Coefficients]:
+        return static_signals(self._field, self._arrays)
 
     def update(self, params: Params) -> None:
-        """Replace the parameters; the operator is built anew at the next prediction."""
+        """Replace the parameters; operators are built anew at the next prediction."""
         super().update(params)
-        self.operator = None
+        self._ready = {}
+        for derived in ("_arrays", "_signals"):
+            vars(self).pop(derived, None)
 
     def __call__(self, request: Request) -> NDArray[np.float32]:
         """Magnitudes [m, height, width].
 
         Raises:
-            MemoryError: the operator is too large.
+            MemoryError: weights of more than `MOST_BYTES`.
         """
-        if self.operator is None:
-            graph, params = self.graph, {name: dr.detach(values).numpy() for name, values in self.params.items()}
-            assert graph.field is not None, "an operator needs Gaussians"
-            self.operator = StaticOperator(graph.field, params, graph.receivers, *graph.form.size, self._store)
-        return self.operator(np.asarray(request.condition, np.float32), request.port)
+        receiver, (factors, coefficients) = request.port, self._signals
+        if receiver not in self._ready:
+            operator = PixelOperator(self._weights(receiver), *self.graph.form.size)
+            self._ready[receiver] = operator if factors is None else operator.composed(factors)
+        return self._ready[receiver].magnitude(
+            coefficients(np.asarray(request.condition, np.float32)), SQUARED_MAGNITUDE_EPS
+        )
+
+    def key(self, receiver: int) -> str:
+        """Digest of everything that the weights at a receiver depend on."""
+        pose, size = self.graph.receivers[receiver], self.graph.form.size
+        constants = (FORMAT, __version__, *size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, repr(self._field))
+        # Another signal network leaves the weights as they are.
+        signal_alone = self._field.signal_parameters
+        arrays = {name: values for name, values in self._arrays.items() if not name.startswith(signal_alone)}
+        return content_digest(constants, pose.position_m, pose.to_world, arrays)
+
+    def _weights(self, receiver: int) -> csr_array:
+        """Weights [pixels, n] at a receiver: stored ones if they are valid, else built and stored."""
+        key, size = self.key(receiver), self.graph.form.size
+        path = None if self._store is None else self._store / f"operator{receiver}.npz"
+        if path is not None:
+            stored = read_weights(path, key, (size[0] * size[1], self.params["position"].shape[1]))
+            if stored is not None:
+                return stored
+        with dr.suspend_grad():
+            # Of any transmitter: geometry and attenuation are those of all.
+            gaussians = self._field.gaussians(self.params, to_tensor(np.zeros((3, 1))))
+            pose, plane = device_pose(self.graph.receivers[receiver]), perception_plane(*size, mi.Float)
+            weights = pixel_weights(gaussians, pose, plane, MOST_BYTES)
+        if path is not None:
+            write_weights(path, key, weights)
+        return weights
+
+
+def write_weights(path: Path, key: str, weights: csr_array) -> None:
+    """Store weights if the folder can be written."""
+    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+    try:
+        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
+    except OSError:  # a run in a folder of someone else is predicted all the same
+        return
+
+
+def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:
+    """Stored weights of ``shape``; None if there are none, or if they are damaged or have another key."""
+    try:
+        stored = stored_arrays(path)
+        if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
+            return None
+        weights = csr_array(tuple(stored[name] for name in ("data", "indices", "indptr")), shape=shape)
+        # SciPy's product checks nothing: an index out of range would end the process.
+        weights.check_format(full_check=True)
+    except Exception:  # numpy, zipfile and scipy raise a dozen kinds on damaged files
+        return None
+    return weights
 
 
 def evaluator_of(graph: Graph, operator: bool = False, store: Path | None = None) -> Evaluator:

@@ -71,13 +71,16 @@ class FitPlan:
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(field, receivers, form, scene, config.traced, record.tx_antenna, config.evaluation)
         self.stages = self._stage_names()
-        # What corrects paths is chosen also on rows far from the training rows.
+        # What corrects paths is chosen also on rows far from the training rows: near them, Gaussians that interpolate
+        # always gain, whatever they do elsewhere.
         wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0
         wanted &= config.holdout_steps_fraction > 0
         self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted else split
         self.in_groups = wanted and (self.choosing is not split or self.graph.corrects)
         self.unjudged = self.in_groups and self.choosing is split
+        # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
         self.schedule = self._planned()
+        # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
 
     @property
@@ -117,6 +120,7 @@ class FitPlan:
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
         alone, end = config.traced.alone, config.holdout_steps_fraction
+        # Each stage but the last has an equal share of the steps.
         first = tuple(round(k * alone * config.steps) for k in range(1, len(self.stages)))
         if first and config.patience and 0 < end * config.steps <= first[-1]:
             share = f"{alone} of the steps" + (", twice," if len(first) > 1 else "")

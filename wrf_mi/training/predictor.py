@@ -93,6 +93,7 @@ class Predictor:
         fields that were trained on several carriers; others ignore it.
         """
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
+        # Fields of several carriers have the carrier as a last input.
         if self.graph.form.carriers_hz is not None:
             columns = np.vstack([columns, np.full((1, columns.shape[1]), log_carrier, np.float32)])
         if self.graph.field is None:
@@ -125,6 +126,7 @@ class Predictor:
                 used, or no such receiver.
         """
         index, form = receiver_index(self.receivers, receiver), self.graph.form
+        # Antennas of an uplink are independent inputs, without positions and paths.
         if form.features:
             return self._by_uplink(uplink, index)
         positions = np.asarray(tx_pos_m, float)
@@ -145,6 +147,7 @@ class Predictor:
             (rows, predictor._reported(positions[rows], port, side))
             for rows, predictor, port, side in self._sides(positions, index, headings, carriers)
         ]
+        # Groups come in the order of the search, which brings equal positions together.
         order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
         return reports[np.argsort(order)]
 
@@ -184,7 +187,7 @@ class Predictor:
             positions = tx_pos_m[rows]
             reports.append({"whole": predictor._reported(positions, port, side)})
             if self.graph.field is not None:
-                reports[-1] |= {one: predictor._of_one_side(positions, port, side, one) for one in get_args(Alone)}
+                reports[-1] |= {name: predictor._of_one_side(positions, port, side, name) for name in get_args(Alone)}
             statistics.append(side.statistics(self.evaluate.params))
             order.append(rows)
         back = np.argsort(np.concatenate(order))
@@ -217,6 +220,7 @@ class Predictor:
             return self, receiver
         if carrier_hz in trained_hz:
             return self, receiver * self.graph.carriers + int(np.searchsorted(trained_hz, carrier_hz))
+        # Another carrier has ports of its own, and recordings that hold its wavelength.
         if carrier_hz not in self._others:
             self._others[carrier_hz] = Predictor(self.graph.at_carrier(carrier_hz), {})
             self._others[carrier_hz].update(self.evaluate.params)
@@ -239,6 +243,7 @@ class Predictor:
                 parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
                 reports = [self._reported(conditions[part], port, side, slots[part]) for part in parts]
                 return np.concatenate(reports)[np.argsort(np.concatenate(parts))]
+            # Channels are zero without Gaussians, and nothing has to be evaluated.
             if self.graph.scene is None:
                 return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
         return self.of_side(conditions, port, side, slots, weight)
@@ -246,6 +251,7 @@ class Predictor:
     def _of_one_side(self, tx_pos_m: FloatArray, port: int, side: TracedField, alone: Alone) -> NDArray[Any]:
         """Reports of one side alone, NaN where Gaussians are out of reach."""
         weight = None if self.reach is None else self.reach.weight(tx_pos_m, port // self.graph.carriers)
+        # Far from training rows the Gaussians' component is not defined, while that of the paths always is.
         used = np.arange(len(tx_pos_m))
         if alone == "learned" and weight is not None:
             used = np.flatnonzero(weight)
@@ -271,6 +277,7 @@ class Predictor:
             if not isinstance(self.evaluate, OperatorReports):
                 raise
             warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
+            # From now on, so that this is said once.
             params, self.evaluate = self.evaluate.params, evaluator_of(self.graph)
             self.evaluate.update(params)
             reports = self.evaluate(request)

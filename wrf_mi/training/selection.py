@@ -51,6 +51,7 @@ def improves(score: FloatArray, before: FloatArray, higher_is_better: bool, erro
     """
     gain = (score - before) * (1 if higher_is_better else -1)
     gain = gain[np.isfinite(gain)]
+    # Paired scores: rows differ among each other by more than options do, which the difference removes.
     return len(gain) > 1 and float(gain.mean()) > errors * float(gain.std(ddof=1)) / np.sqrt(len(gain))
 
 
@@ -69,15 +70,16 @@ def last_gain(
         confidence: one-sided confidence in a gain by Student's t distribution, in place of standard errors: the
             rows, such as receivers, may be a handful.
     """
-    (kept, best), *others = scores
+    (chosen, best), *others = scores
     for option, score in others:
-        errors = (doubt or {}).get(kept, 1.0)
+        errors = (doubt or {}).get(chosen, 1.0)
         if confidence is not None:
-            known = np.count_nonzero(np.isfinite(score - best))
-            errors = float(stdtrit(known - 1, confidence)) if known > 1 else np.inf
+            pairs = np.count_nonzero(np.isfinite(score - best))
+            errors = float(stdtrit(pairs - 1, confidence)) if pairs > 1 else np.inf
+        # Against the one chosen so far, not the one before: a series of unclear gains may add up to a clear one.
         if improves(score, best, higher_is_better, errors):
-            kept, best = option, score
-    return kept
+            chosen, best = option, score
+    return chosen
 
 
 def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
@@ -102,15 +104,15 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     if count < 2:
         return split
     rng = np.random.default_rng([split.seed, 3])
-    labels, held = clusters(tx_pos_m[rows], count, rng), np.zeros(len(rows), bool)
+    labels, out = clusters(tx_pos_m[rows], count, rng), np.zeros(len(rows), bool)
     for group in rng.permutation(count):
-        more = held | (labels == group)
+        more = out | (labels == group)
         # The first cluster may be larger than the share: without any, nothing could be chosen.
-        if more.mean() <= (HELD_OUT if held.any() else MOST_HELD_OUT):
-            held = more
-    if not held.any():
+        if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
+            out = more
+    if not out.any():
         return split
-    return replace(split, train=rows[~held], validation=np.sort(np.concatenate([split.validation, rows[held]])))
+    return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
 
 
 def hold_out(record: Record, split: Split) -> Split | None:
@@ -141,6 +143,7 @@ def hold_out(record: Record, split: Split) -> Split | None:
     groups = hold_out_groups(split, record.tx_pos_m)
     out = groups.validation
     if groups is split or len(out) < 2:
+        # Where rows are sparsest, as far from the others as rows to be predicted may be.
         distance, _ = cKDTree(positions).query(positions, k=2)
         out = np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
     fold = _fold(split, out, out)
@@ -178,13 +181,13 @@ def _without_carrier(tx_pos_m: FloatArray, carriers_hz: FloatArray, split: Split
     carriers, place = np.unique(carriers_hz[rows]), np.unique(tx_pos_m, axis=0, return_inverse=True)[1].reshape(-1)
     if len(carriers) < 2:
         return None
-    known = np.isin(place[split.test], place[rows]).any()
+    measured_places = np.isin(place[split.test], place[rows]).any()
     rng = np.random.default_rng([split.seed, 4])
     places = rng.permutation(np.unique(place[rows]))
-    held_places = places if known else places[: -(-len(places) // FOLDS)]
+    held_places = places if measured_places else places[: -(-len(places) // FOLDS)]
     at_carrier, at_places = carriers_hz[rows] == rng.choice(carriers), np.isin(place[rows], held_places)
-    # At new positions nothing is known at any carrier.
-    fold = _fold(split, rows[at_carrier | (at_places & ~known)], rows[at_carrier & at_places])
+    # Where test positions are new, nothing is known of them at any carrier.
+    fold = _fold(split, rows[at_carrier | (at_places & ~measured_places)], rows[at_carrier & at_places])
     return fold if len(fold.test) and len(fold.all_train) >= 2 else None
 
 

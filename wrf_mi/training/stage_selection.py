@@ -58,6 +58,7 @@ class StageSelection:
         plan = self.plan
         if not plan.graph.corrects:
             return None
+        # Once a state is chosen, the held-out rows train, too, unless they stay out to the end.
         joined = chosen and plan.schedule.joined < plan.config.steps
         rows = plan.split.all_train if joined else plan.choosing.train
         positions_m = [plan.record.tx_pos_m[plan.targets.received(port, rows)] for port in range(plan.targets.ports)]

@@ -108,6 +108,7 @@ class TrainingData:
         batch, index_type = dr.width(rows), type(rows)
         flat = self.condition.array
         tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
+        # Flat arrays and index arithmetic: a tensor's fancy index would be evaluated as an array of its own.
         slot = dr.arange(index_type, batch * values)
         row = dr.gather(index_type, rows, slot // values) + receiver * n
         factor = dr.gather(type(self.truth), self.scale, receiver)
@@ -175,6 +176,7 @@ class Steps:
 
     def take(self, state: FitState, schedule: Schedule, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the step of a schedule that follows the steps of a state; returns its loss and report."""
+        # Slots are rows of the traced side, of which each row has one, however many conditions it has.
         t, targets = state.step, self._plan.targets
         port, rows = int(schedule.receiver[t]), schedule.rows[t]
         slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
@@ -195,6 +197,7 @@ class Steps:
         if side is not None and side.refresh(params):
             state.searched_m[port] = side.searched_at_m
         stage = plan.stages[schedule.stage(state.chosen - 1 if state.chosen else state.step)]
+        # Gaussians of the field are evaluated in their stage alone, and no more once a reach of 0 is chosen.
         learned = side is None or (stage == FIELD and not (state.chosen and state.reach_m == 0))
         arrays = graph.arrays(port, side)
         key = None if side is None and not arrays else (port, side and side.searches, learned, state.surface)
@@ -214,7 +217,7 @@ class Steps:
         """Learning rate of each parameter."""
         o, traced = self._plan.config.optimiser, self._plan.graph.traced
         rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
-        rates |= {"log_scale": o.scale, "image": 0.0, LEVEL: o.level}
+        rates |= {"log_scale": o.scale, LEVEL: o.level}
         return {
             name: traced.rate(name) if name.startswith(TRACED_NAMES) else rates.get(name, o.network) for name in names
         }
@@ -224,27 +227,28 @@ class Steps:
         evaluation, loss_of = self._plan.graph.evaluation, self.loss
         shape = self._plan.targets.truth.shape[2:]
 
-        def step(adam: Adam, mean: Params, given: StepBatch) -> StepResult:
-            params = rated_params(adam, rates, given.step.factor)
-            condition, truth, scale = given.data.select(given.rows, given.batch.receiver, math.prod(shape))
+        def step(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
+            params = rated_params(adam, rates, inputs.step.factor)
+            condition, truth, scale = inputs.data.select(inputs.rows, inputs.batch.receiver, math.prod(shape))
             truth = truth * scale
             # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather
             # again.
             dr.schedule(truth, scale)
-            prediction = report(params, replace(given.batch, condition=condition))
-            loss = loss_of(prediction * scale, truth, dr.width(given.rows), *shape)
-            mean, trouble, finite = guarded_step(adam, params, loss, mean, given.step)
-            result = StepResult(mean, trouble, dr.detach(loss), _view_gradient_norm(params, given.batch.pose, finite))
+            # In the receiver's unit, so that learning rates suit observations of any scale.
+            prediction = report(params, replace(inputs.batch, condition=condition))
+            loss = loss_of(prediction * scale, truth, dr.width(inputs.rows), *shape)
+            mean, trouble, finite = guarded_step(adam, params, loss, mean, inputs.step)
+            result = StepResult(mean, trouble, dr.detach(loss), _view_gradient_norm(params, inputs.batch.pose, finite))
             dr.eval(adam, result)
             return result
 
         if evaluation.recordable:
             return Recorded(step, read)
 
-        def unrecorded(adam: Adam, mean: Params, given: StepBatch) -> StepResult:
+        def unrecorded(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
             # As in a recording: a row that is a constant would compile the kernels anew.
-            dr.make_opaque(adam, mean, given)
-            result = step(adam, mean, given)
+            dr.make_opaque(adam, mean, inputs)
+            result = step(adam, mean, inputs)
             evaluation.release()
             return result
 
