@@ -9,7 +9,7 @@ All are chosen on rows that are held out (`wrf_mi.training.selection`), some nea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -150,114 +150,70 @@ def constant(weights: FloatArray) -> Mixture:
     return Mixture(np.zeros(1), weights[None])
 
 
-def averaged(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
-    """One mixture for all distances, by forward selection that starts from equal weights.
+@dataclass(frozen=True)
+class HeldOutScores:
+    """Scores of held-out observations by the weights of several predictions, and forms of weights fitted to some.
 
-    Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
-    Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
-    """
-    scores = [score(np.broadcast_to(weights, (len(rows), count)), rows) for weights in np.eye(count)]
-    means = [unit_means(values, unit[rows]) for values in scores]
-    best = max(means, key=np.mean)
-    alike = np.array([not improves(best, mean, True, DOUBT) for mean in means])
-    return constant(_selected(score, rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
-
-
-def mixed(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
-    """One mixture for all distances, by forward selection that starts from the best single prediction."""
-    return constant(_best_selected(score, rows, np.ones(len(rows)), count))
-
-
-def by_distance(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
-    """A mixture as `mixed` at each of some distances.
-
-    An observation counts at the two knots next to its distance, the more the nearer.
-    """
-    distance_m = distance_m[rows]
-    knots = _knots(distance_m)
-    shares = np.stack([np.interp(distance_m, knots, column) for column in np.eye(len(knots))])
-    weights = [_best_selected(score, rows[share > 0], share[share > 0], count) for share in shares]
-    return Mixture(knots, np.stack(weights))
-
-
-FORMS = {"averaged": averaged, "mixed": mixed, "by distance": by_distance}
-"""Forms of the weights, in the order of their freedom."""
-SINGLE = "single"
-"""Form before these: one prediction alone, which is named beforehand."""
-
-
-def choose_weights(
-    score: RowScores,
-    distance_m: FloatArray,
-    fold: IntArray,
-    unit: IntArray,
-    count: int,
-    on_fold: Callable[[float], None],
-    trusted: int | None = None,
-) -> tuple[str, Mixture]:
-    """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
-
-    Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
-    its mean score is better by more than the standard error of the difference over independent units: the receivers of
-    one transmitter have errors in common. A trusted prediction is left for a gain of `DOUBT` errors.
-
-    Args:
-        score: scores of all held-out observations by their weights.
-        distance_m: their distances [q], metres.
-        fold: their folds [q].
-        unit: number of the unit that each belongs to [q].
+    Attributes:
+        score: scores of observations by their weights.
+        distance_m: distance of each to the nearest training row [q], metres.
+        unit: number of the unit that each belongs to [q]; errors are independent between units.
         count: number k of predictions.
-        on_fold: called with the share of the folds that is done.
-        trusted: number of the prediction that is used alone unless a mixture gains; None: mixtures only.
     """
 
-    def single(score: RowScores, distance_m: FloatArray, unit: IntArray, rows: IntArray, count: int) -> Mixture:
-        return constant(np.eye(count)[trusted])
+    score: RowScores
+    distance_m: FloatArray
+    unit: IntArray
+    count: int
 
-    forms = FORMS if trusted is None else {SINGLE: single, **FORMS}
-    folds, every = np.unique(fold), np.arange(len(fold))
-    scores = {name: np.full(len(fold), np.nan) for name in forms}
-    for done, number in enumerate(folds):
-        out = fold == number
-        for name, form in forms.items():
-            # A single fold cannot be left out: forms are then scored on the rows that they are fitted to.
-            mixture = form(score, distance_m, unit, every[~out] if len(folds) > 1 else every, count)
-            scores[name][out] = score(mixture(distance_m[out]), every[out])
-        on_fold((done + 1) / len(folds))
-    best = last_gain(((name, unit_means(values, unit)) for name, values in scores.items()), True, {SINGLE: DOUBT})
-    return best, forms[best](score, distance_m, unit, every, count)
+    def averaged(self, rows: IntArray) -> Mixture:
+        """One mixture for all distances, by forward selection that starts from equal weights.
 
+        Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
+        Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
+        """
+        scores = [self.score(np.broadcast_to(weights, (len(rows), self.count)), rows) for weights in np.eye(self.count)]
+        means = [unit_means(values, self.unit[rows]) for values in scores]
+        best = max(means, key=np.mean)
+        alike = np.array([not improves(best, mean, True, DOUBT) for mean in means])
+        return constant(self._selected(rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
 
-def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
-    """Mean value of each unit."""
-    _, number = np.unique(unit, return_inverse=True)
-    return np.asarray(np.bincount(number, values) / np.bincount(number))
+    def mixed(self, rows: IntArray) -> Mixture:
+        """One mixture for all distances, by forward selection that starts from the best single prediction."""
+        return constant(self._best_selected(rows, np.ones(len(rows))))
 
+    def by_distance(self, rows: IntArray) -> Mixture:
+        """A mixture as `mixed` at each of some distances.
 
-def _selected(score: RowScores, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:
-    """Weights [k] of a forward selection with replacement on observations that count by their shares.
+        An observation counts at the two knots next to its distance, the more the nearer.
+        """
+        distance_m = self.distance_m[rows]
+        knots = _knots(distance_m)
+        shares = np.stack([np.interp(distance_m, knots, column) for column in np.eye(len(knots))])
+        return Mixture(knots, np.stack([self._best_selected(rows[share > 0], share[share > 0]) for share in shares]))
 
-    It starts from ``weights``, which count as ``begun`` steps, and goes on while the mean score increases.
+    def _best_selected(self, rows: IntArray, share: FloatArray) -> FloatArray:
+        """`_selected` from the best single prediction."""
+        every = np.eye(self.count)
+        first = every[int(np.argmax([self._mean(weights, rows, share) for weights in every]))]
+        return self._selected(rows, share, first, FIRST)
 
-    Source: Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004.
-    """
-    every = np.eye(len(weights))
-    best = _mean(score, weights, rows, share)
-    for step in range(begun, begun + STEPS):
-        # Each candidate adds one prediction, with replacement, to the ``step`` that are averaged so far.
-        candidates = (weights * step + every) / (step + 1)
-        values = [_mean(score, candidate, rows, share) for candidate in candidates]
-        if max(values) <= best:
-            break
-        best, weights = max(values), candidates[int(np.argmax(values))]
-    return weights
+    def _selected(self, rows: IntArray, share: FloatArray, weights: FloatArray, begun: int) -> FloatArray:
+        """Weights [k] of a forward selection from ``weights``, which count as ``begun`` steps."""
+        # Caruana, Niculescu-Mizil, Crew and Ksikes, "Ensemble selection from libraries of models", ICML 2004: each step
+        # adds one prediction, with replacement, to those that are averaged so far, while the mean score increases.
+        best = self._mean(weights, rows, share)
+        for step in range(begun, begun + STEPS):
+            candidates = (weights * step + np.eye(self.count)) / (step + 1)
+            values = [self._mean(candidate, rows, share) for candidate in candidates]
+            if max(values) <= best:
+                break
+            best, weights = max(values), candidates[int(np.argmax(values))]
+        return weights
 
-
-def _best_selected(score: RowScores, rows: IntArray, share: FloatArray, count: int) -> FloatArray:
-    """`_selected` from the best single prediction."""
-    every = np.eye(count)
-    first = every[int(np.argmax([_mean(score, weights, rows, share) for weights in every]))]
-    return _selected(score, rows, share, first, FIRST)
+    def _mean(self, weights: FloatArray, rows: IntArray, share: FloatArray) -> float:
+        """Mean score of observations that count by their shares."""
+        return float(np.average(self.score(np.broadcast_to(weights, (len(rows), self.count)), rows), weights=share))
 
 
 def _knots(distance_m: FloatArray) -> FloatArray:
@@ -267,9 +223,52 @@ def _knots(distance_m: FloatArray) -> FloatArray:
     return np.unique(np.quantile(finite, (np.arange(count) + 0.5) / count)) if len(finite) else np.zeros(1)
 
 
-def _mean(score: RowScores, weights: FloatArray, rows: IntArray, share: FloatArray) -> float:
-    scores = score(np.broadcast_to(weights, (len(rows), len(weights))), rows)
-    return float(np.average(scores, weights=share))
+SINGLE = "single"
+"""Form of the weights before all others: one prediction alone, which is named beforehand."""
+FORMS: Mapping[str, Callable[[HeldOutScores, IntArray], Mixture]] = {
+    "averaged": HeldOutScores.averaged,
+    "mixed": HeldOutScores.mixed,
+    "by distance": HeldOutScores.by_distance,
+}
+"""Forms of the weights, in the order of their freedom."""
+
+
+def choose_weights(
+    scores: HeldOutScores, fold: IntArray, on_fold: Callable[[float], None], trusted: int | None = None
+) -> tuple[str, Mixture]:
+    """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
+
+    Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
+    its mean score is better by more than the standard error of the difference over independent units: the receivers of
+    one transmitter have errors in common. A trusted prediction is left for a gain of `DOUBT` errors.
+
+    Args:
+        scores: scores of all held-out observations.
+        fold: their folds [q].
+        on_fold: called with the share of the folds that is done.
+        trusted: number of the prediction that is used alone unless a mixture gains; None: mixtures only.
+    """
+    forms = dict(FORMS)
+    if trusted is not None:
+        forms = {SINGLE: lambda scores, rows: constant(np.eye(scores.count)[trusted])} | forms
+    folds, every = np.unique(fold), np.arange(len(fold))
+    of_forms = {name: np.full(len(fold), np.nan) for name in forms}
+    for done, number in enumerate(folds):
+        out = fold == number
+        for name, form in forms.items():
+            # A single fold cannot be left out: forms are then scored on the rows that they are fitted to.
+            mixture = form(scores, every[~out] if len(folds) > 1 else every)
+            of_forms[name][out] = scores.score(mixture(scores.distance_m[out]), every[out])
+        on_fold((done + 1) / len(folds))
+    means = ((name, unit_means(values, scores.unit)) for name, values in of_forms.items())
+    best = last_gain(means, True, {SINGLE: DOUBT})
+    return best, forms[best](scores, every)
+
+
+def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
+    """Mean value of each unit."""
+    _, number = np.unique(unit, return_inverse=True)
+    return np.asarray(np.bincount(number, values) / np.bincount(number))
 
 
 @dataclass(frozen=True)

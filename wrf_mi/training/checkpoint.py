@@ -52,6 +52,7 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
         version = int(arrays["format"])
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    # A fit may go back to its best state, which has arrays of its own.
     for lead in ("", "best/"):
         _check_state(path, arrays, lead)
     return arrays

@@ -207,6 +207,7 @@ class TrainConfig(LoopConfig):
 
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
         """The settings with number of steps and scale for the training transmitters [n, 3] in metres."""
+        # A scale that encodes two transmitters alike would make the network predict their mean.
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
         scale = self.encoding.tx_scale_m or unambiguous_scale(tx_pos_m, LEAST_TX_SCALE_M)
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
@@ -290,6 +291,7 @@ def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
     """Settings of a task that differ from `TrainConfig`, as ``--set`` takes them; ``image``: whether observations are
     images.
     """
+    # Images are the papers' task: `TrainConfig` has their settings.
     if image:
         return JOINT_IMAGES if with_scene else ()
     return (JOINT if with_scene else ALONE).get(task, ())
@@ -314,6 +316,7 @@ def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfi
     unknown = [part for part in chosen if part not in CALIBRATED]
     if unknown or not chosen:
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
+    # All parts are held first, as the settings of paths train some of them by default.
     moved = [setting for part in chosen for setting in CALIBRATED[part]]
     more = PATHS_OF_IMAGES if images else ()
     return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *more, *HELD, *moved])

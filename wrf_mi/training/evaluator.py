@@ -228,6 +228,8 @@ class TracedReports(_InBatches):
         learned &= side is None or weight is None or bool(np.any(weight))
         if side is not None and len(side) == 1 and self._may_record(1):
             return self._of_one(request, side, learned)
+        # Numbers of paths differ from batch to batch, and a recording serves one: only the Gaussians' signal, which
+        # takes most of the time, is recorded.
         signal, count = None, len(request.condition)
         # Batches of `TOGETHER` are recorded; copies that filled others would cost more than they save.
         if learned and TOGETHER // 2 < count <= TOGETHER and self._may_record(TOGETHER):
@@ -241,6 +243,7 @@ class TracedReports(_InBatches):
         """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""
         port, how = request.port, {"alone": request.alone, "phase_error": request.phase_error}
         name = "both", port, learned, *how.values(), side.form
+        # The recorded function looks the side up at each call, as its arrays are read beside the arguments.
         self._sides[name] = side
 
         def reported(params: Mapping[str, Any], batch: Batch) -> Any:

@@ -162,6 +162,7 @@ def _without_receivers(record: Record, split: Split) -> Split | None:
         return None
     # The half that judges a correction (`wrf_mi.correction.correct`): offsets differ, and few say little of others.
     group = np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2].tolist()
+    # As many rows are left to each as the split leaves to its own held-out receivers.
     each = len(split.left) // len(split.held_receivers)
     # Rows that are left at the split's own receivers train, but for a part that is held out as theirs are.
     left = np.random.default_rng([split.seed, 8]).permutation(np.arange(len(split.left)) % FOLDS) != 0
@@ -239,6 +240,7 @@ class HeldOut:
     def of(cls, record: Record, fold: Split, seed: int) -> HeldOut:
         """Held-out observations of a fold, or as many of them, drawn with a seed, as `MOST_OBSERVATIONS` allows."""
         parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        # Rows that a receiver did not receive are no neighbours: distances differ between receivers of one row.
         distance = RowDistance.of_rows(record.seen(fold), fold.all_train)
         for receiver in fold.held_receivers or fitted_receivers(record, [fold])[0]:
             rows = np.setdiff1d(fold.test, fold.left[fold.left[:, 0] == receiver, 1])

@@ -93,6 +93,7 @@ class StageSelection:
 
     def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
         """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
+        # Sides hold all training rows, held-out ones too: scores need no further search for paths.
         slots = np.searchsorted(self.plan.known[port], rows)
         return predict.of_side(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight)
 
@@ -119,6 +120,7 @@ class StageSelection:
         def score(port: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
             return self._scores(predict, port, rows[port], weight)
 
+        # The state keeps the reach with which it is scored, so that the best state has the best reach.
         state.reach_m, scores = choose_reach(reach, lengths, positions_m, score, self._higher)
         return scores
 

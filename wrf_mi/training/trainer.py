@@ -21,7 +21,7 @@ from .fit_plan import SURFACES, FitPlan
 from .initial import starting_values
 from .loop import TrainingLoop
 from .predictor import Predictor
-from .stage_selection import HeldOutReports, StageSelection
+from .stage_selection import StageSelection
 from .state import FitState
 from .step import Loss, Steps
 
@@ -74,6 +74,7 @@ class Trainer(TrainingLoop):
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
+        # Traced once: the positions of training rows do not change, only what the paths meet.
         self.sides = plan.traced()
         self.selection = StageSelection(plan, self.sides)
         self.steps = Steps(plan, self.sides, loss or partial(plan.task.loss, ssim_weight=config.loss.ssim_weight))
@@ -89,6 +90,7 @@ class Trainer(TrainingLoop):
             check_params(plan.graph.field, state.params(), "checkpoint.npz")
             plan.graph.cover(self.sides, state.params())
         self.state = state
+        # A resumed fit whose state was chosen has the shortened schedule that followed.
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self._restore_paths()
@@ -138,10 +140,6 @@ class Trainer(TrainingLoop):
         """Reach around the rows that train now; None: the Gaussians are used everywhere."""
         return self.selection.reach(bool(self.state.chosen), self.state.reach_m)
 
-    def held_out_reports(self) -> HeldOutReports | None:
-        """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
-        return self.selection.reports(self.state)
-
     def begin(self) -> None:
         """Score the state that a fit beside paths starts from."""
         if self.plan.chooses_stages and not self.state.step and self.state.best is None:
@@ -158,6 +156,7 @@ class Trainer(TrainingLoop):
         """
         if self.plan.in_groups and len(self.selection.scores):
             score = self.selection.stage_score(self.state)
+        # A stage may end without a gain and the next one still have some: patience counts in the last stage alone.
         if self.schedule.stage(self.state.step) < len(self.schedule.stages):
             self.state.waited = -1
         if not super().choose(score):
@@ -167,7 +166,7 @@ class Trainer(TrainingLoop):
             self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
         if self.state.reach_m == 0 and self.graph.scene is None:
             logger.warning("at no distance from training rows do the Gaussians predict held-out rows better than zero")
-            self.state.step = self.config.steps
+            self.state.step = self.config.steps  # further steps would train what is not used
         return True
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
@@ -191,10 +190,12 @@ class Trainer(TrainingLoop):
         names = self.field.per_gaussian
         params = {name: values for name, values in state.params().items() if name in names}
         receivers = np.stack([r.position_m for r in self.plan.record.receivers])
+        # Of the nearest receiver, which sees the Gaussian largest.
         distance = np.linalg.norm(params["position"].T[:, None].astype(float) - receivers, axis=2).min(axis=1)
         # A generator for each round: a resumed run draws the same numbers.
         rng = np.random.default_rng([self.config.seed, 2, state.step])
         gradient = state.view_gradient_norm.numpy() / max(1, state.view_gradient_steps)
+        # A field that starts with more Gaussians than the limit keeps them, and does not grow.
         most = max(density.max_gaussians, self.config.initial.gaussians)
         change = adapt(params, gradient, distance, rng, density.growth_fraction, most)
         state.change_density(change)

@@ -213,7 +213,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     if trainer.state.phase_error:
         arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
     fitted = load(arrays, problem, folder)
-    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.held_out_reports()
+    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
     return fitted
 
 

@@ -28,6 +28,7 @@ from ...tasks import task_of
 from ...training.by_distance import (
     GAPS,
     LEAST,
+    HeldOutScores,
     Intervals,
     Mixture,
     choose_weights,
@@ -325,7 +326,9 @@ def _weights(
     def on_group(share: float) -> None:
         session.report("choosing weights", share)
 
-    form, mixture = choose_weights(score, held.distance_m, held.group, unit, len(means), on_group, trusted=0)
+    form, mixture = choose_weights(
+        HeldOutScores(score, held.distance_m, unit, len(means)), held.group, on_group, trusted=0
+    )
     mean = np.einsum("qk,kq...->q...", mixture(held.distance_m), means)
     stds = [one.std for one in predictions.values()]
     known = [std for std in stds if std is not None]
