@@ -178,6 +178,13 @@ def test_invalid_settings_are_refused(setting: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_settings_that_are_constants_now_are_read_at_their_value_alone() -> None:
+    """Run files of earlier versions have them."""
+    assert read({"density": {"split_deg": 5.0}, "network": {"phase_hz": 0.0}}) == TrainConfig()
+    with pytest.raises(InputError, match=r"config, setting density.split_deg: 6.0, where this version has 5.0"):
+        read({"density": {"split_deg": 6.0}})
+
+
 @pytest.mark.parametrize(
     "setting",
     [

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
-from typing import Annotated, Any, ClassVar, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 import yaml
@@ -90,6 +90,8 @@ class CheckedSettings:
 def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) -> Settings:
     """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
+    Settings of earlier versions that are constants now, in the mapping ``FIXED`` of the class, must have that value.
+
     ``source`` names the file or option in messages.
 
     Raises:
@@ -101,14 +103,15 @@ def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) 
 def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         raise InputError(f"{source}, setting {prefix[:-1] or 'top'}: expected a mapping, got {values!r}")
-    hints = {
-        name: hint for name, hint in typing.get_type_hints(kind).items() if typing.get_origin(hint) is not ClassVar
-    }
+    hints = typing.get_type_hints(kind)
     arguments = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
-        if (key, value) in getattr(kind, "CONSTANT", {}).items():
-            continue  # a setting of earlier versions in a run file, at the value that is a constant now
+        if key in (fixed := getattr(kind, "FIXED", {})):
+            if value != fixed[key]:
+                text = f"{value!r}, where this version has {fixed[key]!r} alone; omit it, or train the run anew"
+                raise InputError(f"{source}, setting {name}: {text}")
+            continue
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")

@@ -20,11 +20,9 @@ from .parameters import Gaussians
 from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
 from .tiles import LANE_ROWS, Plane, TileLists, build_lists
 
-RECORD = 16
-"""Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal."""
+RECORD = 16  # floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal
 
-GROUP = 4
-"""Transmitters whose sums a lane keeps: more would not fit into its registers."""
+GROUP = 4  # transmitters whose sums a lane keeps: more would not fit into its registers
 
 MOST_COPIED = 1 << 16
 """Floats of a gradient table of which each lane of each thread may sum into its private copy: some MB in all.

@@ -37,10 +37,8 @@ from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, 
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
-MOST_IN_STRIP = 2**32 - 1
-"""Largest number of entries of one row of tiles."""
-BLOCK = 16
-"""Transmitters at once: 4 MB of complex numbers for 360 x 90 directions, which stay in the cache."""
+MOST_IN_STRIP = 2**32 - 1  # largest number of entries of one row of tiles
+BLOCK = 16  # transmitters at once: 4 MB of complex numbers for 360 x 90 directions, which stay in the cache
 PAIRS_PER_CHUNK = 1 << 15
 """Pairs of Gaussian and transmitter whose signals are computed at once: 16 MB of a layer of 128."""
 

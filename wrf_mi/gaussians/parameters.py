@@ -124,8 +124,7 @@ def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     return gaussians.mapped(lambda a: dr.gather(kind, a, pair), **changes)
 
 
-CHUNK_SIZE = 1 << 14
-"""Pairs of Gaussian and transmitter at once: 64 MB of a network of width 256."""
+CHUNK_SIZE = 1 << 14  # pairs of Gaussian and transmitter at once: 64 MB of a network of width 256
 
 
 def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_once: int = CHUNK_SIZE) -> Gaussians:

@@ -42,8 +42,7 @@ from ..tracing.paths.corrected_scene import check_materials, write_corrected_sce
 from ..tracing.paths.result import join_traces
 from ..tracing.paths.solve import PAIRS_TOGETHER
 from ..tracing.tracer import Offsets, RayTracer, fit_offsets, warn_of_cross_polarization
-from ..training.config import calibration_config
-from ..training.loop_config import LoopOptions
+from ..training.config import LoopOptions, calibration_config
 from .gaussian.model import FittedField
 from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field

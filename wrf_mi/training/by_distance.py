@@ -26,27 +26,22 @@ from .selection import RowDistance, improves, last_gain
 
 LENGTHS = 7
 """Number of reaches tried beside 0: each twice the one before, the last four times the largest distance held out."""
-NEGLIGIBLE = 1e-4
-"""Weight below which Gaussians are not evaluated: the largest relative change of their signal."""
+NEGLIGIBLE = 1e-4  # weight below which Gaussians are not evaluated: the largest relative change of their signal
 
 KNOTS, KNOT_ROWS = 4, 20
 """Largest number of distances at which weights are chosen, and least number of held-out observations for each."""
 FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
-DOUBT = 2.0
-"""Standard errors of a difference that is clear: by chance five rows exceed one of them one time in five."""
+DOUBT = 2.0  # standard errors of a difference that is clear: by chance five rows exceed one of them one time in five
 
 LEVEL = 0.9
-SIZES, DISTANCES = 8, 4
-"""Largest numbers of groups by size and by distance."""
+SIZES, DISTANCES = 8, 4  # largest numbers of groups by size and by distance
 GROUP_ROWS = 12
 """Least average number of rows in a group: intervals of smaller ones follow their rows and are too narrow elsewhere."""
-MOST_ERRORS = 400_000
-"""Largest number of errors that are sorted; more are thinned evenly."""
+MOST_ERRORS = 400_000  # largest number of errors that are sorted; more are thinned evenly
 GAPS = ("distance_m",)
 """Arrays that may hold infinity (`wrf_mi.models.model.Model.gaps`): distances to receivers without training rows."""
-SMALLEST = 1e-6
-"""Smallest standard deviation, relative to the median held-out error, and smallest factor."""
+SMALLEST = 1e-6  # smallest standard deviation, relative to the median held-out error, and smallest factor
 LEAST = float(np.finfo(np.float32).tiny) / SMALLEST**2
 """Smallest standard deviation: factors do not make it zero in single precision, as intervals of zero width would be."""
 
@@ -223,8 +218,7 @@ def _knots(distance_m: FloatArray) -> FloatArray:
     return np.unique(np.quantile(finite, (np.arange(count) + 0.5) / count)) if len(finite) else np.zeros(1)
 
 
-SINGLE = "single"
-"""Form of the weights before all others: one prediction alone, which is named beforehand."""
+SINGLE = "single"  # form of the weights before all others: one prediction alone, which is named beforehand
 FORMS: Mapping[str, Callable[[HeldOutScores, IntArray], Mixture]] = {
     "averaged": HeldOutScores.averaged,
     "mixed": HeldOutScores.mixed,

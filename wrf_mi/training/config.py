@@ -1,24 +1,97 @@
-"""Settings of a fit: frozen dataclasses, written to and read from ``config.yaml``."""
+"""Settings of fits by gradients: frozen dataclasses, written to and read from ``config.yaml``."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from dataclasses import dataclass, field, make_dataclass
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
+from ..core.settings import (
+    NOT_NEGATIVE,
+    CheckedSettings,
+    Count,
+    Inside,
+    Positive,
+    Share,
+    ShareBelow1,
+    with_settings,
+)
 from ..gaussians.encoding import unambiguous_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
 from ..tasks import TASKS
-from .loop_config import AdamConfig, LoopConfig
 
 AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
+
+
+@dataclass(frozen=True)
+class AdamConfig:
+    """Adam (Kingma and Ba 2015): warm-up, then a cosine to ``final`` of each rate.
+
+    Attributes:
+        network: rate of all networks.
+        warm_up: steps over which rates rise from zero.
+        cosine_start: share of the steps after which rates begin to fall.
+        final: final factor of each rate.
+        ema_decay: decay per step of the running mean of the parameters, which is evaluated and stored.
+    """
+
+    network: float = 1e-3
+    warm_up: int = 100
+    cosine_start: Share = 0.0
+    final: Share = 0.01
+    ema_decay: ShareBelow1 = 0.999
+
+
+@dataclass(frozen=True)
+class LoopConfig(CheckedSettings):
+    """Settings of `wrf_mi.training.loop.TrainingLoop`.
+
+    Attributes:
+        steps: optimiser steps.
+        batch: largest number of samples in a step.
+        holdout_steps_fraction: share of the steps in which the validation rows are kept out of training. 1 keeps them
+            out to the end, as every choice of settings must; less ends with a fit on all training rows.
+        patience: number of scores on the validation rows without improvement after which the fit goes on from the best
+            state with all training rows, for a share of the steps that led to it. 0: all steps are taken, and the last
+            state counts.
+        checkpoint_every: steps between two checkpoints.
+        log_every: steps between two lines of the log.
+        validate_every: steps between two scores on the validation rows.
+        optimiser: learning rates and running mean.
+    """
+
+    steps: Count = 1000
+    batch: Count = 1
+    holdout_steps_fraction: Share = 0.7
+    patience: int = 0
+    checkpoint_every: Count = 2000
+    log_every: Count = 100
+    validate_every: Count = 1000
+    optimiser: AdamConfig = field(default_factory=AdamConfig)
+
+
+_OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}
+
+
+def _chosen(options: Any) -> list[str]:
+    """Settings that are not null, as ``--set`` takes them."""
+    values = {name: getattr(options, name) for name in _OPTIONAL}
+    return [f"{name}={value}" for name, value in values.items() if value is not None]
+
+
+LoopOptions: Any = make_dataclass(
+    "LoopOptions",
+    [(name, kind | None, None) for name, kind in _OPTIONAL.items()],
+    namespace={"chosen": _chosen},
+    frozen=True,
+)
+"""Base of settings of a model that may be trained: those of `LoopConfig`; null: the default of the training."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +157,7 @@ class NetworkConfig:
     terms: int = 0
     static_geometry: bool = False
 
-    CONSTANT: ClassVar[Mapping[str, float]] = {"phase_hz": 0.0}
+    FIXED: ClassVar[Mapping[str, float]] = {"phase_hz": 0.0}
 
 
 @dataclass(frozen=True)
@@ -145,8 +218,8 @@ class DensityConfig:
     max_gaussians: Count = 320
     reset_every: int = 0
 
-    CONSTANT: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
-    """Constants of `wrf_mi.gaussians.density` that run files of earlier versions have as settings."""
+    # Constants of `wrf_mi.gaussians.density`, which run files of earlier versions have as settings.
+    FIXED: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
 
 
 @dataclass(frozen=True)
@@ -160,8 +233,7 @@ class LossConfig:
     ssim_weight: Share = 0.2
 
 
-PATHS_ALONE = "ray-tracing"
-"""Name of the model that trains the paths of a scene without Gaussians."""
+PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which held-out scores no longer improve (docs/speed.md); `OTHERWISE` for other models."""
 OTHERWISE = 15000
@@ -238,8 +310,7 @@ PAPER = (
 The paper states no scale of coordinates; metres are assumed. Loss, networks and Adam are the paper's by default.
 """
 
-QUICK = ("steps=6000",)
-"""Shorter schedule of the demo."""
+QUICK = ("steps=6000",)  # shorter schedule of the demo
 
 ONE_ANTENNA = (
     "batch=16",
@@ -255,8 +326,7 @@ ONE_ANTENNA = (
 """Settings of a field of signal strengths or channels that differ from a field of spectra: few numbers result."""
 PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every=50", "patience=8", "density.every=0")
 """Settings of paths alone: few parameters converge soon."""
-PATHS_OF_IMAGES = ("batch=8",)
-"""Further settings where observations are images of thousands of numbers."""
+PATHS_OF_IMAGES = ("batch=8",)  # further settings where observations are images of thousands of numbers
 HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0", "traced.surface=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "gain": ("traced.gain=0.05",),

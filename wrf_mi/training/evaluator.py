@@ -39,14 +39,10 @@ from ..version import __version__
 from .adam import Params
 from .step import device_pose, evaluated, places_of
 
-TOGETHER = 16
-"""Transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch."""
-TRACED_NUMBERS = 512
-"""With paths, numbers in a batch of small observations."""
-FORMAT = 1
-"""Version of the file of an operator."""
-MOST_BYTES = 1 << 30
-"""Largest size of one receiver's weights; larger fields are evaluated directly."""
+TOGETHER = 16  # transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch
+TRACED_NUMBERS = 512  # with paths, numbers in a batch of small observations
+FORMAT = 1  # version of the file of an operator
+MOST_BYTES = 1 << 30  # largest size of one receiver's weights; larger fields are evaluated directly
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
 """Memory of a training step for each neuron, and beside networks, of each pair of a Gaussian and a transmitter, and for
 each number of a Gaussian (its value, gradient, moments, running mean and best state): measured on 4,000 and 16,000
 Gaussians of the three fields, within a third."""
-MOST_NUMBERS = (1 << 32) - 1
-"""Most numbers of an array of Dr.Jit."""
+MOST_NUMBERS = (1 << 32) - 1  # most numbers of an array of Dr.Jit
 
 
 def field_of(config: TrainConfig, form: Form) -> Field | None:

@@ -33,12 +33,9 @@ from .config import InitialConfig
 from .fit_plan import FitPlan
 from .step import Place, evaluated
 
-LEAST_SCALE_M = 0.02
-"""Smallest starting scale, for a cluster of a single point."""
-LEAST_SHARE = 1e-3
-"""Smallest starting power relative to the strongest cluster, so that weak Gaussians can grow."""
-LEVEL_ROWS = 64
-"""Observations of a receiver from which its starting level is estimated."""
+LEAST_SCALE_M = 0.02  # smallest starting scale, for a cluster of a single point
+LEAST_SHARE = 1e-3  # smallest starting power relative to the strongest cluster, so that weak Gaussians can grow
+LEVEL_ROWS = 64  # observations of a receiver from which its starting level is estimated
 
 
 def gaussians_from_paths(

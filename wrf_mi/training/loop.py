@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .adam import NonFiniteReport, NumericsError, watched_groups
-from .loop_config import LoopConfig
+from .config import LoopConfig
 from .schedule import Schedule
 from .state import FitState
 

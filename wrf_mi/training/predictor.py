@@ -27,8 +27,7 @@ from .adam import Params
 from .by_distance import Reach
 from .evaluator import OperatorReports, Request, evaluator_of
 
-SEARCHED = 512
-"""Transmitters of a carrier whose paths are searched together: a search has a fixed cost."""
+SEARCHED = 512  # transmitters of a carrier whose paths are searched together: a search has a fixed cost
 
 
 class Predictor:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.types import IntArray
-from .config import DensityConfig
-from .loop_config import AdamConfig, LoopConfig
+from .config import AdamConfig, DensityConfig, LoopConfig
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,10 @@ from ..datasets.splits import rows_left
 
 Option = TypeVar("Option")
 
-GROUPS = 10
-"""Clusters of training positions, some of which are held out together."""
-ROWS_OF_GROUP = 4
-"""Least average number of rows of a cluster."""
-HELD_OUT = 0.25
-"""Approximate share of the training rows that are held out in clusters."""
-MOST_HELD_OUT = 0.5
-"""Largest share in a single cluster."""
+GROUPS = 10  # clusters of training positions, some of which are held out together
+ROWS_OF_GROUP = 4  # least average number of rows of a cluster
+HELD_OUT = 0.25  # approximate share of the training rows that are held out in clusters
+MOST_HELD_OUT = 0.5  # largest share in a single cluster
 FOLDS = 5
 """Parts of rows that are left to receivers, or of positions at a held-out carrier, of which one is held out; largest
 number of groups of held-out observations."""

@@ -17,8 +17,7 @@ from .predictor import Predictor
 from .selection import improves
 from .state import FitState
 
-PHASE_ERRORS = (0.5, 1.0, 1.5)
-"""Phase errors that are tried, rad: beyond, a reflection knows nothing of its phase."""
+PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a reflection knows nothing of its phase
 
 
 @dataclass(frozen=True)

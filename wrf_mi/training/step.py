@@ -35,8 +35,7 @@ from .targets import Targets
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 
-CENTRES = "position"
-"""Parameter [3, n] of every field with Gaussians."""
+CENTRES = "position"  # parameter [3, n] of every field with Gaussians
 
 
 def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:

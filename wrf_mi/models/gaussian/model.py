@@ -36,10 +36,8 @@ from ...training.trainer import Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 Params = dict[str, NDArray[np.float32]]
-OF_RECEIVER = "receiver."
-"""Prefix of the names of a receiver's parameters."""
-MEANS = ("gain", "pattern")
-"""Parameters of a receiver whose mean is taken; a pose is the stated one."""
+OF_RECEIVER = "receiver."  # prefix of the names of a receiver's parameters
+MEANS = ("gain", "pattern")  # parameters of a receiver whose mean is taken; a pose is the stated one
 
 
 def without_rows(split: Split) -> tuple[int, ...]:
@@ -86,10 +84,8 @@ def of_all_receivers(
 logger = logging.getLogger(__name__)
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
-PARAM = "param/"
-"""Prefix of a parameter's array in ``model.npz``."""
-REACH = "reach_m"
-"""Array of the reach in metres: infinite where no validation chose a finite one."""
+PARAM = "param/"  # prefix of a parameter's array in ``model.npz``
+REACH = "reach_m"  # array of the reach in metres: infinite where no validation chose a finite one
 PHASE_ERROR = "phase_error"
 """Array of the standard deviation of a reflection's phase in predictions, rad, where it is not 0."""
 
