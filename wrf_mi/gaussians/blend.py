@@ -137,24 +137,41 @@ class Lanes:
     group: Any
 
 
-def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = False) -> Lanes:
-    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
+@dataclass
+class Layout:
+    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``.
+
+    ``fields`` is the number of a record's floats without the signal, ``size`` that of transmitters whose sums a lane
+    keeps.
+    """
+
+    lists: TileLists
+    plane: Plane
+    n: int
+    batch: int
+    shared: bool
+    fields: int
+    size: int
+
+
+def lanes_of(layout: Layout) -> Lanes:
+    """The lanes of all groups of transmitters."""
+    plane, lists, size = layout.plane, layout.lists, layout.size
     index_type = type(lists.index)
-    size = group_size(batch) if shared else 1
     # Lanes of one group of transmitters follow each other, so that those of a register walk the same list.
-    lane = dr.arange(index_type, batch // size * plane.lanes)
+    lane = dr.arange(index_type, layout.batch // size * plane.lanes)
     inner, group = lane % plane.lanes, lane // plane.lanes
 
     def spread(array: Any) -> Any:
         return dr.gather(type(array), array, inner)
 
-    tile = spread(plane.tile) if shared else group * plane.tiles + spread(plane.tile)
+    tile = spread(plane.tile) if layout.shared else group * plane.tiles + spread(plane.tile)
     return Lanes(
         azimuth=[spread(a) for a in plane.azimuth],
         elevation=[[spread(c) for c in e] for e in plane.elevation],
         pixel=[[(group * size + k) * plane.pixels + spread(p) for k in range(size)] for p in plane.pixel],
         active=[spread(a) for a in plane.active],
-        start=lists.begin(tile, n),
+        start=lists.begin(tile, layout.n),
         end=dr.gather(index_type, lists.length, tile),
         group=group,
     )
@@ -174,14 +191,11 @@ def _blend_one(
 
 
 @dr.syntax
-def _forward(
-    table: Any, signals: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int
-) -> tuple[Any, Any]:
+def _forward(table: Any, signals: Any, layout: Layout) -> tuple[Any, Any]:
     """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
+    lists, n, shared, fields, size = layout.lists, layout.n, layout.shared, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
-    shared, fields = signals is not None, 11 if product else 10
-    size = group_size(batch) if shared else 1
-    lanes = lanes_of(plane, lists, n, batch, shared)
+    lanes = lanes_of(layout)
     state = ForwardState.start(float_type, LANE_ROWS, size)
     j = index_type(0)
     while j < lanes.end:
@@ -192,7 +206,7 @@ def _forward(
         j += 1
     # Each scatter below is a kernel that would run the loop again.
     dr.eval(state.total)
-    out_re, out_im = dr.zeros(float_type, batch * plane.pixels), dr.zeros(float_type, batch * plane.pixels)
+    out_re, out_im = (dr.zeros(float_type, layout.batch * layout.plane.pixels) for _ in range(2))
     for row in range(LANE_ROWS):
         for k in range(size):
             dr.scatter(out_re, state.total[row][k][0], lanes.pixel[row][k], lanes.active[row])
@@ -237,19 +251,14 @@ def _derivatives(
 def _backward(
     table: Any,  # [batch * n * RECORD], or [n * RECORD] of a shared geometry
     signals: Any,  # [2 * batch * n] of a shared geometry, else None
-    lists: TileLists,
-    plane: Plane,
-    n: int,
-    product: bool,
-    batch: int,
+    layout: Layout,
     total: tuple[Any, Any],  # re, im, [batch * pixels] each
     gradient: tuple[Any, Any],  # re, im, [batch * pixels] each
 ) -> tuple[Any, Any]:
     """Gradients of both tables, in their layouts."""
+    lists, n, shared, fields, size = layout.lists, layout.n, layout.shared, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
-    shared, fields = signals is not None, 11 if product else 10
-    size = group_size(batch) if shared else 1
-    lanes = lanes_of(plane, lists, n, batch, shared)
+    lanes = lanes_of(layout)
     slopes, state = reverse_start(lanes.pixel, lanes.active, total, gradient)
     # The targets of the loop's scatters exist before it: inside of a recorded loop nothing can be evaluated.
     out = dr.zeros(float_type, dr.width(table))
@@ -278,38 +287,28 @@ def _backward(
 class _Blend(dr.CustomOp):
     """Blending as one differentiable operation over per-Gaussian columns and signals."""
 
-    def eval(
-        self,
-        lists: TileLists,
-        plane: Plane,
-        n: int,
-        product: bool,
-        batch: int,
-        shared: bool,
-        columns: list[Any],
-        signal: list[Any],
-    ) -> Any:
-        self.arguments = (lists, plane, n, product, batch)
-        self.count = len(columns)
-        self.table = pack([*columns, *([] if shared else signal)])
-        self.signals = _pack_signals(signal, n, batch) if shared else None
+    def eval(self, layout: Layout, columns: list[Any], signal: list[Any]) -> Any:
+        self.layout = layout
+        self.table = pack([*columns, *([] if layout.shared else signal)])
+        self.signals = _pack_signals(signal, layout.n, layout.batch) if layout.shared else None
         dr.eval(self.table, self.signals)
-        self.total = _forward(self.table, self.signals, *self.arguments)
+        self.total = _forward(self.table, self.signals, layout)
         dr.eval(self.total)
         return self.total
 
     def backward(self) -> None:
         gradient: Any = self.grad_out()
         dr.eval(gradient)
-        out, out_signals = _backward(self.table, self.signals, *self.arguments, self.total, gradient)
+        out, out_signals = _backward(self.table, self.signals, self.layout, self.total, gradient)
         dr.eval(out, out_signals)
-        columns = unpack(out, self.count + 2)
+        count = self.layout.fields
+        columns = unpack(out, count + 2)
         if out_signals is None:
-            by_signal = columns[self.count :]
+            by_signal = columns[count:]
         else:
-            slots = _signal_slots(self.arguments[2], self.arguments[4], dr.uint32_array_t(type(out)))
+            slots = _signal_slots(self.layout.n, self.layout.batch, dr.uint32_array_t(type(out)))
             by_signal = [dr.gather(type(out), out_signals, slots + part) for part in (0, 1)]
-        self.set_grad_in("columns", columns[: self.count])
+        self.set_grad_in("columns", columns[:count])
         self.set_grad_in("signal", by_signal)
 
     def name(self) -> str:
@@ -342,7 +341,8 @@ def blend(
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)
     shared = batch > 1 and dr.width(footprints.radius) == n
-    result: tuple[Any, Any] = dr.custom(_Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal)
+    layout = Layout(lists, plane, n, batch, shared, len(columns), group_size(batch) if shared else 1)
+    result: tuple[Any, Any] = dr.custom(_Blend, layout, columns, signal)
     return result
 
 
