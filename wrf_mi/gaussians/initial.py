@@ -66,6 +66,7 @@ def random_gaussians(
     size_deg: float = 7.0,
     opacity: float = 0.1,
     signal: float = 0.3,
+    *,
     sphere: bool = False,
 ) -> InitialGaussians:
     """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere or full sphere.
