@@ -82,7 +82,7 @@ class Reach:
 
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
-        # The longest reach is nearly 1 everywhere among held-out rows: beyond, nothing tells reaches apart.
+        # With the longest reach w is 0.94 at the farthest held-out row: nothing tells longer ones apart.
         away = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]
         largest = float(np.max(np.concatenate(away), initial=0.0)) if away else 0.0
         return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]

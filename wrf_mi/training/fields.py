@@ -70,7 +70,6 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
 
 def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
     """Shapes of the parameters of a field with four Gaussians, by name."""
-    # Initialised once: four Gaussians are the fewest, and cost nothing.
     place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
     return {name: values.shape for name, values in field.init(random_gaussians([place], 4, rng), rng).items()}
 
@@ -120,7 +119,7 @@ def check_memory(config: TrainConfig, field: Field) -> None:
     # The widest layer has its width of numbers for every pair; Dr.Jit's indices of 32 bits would wrap around unnoticed.
     if pairs * widest > MOST_NUMBERS:
         raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
-    # On a GPU the memory of the machine says nothing of the device's, whose driver refuses by an error.
+    # `require_memory` knows the machine's memory, not that of a GPU.
     if not (mi.variant() or "").startswith("cuda"):
         step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
         require_memory(step + BYTES_PER_NUMBER * count * numbers, f"{what}a training step", remedy)

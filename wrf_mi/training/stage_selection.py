@@ -170,8 +170,7 @@ class StageSelection:
             predict.phase_error = phase_error
             reports = self._held_out_reports(predict, state, rows)
             scores = np.ravel(plan.task.training_score(reports, observed))
-            # Scores rise to one maximum: the first error without a gain ends the search, of which each try costs a
-            # prediction of all held-out rows.
+            # Scores are taken to rise to one maximum, as each try costs a prediction of all held-out rows.
             if not improves(scores, before, self._higher):
                 break
             state.phase_error, best, before = phase_error, reports, scores

@@ -107,7 +107,7 @@ class TrainingData:
         batch, index_type = dr.width(rows), type(rows)
         flat = self.condition.array
         tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
-        # Flat arrays and index arithmetic: a tensor's fancy index would be evaluated as an array of its own.
+        # Truth is [receiver, condition, value], flat.
         slot = dr.arange(index_type, batch * values)
         row = dr.gather(index_type, rows, slot // values) + receiver * n
         factor = dr.gather(type(self.truth), self.scale, receiver)
