@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from wrf_mi.core import Receiver
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -56,7 +56,7 @@ def spectra(
     tx_pos = np.random.default_rng(1).uniform(-1, 1, (rows, 3))
 
     def observe() -> np.ndarray:
-        predict = Predictor(model_field, params, RECEIVERS[:receivers], *size)
+        predict = Predictor.of_field(model_field, params, RECEIVERS[:receivers], *size)
         return np.stack([predict(tx_pos, r) for r in range(receivers)])
 
     largest = observe().max()

@@ -108,7 +108,6 @@ _OWN: Mapping[str, Check] = {
     "pareto": _here("run time against error", "pareto:main", resumes=True),
     "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main"),
-    "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
     "intervals": _here("intervals of three models", "coverage:main", RFID, FLAT, resumes=True, table="coverage:table"),

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
-from wrf_mi.gaussians.operator import PixelOperator, pixel_weights
-from wrf_mi.gaussians.render import splat
-from wrf_mi.gaussians.static_signals import static_signals
+from wrf_mi.gaussians.blend import splat
+from wrf_mi.gaussians.operator import PixelOperator, pixel_weights, static_signals
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.reports import SQUARED_MAGNITUDE_EPS
 from wrf_mi.synthetic.laboratory import RECEIVER
@@ -112,7 +111,7 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "both": partial(direct.pixels, tx[0]),
         }
         if field.static_geometry:
-            predictor = Predictor(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
+            predictor = Predictor.of_field(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
             calls |= {"operator": partial(predictor, tx[:1]), f"operator, {BATCH}": partial(predictor, tx)}
         times = interleaved(calls, REPEATS, most_s=30)
         found[name] = {key: bootstrap(t / (BATCH if key.endswith(str(BATCH)) else 1)) for key, t in times.items()}

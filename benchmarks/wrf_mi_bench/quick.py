@@ -25,7 +25,7 @@ from drjit.opt import Adam
 from threadpoolctl import threadpool_limits
 
 from wrf_mi.backend import init
-from wrf_mi.backend.device import on_device, to_float, to_tensor
+from wrf_mi.backend.device import on_device, to_tensor
 from wrf_mi.backend.recorded import Recorded
 from wrf_mi.core import InputError
 from wrf_mi.core.arrays import planar_array
@@ -154,12 +154,12 @@ def _paths_alone() -> tuple[Call, Call]:
     known, split = record(20, receivers=receivers, frequencies_hz=carrier), make_splits(record(20), "random")[0]
     config = with_settings(calibration_config(["gain", "materials"], images=True), ["steps=100000", *ONLY_STEPS])
     trainer = Trainer(known, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
-    graph, targets, batch = trainer.graph, trainer.targets, trainer.schedule.rows[0]
+    graph, targets, batch = trainer.graph, trainer.plan.targets, trainer.schedule.rows[0]
     side = graph.trace(known.tx_pos_m, 0)[0]
     assert side is not None
     adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
     names, model, size = list(adam), graph.models[0], targets.truth.shape[2:]
-    loss_of = partial(trainer.task.loss, ssim_weight=config.loss.ssim_weight)
+    loss_of = partial(trainer.plan.task.loss, ssim_weight=config.loss.ssim_weight)
 
     def step(adam: Any, data: TrainingData, rows: Any, receiver: Any) -> Any:
         truth = data.select(rows, receiver, HEIGHT * WIDTH)[1]
@@ -170,7 +170,7 @@ def _paths_alone() -> tuple[Call, Call]:
         return dr.detach(found)
 
     recorded = Recorded(step, lambda: graph.arrays(0, side))
-    data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(1 / targets.unit))
+    data = TrainingData.of(targets)
     rows, receiver = on_device(batch, mi.UInt32), dr.opaque(mi.UInt32, 0)
 
     def ours() -> None:

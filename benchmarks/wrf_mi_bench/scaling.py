@@ -92,7 +92,7 @@ def _networks(count: int) -> Call:
 def _field(transmitters: int) -> Call:
     tx = transmitter_path(transmitters)
     field = make_field(TrainConfig().resolved(tx))
-    predictor = Predictor(field, parameters(field, SMALL, size_deg(SMALL)), [RECEIVER], HEIGHT, WIDTH)
+    predictor = Predictor.of_field(field, parameters(field, SMALL, size_deg(SMALL)), [RECEIVER], HEIGHT, WIDTH)
     return lambda: predictor(tx)
 
 

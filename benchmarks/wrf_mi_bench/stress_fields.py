@@ -20,8 +20,8 @@ from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians import Gaussians
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.footprint import CUTOFF, MIN_COSINE
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -15,8 +15,8 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import Receiver, unit_vectors
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -147,8 +147,8 @@ def _visits(of: Trainer) -> float:
     """Number of pairs of a pixel and a Gaussian on its tile's list, for one transmitter."""
     params = {name: dr.detach(value) for name, value in of.state.mean.items()}
     with dr.suspend_grad():
-        gaussians = of.field.gaussians(params, to_tensor(of.record.tx_pos_m[:1].T))
-        footprints = project(gaussians, device_pose(of.record.receivers[0]))
+        gaussians = of.field.gaussians(params, to_tensor(of.plan.record.tx_pos_m[:1].T))
+        footprints = project(gaussians, device_pose(of.plan.record.receivers[0]))
         order = depth_order(footprints.depth, gaussians.position)
         lists = build_lists(footprints, order, perception_plane(*of.graph.form.size, mi.Float), 1)
     return float(lists.length.numpy().sum()) * TILE_ROWS * TILE_COLUMNS

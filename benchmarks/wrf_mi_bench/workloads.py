@@ -13,7 +13,7 @@ from wrf_mi.backend.device import to_float
 from wrf_mi.core import Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import random_gaussians
-from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path

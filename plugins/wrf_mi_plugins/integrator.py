@@ -64,7 +64,7 @@ class TracedField(ADIntegrator):
     Evaluates the complex field at a receiver along each ray of its sensor: from near to far, each Gaussian adds its
     signal times its largest response on the ray, times the transmission of nearer Gaussians and walls. Gaussians with
     an ``opacity`` are blended as in WRF-GS+ (alpha), those with an ``attenuation`` as in WRF-GS (product). Order,
-    cut-off and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.render.splat`); the footprint is
+    cut-off and low-pass are those of the splatted evaluation (`wrf_mi.gaussians.blend.splat`); the footprint is
     exact where splatting projects (`wrf_mi_plugins.ray_response`).
 
     The field is the scene's ``ellipsoids`` shape with the attribute ``signal``, see

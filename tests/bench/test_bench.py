@@ -49,7 +49,6 @@ ON_PAGE = {
     "pareto": "speed.md",
     "scaling": "speed.md",
     "operator": "speed.md",
-    "budgets": "speed.md",
     "training": "speed.md",
     "stress": "numerics.md",
     "elsewhere": "numerics.md",

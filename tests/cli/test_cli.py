@@ -65,7 +65,6 @@ def test_commands_are_complete() -> None:
         "sweep",
         "evaluate",
         "predict",
-        "compress",
         "compare",
     }
     expected |= {"map", "locate", "view", "export", "import", "bench", "demo"}

@@ -17,7 +17,7 @@ from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.training.step import device_pose

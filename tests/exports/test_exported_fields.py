@@ -21,9 +21,7 @@ from wrf_mi.exports import ExportOptions, export
 from wrf_mi.exports.field_file import import_field
 from wrf_mi.exports.gaussians import RANGE_DB
 from wrf_mi.runs.api import train
-from wrf_mi.runs.compressed import compress_run
 from wrf_mi.runs.run import open_run
-from wrf_mi.training.compress import Compression
 
 TX_M = np.array([[-0.3, 0.2, 0.5]])
 SINGLE = 1e-5
@@ -149,15 +147,6 @@ def test_imported_field_predicts_the_same_bits(runs: dict[str, Path], tmp_path: 
         np.testing.assert_array_equal(run.field.params[name], values)
     with np.load(tmp_path / "field.npz", allow_pickle=False) as stored:
         assert stored["param/position"].shape == (3, 8)
-
-
-def test_field_in_half_precision_is_exported_in_single_precision(runs: dict[str, Path], tmp_path: Path) -> None:
-    compress_run(runs["wrf-gs"], tmp_path / "small", Compression(distil=0, precision="half"))
-    export(tmp_path / "small", "field", tmp_path / "small.npz")
-    run = import_field(tmp_path / "small.npz", tmp_path / "again")
-    np.testing.assert_array_equal(run.predict(TX_M).mean, open_run(tmp_path / "small").predict(TX_M).mean)
-    with np.load(tmp_path / "small.npz", allow_pickle=False) as stored:
-        assert not any(key.startswith("packed_") for key in stored)
 
 
 def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Path) -> None:

@@ -19,8 +19,7 @@ from wrf_mi.gaussians import (
     random_gaussians,
     tiles,
 )
-from wrf_mi.gaussians.blend import GROUP, group_size
-from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.blend import GROUP, group_size, splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -22,7 +22,7 @@ from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.operator import pixel_weights
 from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
-from wrf_mi.training import predictor
+from wrf_mi.training import evaluator
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
@@ -118,11 +118,11 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.M
     """Above a number of Gaussians nothing is recorded, networks run in chunks and lists are counted."""
     field, params = true_field("wrf-gs+")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
-    recorded = Predictor(field, params, RECEIVERS, *SIZE)
+    recorded = Predictor.of_field(field, params, RECEIVERS, *SIZE)
     expected = recorded(tx)
-    monkeypatch.setattr(predictor, "CHUNK_SIZE", 1)
+    monkeypatch.setattr(evaluator, "CHUNK_SIZE", 1)
     monkeypatch.setattr(tiles, "RESERVED", 0)
-    parts = Predictor(field, params, RECEIVERS, *SIZE)
+    parts = Predictor.of_field(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
-    assert not parts._recordings
-    assert all(one.n_recordings > 0 for one in recorded._recordings.values())
+    assert not parts.evaluate.recordings
+    assert all(one.n_recordings > 0 for one in recorded.evaluate.recordings.values())

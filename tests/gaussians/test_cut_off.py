@@ -15,10 +15,9 @@ from scipy.special import logit
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core.angles import pixel_directions
-from wrf_mi.gaussians.density import adapt
+from wrf_mi.gaussians.density import LEAST_OPACITY, adapt
 from wrf_mi.gaussians.footprint import CUTOFF, depth_order, project, ranked_order
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
-from wrf_mi.training.config import DensityConfig
 
 pytestmark = pytest.mark.all_threads
 
@@ -55,7 +54,7 @@ def test_cut_off_stays_within_its_bound(seed: int) -> None:
 @given(st.integers(0, 2**32))
 def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed: int) -> None:
     """The bound is that of the cut-off with the whole weight of each pruned Gaussian, at most its opacity."""
-    gaussians, least = fields(seed, False), DensityConfig().least_opacity
+    gaussians, least = fields(seed, False), LEAST_OPACITY
     opacity = 10.0 ** np.random.default_rng(seed).uniform(-4, 0, COUNT)
     parameters = {
         "position": np.stack([p.numpy()[:COUNT] for p in gaussians.position]),
@@ -64,7 +63,7 @@ def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed: in
         "opacity": logit(opacity[None]),
     }
     one = np.ones(COUNT)
-    change = adapt(parameters, one, one, np.random.default_rng(0), 0.0, COUNT, np.pi, least)
+    change = adapt(parameters, one, one, np.random.default_rng(0), 0.0, COUNT)
     pruned = np.setdiff1d(np.arange(COUNT), change.source)
     assert len(pruned) == (opacity < least).sum()
     strength = np.hypot(*(s.numpy()[:COUNT] for s in gaussians.signal))

@@ -19,14 +19,19 @@ from scipy.stats import kstest
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
-from wrf_mi.gaussians.density import SPLIT_SHRINK, DensityChange, adapt, reset_opacity
+from wrf_mi.gaussians.density import (
+    LEAST_OPACITY,
+    RESET_OPACITY,
+    SPLIT_SHRINK,
+    DensityChange,
+    adapt,
+    reset_opacity,
+)
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.training.config import InitialConfig
 from wrf_mi.training.initial import initial_gaussians
 from wrf_mi.training.state import FitState
 
-SPLIT_RAD = np.radians(5.0)
-LEAST_OPACITY = 0.005
 FLOAT32_EPS = 1e-6
 """Relative rounding of one or two float32 operations, with room."""
 SMALLEST_P = 1e-3
@@ -57,8 +62,6 @@ def one_round(parameters: dict[str, np.ndarray], view_gradient_norm: Any, **chan
         "rng": np.random.default_rng(1),
         "growth_fraction": 0.25,
         "max_gaussians": 10 * n,
-        "split_rad": SPLIT_RAD,
-        "least_opacity": LEAST_OPACITY,
     }
     return adapt(parameters, np.asarray(view_gradient_norm, float), **(arguments | changes))
 
@@ -174,9 +177,9 @@ def test_invariants_of_a_density_round(
 
 
 def test_opacity_reset() -> None:
-    before = np.float32([[-9.0, logit(0.05), 0.0, 5.0]])
-    after = reset_opacity(before, 0.05)
-    np.testing.assert_allclose(after, [[-9.0, logit(0.05), logit(0.05), logit(0.05)]], rtol=FLOAT32_EPS)
+    before = np.float32([[-9.0, logit(RESET_OPACITY), 0.0, 5.0]])
+    after = reset_opacity(before)
+    np.testing.assert_allclose(after, [[-9.0, *[logit(RESET_OPACITY)] * 3]], rtol=FLOAT32_EPS)
     assert after.dtype == np.float32
 
 
@@ -242,13 +245,13 @@ def test_training_step_works_after_a_density_round() -> None:
 def test_opacity_reset_clears_only_its_momentum() -> None:
     state, before = trained_state(5)  # opacity is the last parameter: the step count must not come from it
     first, _, _ = state.moments()
-    state.set_param("opacity", reset_opacity(before["opacity"], 0.05))
+    state.set_param("opacity", reset_opacity(before["opacity"]))
     new_first, new_second, count = state.moments()
     assert count == 3
     assert not new_first["opacity"].any()
     assert not new_second["opacity"].any()
     np.testing.assert_array_equal(new_first["signal"], first["signal"])
-    np.testing.assert_allclose(state.params()["opacity"].max(), logit(0.05), rtol=FLOAT32_EPS)
+    np.testing.assert_allclose(state.params()["opacity"].max(), logit(RESET_OPACITY), rtol=FLOAT32_EPS)
     assert {int(t[0]) for _, _, _, (t, _, _, _) in state.adam.state.values()} == {3}
 
 

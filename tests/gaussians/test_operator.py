@@ -18,8 +18,8 @@ from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import (
     Gaussians,
 )
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import Plane, perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -18,7 +18,7 @@ from wrf_mi.gaussians import (
     Gaussians,
     random_gaussians,
 )
-from wrf_mi.gaussians.render import splat
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 

@@ -162,14 +162,14 @@ def small(tmp_path: Path, *settings: str) -> Trainer:
 def test_validation_of_paths_alone_searches_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores of held-out rows by the paths known from the start: those of predictions, which search."""
     part = small(tmp_path)
-    observed = part.record.observation.copy()
+    observed = part.plan.record.observation.copy()
     observed[1, 9] = np.nan
-    record = replace(part.record, observation=observed)
+    record = replace(part.plan.record, observation=observed)
     split = Split("parts", 0, np.array([0, 2, 3, 6, 7, 8, 10]), np.array([1, 4, 5, 9, 11]), np.zeros(0, np.int64))
     trainer = Trainer(record, split, part.config, scene=part.graph.scene)
     predict = trainer.predictor()
     found = np.stack([predict.of_rows(record, split.validation, r) for r in range(2)])
-    expected = np.nanmedian(trainer.task.training_score(found, observed[:, split.validation]))
+    expected = np.nanmedian(trainer.plan.task.training_score(found, observed[:, split.validation]))
     monkeypatch.setattr(trainer.graph, "trace", lambda *_: pytest.fail("searched"))
     assert trainer.validate() == pytest.approx(float(expected), rel=1e-5)
 
@@ -180,13 +180,13 @@ def test_receivers_share_materials_and_steps_are_recorded_once(tmp_path: Path) -
     assert {PERMITTIVITY, "receiver.array.gain", "receiver.tag.gain"} <= set(trainer.state.adam)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
         trainer.run(stop=stop_after(12))
-        recorded = {key: step.n_recordings for key, step in trainer._steps.items()}
+        recorded = {key: step.n_recordings for key, step in trainer.steps.recorded.items()}
         dr.kernel_history_clear()
         trainer.run(stop=stop_after(12))
         history = dr.kernel_history([dr.KernelType.JIT])
     assert trainer.state.step == 24
     assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
-    assert {key: step.n_recordings for key, step in trainer._steps.items()} == recorded
+    assert {key: step.n_recordings for key, step in trainer.steps.recorded.items()} == recorded
     assert len(recorded) == 2
 
 
@@ -194,7 +194,7 @@ def test_step_with_non_finite_gradient_is_not_taken(tmp_path: Path) -> None:
     trainer = small(tmp_path)
     trainer.run(stop=stop_after(3))
     before = trainer.state.params()
-    trainer._loss = lambda prediction, observed, batch, *shape: dr.sum(prediction) / 0
+    trainer.steps.loss = lambda prediction, observed, batch, *shape: dr.sum(prediction) / 0
     trainer.record_functions()
     # Dr.Jit's sums drop NaN on the way back, so that Adam would go on by its momentum alone.
     with pytest.raises(NumericsError, match="step 4: not finite"):
@@ -230,8 +230,8 @@ def test_resumed_fit_keeps_its_paths(tmp_path: Path) -> None:
     assert (np.linalg.norm(whole.state.searched_m - stated, axis=1) > 0).any(), "the receivers have hardly moved"
     part.run(stop=stop_after(9))
     state = FitState.from_arrays(part.state.arrays())
-    resumed = Trainer(part.record, part.split, part.config, scene=part.graph.scene, state=state)
-    for side, searched_m in zip(resumed._sides, part.state.searched_m, strict=True):
+    resumed = Trainer(part.plan.record, part.plan.split, part.config, scene=part.graph.scene, state=state)
+    for side, searched_m in zip(resumed.sides, part.state.searched_m, strict=True):
         assert side is not None
         np.testing.assert_array_equal(side.searched_at_m, searched_m)
     resumed.run()

@@ -31,11 +31,9 @@ from wrf_mi.graph.graph import Batch, Graph
 from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.runs.api import open_run, train
-from wrf_mi.runs.compressed import compress_run
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
-from wrf_mi.training.compress import Compression
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
@@ -178,7 +176,7 @@ def made_record(rows: int = 60) -> tuple[Record, Any]:
     values = field.init(start, rng)
     values |= {name: 4 * value for name, value in values.items() if name.startswith("deform.signal.")}
     tx, every = np.random.default_rng(1).uniform(-1, 1, (rows, 3)), np.arange(rows)
-    spectra = Predictor(field, values, RECEIVERS[:1], *SIZE)(tx)
+    spectra = Predictor.of_field(field, values, RECEIVERS[:1], *SIZE)(tx)
     spectra = np.minimum(spectra / spectra.max(), 1)[None]
     own = {"official": (every[:40], every[40:])}
     return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, **own), start
@@ -323,6 +321,3 @@ def test_untraceable_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     record, _ = made_record(24)
     with pytest.raises(InputError, match=r"--evaluation belongs to Gaussians .*, not to idw"):
         train(record, tmp_path / "idw", "idw", evaluation="traced")
-    run = train(record, tmp_path / "run", "wrf-gs+", settings=settings("steps=2", "evaluation=traced"), split="random")
-    with pytest.raises(InputError, match="compress a run with evaluation=splatted"):
-        compress_run(run.folder, tmp_path / "small", Compression(budget=4), record)

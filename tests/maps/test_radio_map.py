@@ -22,10 +22,10 @@ from wrf_mi.maps import values
 from wrf_mi.maps.api import radio_map
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
-from wrf_mi.models.held_out import RowDistance
-from wrf_mi.models.hybrid.mixture import Mixture
 from wrf_mi.models.hybrid.model import FittedHybrid
 from wrf_mi.runs.run import Run
+from wrf_mi.training.by_distance import Mixture
+from wrf_mi.training.selection import RowDistance
 
 HZ = 2.44e9
 FIT_DB = 1e-3
@@ -238,7 +238,7 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
     # Training rows are traced alone.
     np.testing.assert_array_equal(np.isnan(found.learned), [True, True, False, False])
     np.testing.assert_array_equal(found.traced[:2], found.whole.mean[:2])
-    share = hybrid.mixture(RowDistance(record, np.arange(22))(positions, 0))[2:]
+    share = hybrid.mixture(RowDistance.of_rows(record, np.arange(22))(positions, 0))[2:]
     np.testing.assert_allclose(share[:, 0] * found.traced[2:] + share[:, 1] * found.learned[2:], found.whole.mean[2:])
     assert found.paths is not None
 

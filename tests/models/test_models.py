@@ -171,7 +171,6 @@ def test_runs_of_version_0_1_are_refused_by_every_command(
         ["evaluate", run],
         ["evaluate", run, "--split", "random"],
         ["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz"],
-        ["compress", run, "--out", out],
         ["compare", run, "--out", out],
     ):
         refused(arguments, message, capsys)

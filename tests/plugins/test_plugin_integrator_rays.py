@@ -19,8 +19,8 @@ from wrf_mi.backend.device import on_device
 from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.gaussians import Gaussians
+from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.footprint import NEAR_M, depth_order
-from wrf_mi.gaussians.render import splat
 from wrf_mi.gaussians.tiles import perception_plane
 
 BLENDINGS = ["alpha", "product"]

@@ -262,7 +262,6 @@ def test_bad_calls_are_refused(
             [*train, "--preset", "quick"],
             "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
         ),
-        (["compress", run, *out], "a run of mri, not of a learned field of spectra"),
     ):
         refused(arguments, message, capsys)
         assert not (tmp_path / "out").exists(), arguments

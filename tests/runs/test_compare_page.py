@@ -25,12 +25,10 @@ from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_tables import best_run, common, common_means, differences
-from wrf_mi.runs.compressed import compress_run
 from wrf_mi.runs.folder import AntennaOptions, read_config, start_run
 from wrf_mi.runs.repeat import changed_settings, command
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
-from wrf_mi.training.compress import Compression
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -185,11 +183,7 @@ def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, o
     assert set(changed) - {resolved} == {setting.partition("=")[0] for setting in steps}
     parsed = build_parser().parse_args(shlex.split(command(read_config(run), tmp_path / "again"))[1:])
     assert plan_run(parsed.dataset, **training_arguments(parsed))[1] == open_run(run).config
-    compress_run(run, tmp_path / "small", Compression(distil=0, precision="half"))
-    line = command(read_config(tmp_path / "small"), tmp_path / "small")
-    assert line.startswith(f"wrf-mi compress {run} --budget 0 ")
-    build_parser().parse_args(shlex.split(line)[1:])
-    page = compare([run, tmp_path / "small"], tmp_path / "out").read_text()
+    page = compare([run], tmp_path / "out").read_text()
     assert command(read_config(run), run) in unescape(page)
     assert "loss.ssim_weight=0.25" in page
     assert "deformation network" in page

@@ -15,13 +15,14 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.datasets import make_splits, write_ble_folder
 from wrf_mi.models import MODELS
-from wrf_mi.models.held_out import HeldOut, held_out_predictions, hold_out
+from wrf_mi.models.held_out import held_out_predictions
 from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.tracer import fit_offsets
+from wrf_mi.training.selection import HeldOut, hold_out
 
 LAW_DBM, EXPONENT = -40.0, 2.5
 ROUNDING_DB = 1e-4

@@ -13,15 +13,16 @@ import pytest
 from made_spectra import OCTAVES, RECEIVERS, SIZE, true_field
 from small_fits import settings
 
+from wrf_mi.backend.device import to_tensor
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.gaussians import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.static_signals import recorded_signals, static_signals
+from wrf_mi.gaussians.operator import recorded_signals, static_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
-from wrf_mi.training import static_operator as still
+from wrf_mi.training import evaluator
+from wrf_mi.training.evaluator import OperatorReports, Request, read_weights
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.static_operator import StaticOperator, read_weights
 
 GREYS = 1e-5
 """Largest difference of greys up to about one: float32 sums of some ten terms in another order."""
@@ -44,14 +45,28 @@ def made(model: str) -> tuple[Any, dict[str, np.ndarray]]:
     return field, field.init(start, rng)
 
 
+class Operator:
+    """Operators of a field's receivers, called with transmitters and the number of a receiver."""
+
+    def __init__(self, field: Any, params: Any, receivers: Any, height: int, width: int, store: Path | None = None):
+        self.reports = OperatorReports(Predictor.of_field(field, params, receivers, height, width).graph, store)
+        self.reports.update({name: to_tensor(values) for name, values in params.items()})
+
+    def __call__(self, tx_pos_m: np.ndarray, receiver: int) -> np.ndarray:
+        return self.reports(Request(tx_pos_m, receiver, None, np.arange(len(tx_pos_m))))
+
+    def key(self, receiver: int) -> str:
+        return self.reports.key(receiver)
+
+
 MODELS = ["wrf-gs", "factorised", "wrf-gs+ still"]
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_operator_predicts_as_splatting_does(model: str) -> None:
     field, params = made(model)
-    direct = Predictor(field, params, RECEIVERS, *SIZE)
-    by_operator = Predictor(field, params, RECEIVERS, *SIZE, operator=True)
+    direct = Predictor.of_field(field, params, RECEIVERS, *SIZE)
+    by_operator = Predictor.of_field(field, params, RECEIVERS, *SIZE, operator=True)
     for receiver in range(2):
         expected = direct(TX, receiver)
         assert np.abs(expected - expected[:1]).max() > 0.01
@@ -59,8 +74,8 @@ def test_operator_predicts_as_splatting_does(model: str) -> None:
     # Other parameters: everything is built anew.
     params["position"] = params["position"] + np.float32(0.2)
     for predictor in (direct, by_operator):
-        predictor.update({name: direct._params[name] * 1 for name in params})
-        predictor.update(Predictor(field, params, RECEIVERS, *SIZE)._params)
+        predictor.update({name: direct.evaluate.params[name] * 1 for name in params})
+        predictor.update(Predictor.of_field(field, params, RECEIVERS, *SIZE).evaluate.params)
     assert np.abs(direct(TX) - expected).max() > 0.01
     np.testing.assert_allclose(by_operator(TX), direct(TX), atol=GREYS)
 
@@ -68,9 +83,9 @@ def test_operator_predicts_as_splatting_does(model: str) -> None:
 def test_moving_geometry_is_splatted() -> None:
     """WRF-GS+ turns and stretches its Gaussians with the transmitter."""
     field, params = true_field("wrf-gs+")
-    asked = Predictor(field, params, RECEIVERS, *SIZE, operator=True)
-    np.testing.assert_array_equal(asked(TX), Predictor(field, params, RECEIVERS, *SIZE)(TX))
-    assert asked._still is None
+    asked = Predictor.of_field(field, params, RECEIVERS, *SIZE, operator=True)
+    np.testing.assert_array_equal(asked(TX), Predictor.of_field(field, params, RECEIVERS, *SIZE)(TX))
+    assert not isinstance(asked.evaluate, OperatorReports)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +102,7 @@ def test_networks_in_numpy_equal_those_of_the_field(field: Any, monkeypatch: pyt
     params = {k: v + 0.1 * rng.standard_normal(v.shape).astype(np.float32) for k, v in params.items()}
     tx = rng.uniform(-3, 3, (7, 3)).astype(np.float32)
     expected = recorded_signals(field, params)(tx)
-    monkeypatch.setattr("wrf_mi.gaussians.static_signals.PAIRS_PER_CHUNK", 100)  # three transmitters at a time
+    monkeypatch.setattr("wrf_mi.gaussians.operator.PAIRS_PER_CHUNK", 100)  # three transmitters at a time
     factors, coefficients = static_signals(field, params)
     found = coefficients(tx)
     if factors is not None:
@@ -111,7 +126,7 @@ def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch:
     def never(*_: Any) -> None:
         raise AssertionError("built although it is stored")
 
-    monkeypatch.setattr(still, "pixel_weights", never)
+    monkeypatch.setattr(evaluator, "pixel_weights", never)
     np.testing.assert_array_equal(open_run(run).predictor()(TX), built)
     assert stored.read_bytes() == first
     np.testing.assert_allclose(open_run(run, operator=False).predictor()(TX), built, atol=GREYS)
@@ -162,12 +177,12 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_changed_geometry_rebuilds_the_operator(what: str, tmp_path: Path) -> None:
     field, params = made("factorised")
-    before = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
+    before = Operator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
     before(TX, 0)
     field, params, receiver, size = CHANGES[what](field, params, RECEIVERS[0], SIZE)
-    after = StaticOperator(field, params, [receiver], *size, tmp_path)
+    after = Operator(field, params, [receiver], *size, tmp_path)
     assert after.key(0) != before.key(0)
-    expected = Predictor(field, params, [receiver], *size)(TX)
+    expected = Predictor.of_field(field, params, [receiver], *size)(TX)
     np.testing.assert_allclose(after(np.float32(TX), 0), expected, atol=GREYS)
     # Stored in place of the one before.
     count = params["position"].shape[1]
@@ -180,17 +195,17 @@ def test_changed_signals_keep_the_operator(model: str) -> None:
     field, params = made(model)
     changed = {k: v * 2 if k.startswith(field.signal_parameters) else v for k, v in params.items()}
     assert any(k.startswith(field.signal_parameters) for k in params)
-    keys = {StaticOperator(field, p, RECEIVERS[:1], *SIZE).key(0) for p in (params, changed)}
+    keys = {Operator(field, p, RECEIVERS[:1], *SIZE).key(0) for p in (params, changed)}
     assert len(keys) == 1
     if model == "wrf-gs":
         other = params | {"attenuation.1.bias": params["attenuation.1.bias"] + np.float32(0.1)}
-        assert StaticOperator(field, other, RECEIVERS[:1], *SIZE).key(0) not in keys
+        assert Operator(field, other, RECEIVERS[:1], *SIZE).key(0) not in keys
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "outside", "short", "format"])
 def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
     field, params = made("factorised")
-    expected = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
+    expected = Operator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
     path = tmp_path / "operator0.npz"
     with np.load(path) as stored:
         arrays = dict(stored)
@@ -206,7 +221,7 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
         else:
             arrays["format"] = np.asarray(99)
         np.savez(path, **arrays)
-    again = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
+    again = Operator(field, params, RECEIVERS[:1], *SIZE, tmp_path)
     np.testing.assert_array_equal(again(TX, 0), expected)
     assert read_weights(path, again.key(0), (SIZE[0] * SIZE[1], 8)) is not None
 
@@ -215,18 +230,18 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
 def test_operator_works_in_a_read_only_folder(tmp_path: Path) -> None:
     field, params = made("factorised")
     tmp_path.chmod(0o500)
-    found = StaticOperator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
-    np.testing.assert_array_equal(found, StaticOperator(field, params, RECEIVERS[:1], *SIZE)(TX, 0))
+    found = Operator(field, params, RECEIVERS[:1], *SIZE, tmp_path)(TX, 0)
+    np.testing.assert_array_equal(found, Operator(field, params, RECEIVERS[:1], *SIZE)(TX, 0))
     assert not any(tmp_path.iterdir())
 
 
 def test_too_large_operator_is_replaced_by_splatting(monkeypatch: pytest.MonkeyPatch) -> None:
     field, params = made("factorised")
-    monkeypatch.setattr(still, "MOST_BYTES", 1000)
-    asked = Predictor(field, params, RECEIVERS[:1], *SIZE, operator=True)
+    monkeypatch.setattr(evaluator, "MOST_BYTES", 1000)
+    asked = Predictor.of_field(field, params, RECEIVERS[:1], *SIZE, operator=True)
     with pytest.warns(UserWarning, match="operator: weights of 8 Gaussians take more than"):
         found = asked(TX)
-    np.testing.assert_array_equal(found, Predictor(field, params, RECEIVERS[:1], *SIZE)(TX))
+    np.testing.assert_array_equal(found, Predictor.of_field(field, params, RECEIVERS[:1], *SIZE)(TX))
     np.testing.assert_array_equal(asked(TX), found)  # and says so once
 
 
@@ -237,8 +252,6 @@ def test_factorised_field_needs_the_transmitter() -> None:
 
 def test_factorised_field_is_the_sum_of_its_terms() -> None:
     """S = C phi, per transmitter."""
-    from wrf_mi.backend.device import to_tensor
-
     field, params = made("factorised")
     tensors = {name: to_tensor(values) for name, values in params.items()}
     tx = to_tensor(TX.T)
@@ -250,7 +263,7 @@ def test_factorised_field_is_the_sum_of_its_terms() -> None:
 
 def test_each_receiver_has_its_operator(tmp_path: Path) -> None:
     field, params = made("factorised")
-    both = StaticOperator(field, params, RECEIVERS, *SIZE, tmp_path)
+    both = Operator(field, params, RECEIVERS, *SIZE, tmp_path)
     assert isinstance(RECEIVERS[1], Receiver)
     assert np.abs(both(TX, 0) - both(TX, 1)).max() > 0.01
     assert sorted(p.name for p in tmp_path.iterdir()) == ["operator0.npz", "operator1.npz"]

@@ -230,18 +230,18 @@ def test_receivers_share_planes_and_keep_their_recordings(scene: Any) -> None:
     names = {SHIFT, TILT, "material.surface.permittivity", "receiver.array.position", "receiver.tag.position"}
     assert names <= set(trainer.state.adam)
     trainer.run(stop=stop_after(10))
-    first, second = trainer._steps[0, 0, False, False], trainer._steps[1, 0, False, False]
+    first, second = trainer.steps.recorded[0, 0, False, False], trainer.steps.recorded[1, 0, False, False]
     recordings = second.n_recordings
     before = trainer.state.params()
     # As a step does once the receiver has moved by more than a quarter of a wavelength.
-    side = trainer._sides[0]
+    side = trainer.sides[0]
     assert side is not None
     side.search(moving.position_m + np.array([0.05, 0, 0]))
     trainer.run(stop=stop_after(6))
-    assert [side.searches for side in trainer._sides if side is not None] == [1, 0]
-    assert trainer._steps[0, 1, False, False] is not first
-    assert trainer._steps[1, 0, False, False] is second
-    assert (0, 0, True, False) not in trainer._steps
+    assert [side.searches for side in trainer.sides if side is not None] == [1, 0]
+    assert trainer.steps.recorded[0, 1, False, False] is not first
+    assert trainer.steps.recorded[1, 0, False, False] is second
+    assert (0, 0, True, False) not in trainer.steps.recorded
     assert second.n_recordings == recordings
     # Steps at either receiver move the planes.
     assert np.abs(trainer.state.params()[SHIFT] - before[SHIFT]).max() > 0

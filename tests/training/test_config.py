@@ -31,7 +31,7 @@ def read(values: Any, source: str = "config") -> TrainConfig:
 
 
 DEFAULTS = leaves(asdict(TrainConfig()))
-INSIDE = {"initial.opacity", "density.least_opacity", "density.reset_opacity"}
+INSIDE = {"initial.opacity"}
 """Shares that must be neither 0 nor 1: their logits are stored."""
 LARGEST = {
     "holdout_steps_fraction": 1.0,
@@ -178,6 +178,13 @@ def test_invalid_settings_are_refused(setting: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_settings_that_are_constants_now_are_read_at_their_value_alone() -> None:
+    """Run files of earlier versions have them."""
+    assert read({"density": {"split_deg": 5.0}, "network": {"phase_hz": 0.0}}) == TrainConfig()
+    with pytest.raises(InputError, match=r"config, setting density.split_deg: 6.0, where this version has 5.0"):
+        read({"density": {"split_deg": 6.0}})
+
+
 @pytest.mark.parametrize(
     "setting",
     [
@@ -203,8 +210,6 @@ def test_invalid_settings_are_refused(setting: str, message: str) -> None:
         "optimiser.ema_decay=1",
         "density.every=-1",
         "density.growth_fraction=2",
-        "density.least_opacity=0",
-        "density.reset_opacity=1",
     ],
 )
 def test_values_out_of_range(setting: str) -> None:

@@ -24,7 +24,8 @@ from wrf_mi.runs.api import train
 from wrf_mi.tasks import TASKS
 from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint
 from wrf_mi.training.config import TrainConfig, default_config
-from wrf_mi.training.predictor import TOGETHER, Predictor
+from wrf_mi.training.evaluator import TOGETHER
+from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.session import FitSession
 from wrf_mi.training.state import FitState
 from wrf_mi.training.step import TrainingData, device_pose
@@ -104,7 +105,7 @@ def test_power_equals_the_sum_over_the_full_sphere(model: str) -> None:
     trainer.state.set_param("level", np.array([[-0.3, 0.7]], np.float32))
     params = {name: dr.detach(trainer.state.adam[name]) for name in trainer.state.adam}
     arrays = {name: value.numpy() for name, value in params.items()}
-    predict = Predictor(trainer.field, arrays, record.receivers, 6, 24, graph=trainer.graph)
+    predict = Predictor(trainer.graph, arrays)
     for r, receiver in enumerate(record.receivers):
         found = predict(record.tx_pos_m[:1], r)[0]
         gaussians = trainer.field.gaussians(params, to_tensor(record.tx_pos_m[:1].T))

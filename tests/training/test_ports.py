@@ -64,14 +64,14 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(task: str, tolerance:
     form = Form("array" if task == "spectrum" else "power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ])[np.random.default_rng(0).permutation(np.arange(12) % 4)]
     graph = Graph(None, receivers, form, open_scene(xml, form.carrier_hz), CONFIG)
-    predict = Predictor(None, {}, receivers, *SIZE, graph=graph)
+    predict = Predictor(graph, {})
     found = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
     for hz in np.unique(rows):
         at = rows == hz
         single = Graph(
             None, receivers, replace(form, frequencies_hz=[hz], carriers_hz=None), open_scene(xml, hz), CONFIG
         )
-        alone = Predictor(None, {}, receivers, *SIZE, graph=single)
+        alone = Predictor(single, {})
         for number in range(2):
             np.testing.assert_allclose(found[number][at], alone(transmitters(12)[at], number), atol=tolerance)
 
@@ -83,7 +83,7 @@ def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count: in
     tracer = RayTracer(xml, instrument, OPTIONS)
     expected = tracer.observe(tracer.trace(transmitters(count)))[0]
     graph = Graph(None, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    certain, predict = (Predictor(None, {}, (array(),), *SIZE, graph=graph, phase_error=sd) for sd in (0.0, 1.0))
+    certain, predict = (Predictor(graph, {}, phase_error=sd) for sd in (0.0, 1.0))
     np.testing.assert_allclose(predict(transmitters(count), 0), expected, rtol=0, atol=TRACED)
     assert np.abs(certain(transmitters(count), 0) - expected).max() > 0.05
 
@@ -92,7 +92,7 @@ def test_gaussians_count_in_each_draw_of_the_paths_phases(xml: Path) -> None:
     """With phases that are as good as certain the expectation is the report itself, beside Gaussians, too."""
     field, params = true_field("wrf-gs+")
     graph = Graph(field, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    certain, nearly = (Predictor(field, params, (array(),), *SIZE, graph=graph, phase_error=sd) for sd in (0.0, 1e-9))
+    certain, nearly = (Predictor(graph, params, phase_error=sd) for sd in (0.0, 1e-9))
     for count in (1, 5):
         reports = [predict(transmitters(count), 0) for predict in (certain, nearly)]
         np.testing.assert_allclose(*reports, rtol=0, atol=10 * SINGLE)
@@ -102,7 +102,7 @@ def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml: Pat
     """Of rows whose positions are partly the same, some of them repeated, at two trained carriers and another one."""
     form = Form("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
     graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), replace(CONFIG, faint=0.05))
-    predict = Predictor(None, {}, (array(),), *SIZE, graph=graph)
+    predict = Predictor(graph, {})
     tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]
     carriers = np.array([CARRIERS_HZ[0], CARRIERS_HZ[2], BETWEEN_HZ]).repeat(4)
     found = predict(tx, 0, carriers_hz=carriers)
@@ -141,7 +141,7 @@ def test_strengths_at_ports_are_those_of_the_tracer(xml: Path) -> None:
     expected = tracer.observe(tracer.trace(transmitters(12), carriers_hz=rows))[0]
     form = Form("power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
     graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), CONFIG)
-    found = Predictor(None, {}, (array(),), *SIZE, graph=graph)(transmitters(12), 0, carriers_hz=rows)
+    found = Predictor(graph, {})(transmitters(12), 0, carriers_hz=rows)
     np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
 
 
@@ -193,13 +193,13 @@ def test_single_predictions_are_those_of_a_batch(receiver_model: str, xml: Path)
     field, params = true_field("wrf-gs+")
     form = Form(receiver_model, SIZE, frequencies_hz=np.array([CARRIERS_HZ[1]]))
     graph = Graph(field, (array(),), form, open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    predict = Predictor(field, params, (array(),), *SIZE, graph=graph)
+    predict = Predictor(graph, params)
     tx = transmitters(12)
     alone = np.concatenate([predict(tx[k : k + 1], 0) for k in range(12)])
-    traced = Predictor(None, {}, (array(),), *SIZE, graph=Graph(None, (array(),), form, graph.scene, CONFIG))
+    traced = Predictor(Graph(None, (array(),), form, graph.scene, CONFIG), {})
     assert np.abs(alone - traced(tx, 0)).max() > 0.01  # the Gaussians tell
     np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=SINGLE if receiver_model == "array" else SINGLE_DB)
-    assert any(name[0] == "both" and one.n_recordings for (name, _), one in predict._recordings.items())
+    assert any(name[0] == "both" and one.n_recordings for (name, _), one in predict.evaluate.recordings.items())
 
 
 @pytest.mark.parametrize(("off_m", "certain"), [(0.0, True), (0.03, False)])

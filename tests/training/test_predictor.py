@@ -18,13 +18,13 @@ FLOAT32_TOLERANCE = 1e-4
 def test_predictor_of_other_receivers_and_sizes() -> None:
     field, params = true_field("wrf-gs")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
-    both = Predictor(field, params, RECEIVERS, *SIZE)
+    both = Predictor.of_field(field, params, RECEIVERS, *SIZE)
     for r, receiver in enumerate(RECEIVERS):
-        alone = Predictor(field, params, [receiver], *SIZE)(tx)
+        alone = Predictor.of_field(field, params, [receiver], *SIZE)(tx)
         np.testing.assert_array_equal(both(tx, r), alone)
         np.testing.assert_array_equal(both(tx, receiver.name), alone)
         # Pixels are points: twice the size has the same directions at every other pixel.
-        double = Predictor(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
+        double = Predictor.of_field(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
         np.testing.assert_allclose(double[:, ::2, ::2], alone, atol=FLOAT32_TOLERANCE)
     assert np.abs(both(tx, 0) - both(tx, 1)).max() > 0.01
     # One by one or together.
@@ -42,7 +42,7 @@ def test_predictor_of_other_receivers_and_sizes() -> None:
 def test_invalid_positions_are_refused(positions: np.ndarray, message: str) -> None:
     field, params = true_field("wrf-gs+")
     with pytest.raises(InputError, match=message):
-        Predictor(field, params, RECEIVERS, *SIZE)(positions)
+        Predictor.of_field(field, params, RECEIVERS, *SIZE)(positions)
 
 
 def test_predictions_are_recorded_once(one_gateway: Record) -> None:
@@ -54,5 +54,5 @@ def test_predictions_are_recorded_once(one_gateway: Record) -> None:
     assert trainer.predictor() is predictor
     after = predictor(one_gateway.tx_pos_m[:3])
     assert np.abs(after - before).max() > 0
-    recorded = predictor._recordings.values()
+    recorded = predictor.evaluate.recordings.values()
     assert 1 <= sum(one.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm

@@ -16,8 +16,9 @@ from traced_rooms import SHOEBOX, write_xml
 from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.settings import with_settings
 from wrf_mi.tracing import open_scene
+from wrf_mi.training.by_distance import Reach, choose_reach
 from wrf_mi.training.config import default_config
-from wrf_mi.training.reach import Reach, choose_reach, hold_out_groups
+from wrf_mi.training.selection import hold_out_groups
 from wrf_mi.training.trainer import Trainer
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -147,7 +148,7 @@ FAR_M = np.array([[4.5, 3.5, 1.2]])
 
 
 def test_far_from_training_rows_a_joint_fit_predicts_its_paths_alone(joint: Trainer) -> None:
-    near_m = joint.record.tx_pos_m[:1]
+    near_m = joint.plan.record.tx_pos_m[:1]
     joint.state.reach_m = 0.1
     predict = joint.predictor()
     near, far = predict(near_m), predict(FAR_M)

@@ -70,7 +70,7 @@ def test_density_rounds_within_a_run(one_gateway: Record) -> None:
     assert losses[100] < 0.9 * losses[45]
     # The recordings are those for this number of Gaussians: a new predictor of the same parameters agrees.
     tx = one_gateway.tx_pos_m[:2]
-    again = Predictor(trainer.field, trainer.state.mean_params(), RECEIVERS[:1], *SIZE)
+    again = Predictor.of_field(trainer.field, trainer.state.mean_params(), RECEIVERS[:1], *SIZE)
     np.testing.assert_allclose(trainer.predictor()(tx), again(tx), atol=FLOAT32_TOLERANCE)
 
 
@@ -176,14 +176,14 @@ def test_nothing_is_compiled_after_the_first_steps(model: str, two_gateways: Rec
     trainer = Trainer(two_gateways, official(two_gateways), settings(*own, model=model))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
         trainer.run(stop=stop_after(10))
-        recordings = sum(step.n_recordings for step in trainer._steps.values())
+        recordings = sum(step.n_recordings for step in trainer.steps.recorded.values())
         dr.kernel_history_clear()
         trainer.run(stop=stop_after(20))
         history = dr.kernel_history([dr.KernelType.JIT])
     assert trainer.state.step == 30
     assert len(history) >= 20
     assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
-    assert sum(step.n_recordings for step in trainer._steps.values()) == recordings
+    assert sum(step.n_recordings for step in trainer.steps.recorded.values()) == recordings
 
 
 def test_garbage_collector_is_off_during_recording(one_gateway: Record) -> None:
@@ -253,7 +253,7 @@ def test_loss_of_a_step_is_the_papers(two_gateways: Record) -> None:
     for t in range(10):
         rows, r = trainer.schedule.rows[t], int(trainer.schedule.receiver[t])
         field, params = trainer.field, trainer.state.params()
-        greys = Predictor(field, params, two_gateways.receivers, *SIZE)(two_gateways.tx_pos_m[rows], r)
+        greys = Predictor.of_field(field, params, two_gateways.receivers, *SIZE)(two_gateways.tx_pos_m[rows], r)
         truth = two_gateways.observation[r, rows]
         expected.append(0.8 * np.abs(greys - truth).mean() + 0.2 * (1 - ssim(greys, truth).mean()))
         trainer.run(received.append, stop=stop_after(1))

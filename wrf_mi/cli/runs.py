@@ -1,4 +1,4 @@
-"""``wrf-mi evaluate``, ``predict``, ``compress`` and ``compare``: what is done with finished runs."""
+"""``wrf-mi evaluate``, ``predict`` and ``compare``: what is done with finished runs."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .output import Watch, show, show_metrics
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``evaluate``, ``predict``, ``compress`` and ``compare`` to the commands."""
-    for add in (_add_evaluate, _add_predict, _add_compress, _add_compare):
+    """Add ``evaluate``, ``predict`` and ``compare`` to the commands."""
+    for add in (_add_evaluate, _add_predict, _add_compare):
         add(commands)
 
 
@@ -86,33 +86,6 @@ def predict_command(a: Arguments) -> int:
         shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
     return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
-
-
-def _add_compress(commands: Any) -> None:
-    text = "make a smaller and faster run of a run, and measure the loss of accuracy"
-    parser = add_command(commands, "compress", compress_command, text)
-    add = parser.add_argument
-    add("run", metavar="RUN", help="run folder")
-    add("--out", required=True, metavar="RUN2", help="run folder to make")
-    add("--budget", type=int, default=0, metavar="N", help="number of Gaussians to keep (default: all)")
-    add("--width", type=int, default=0, metavar="N", help="neurons per layer of a smaller network")
-    add("--layers", type=int, default=0, metavar="N", help="hidden layers of a smaller network")
-    add("--terms", type=int, default=0, metavar="K", help="convert to a factorised field of K terms")
-    text = "steps in which the smaller network learns the old one's output (default: 6000)"
-    add("--distil", type=int, default=6000, metavar="STEPS", help=text)
-    add("--fine-tune", type=int, default=0, metavar="STEPS", help="further steps on the training rows (default: 0)")
-    add("--precision", default="half", help="precision of stored numbers: single, half (default) or 8bit")
-
-
-def compress_command(a: Arguments) -> int:
-    """Compress a run."""
-    from ..runs.compressed import compress_run, render
-    from ..training.compress import Compression
-
-    how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
-    with Watch() as watch:
-        found = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
-    return show(a.json, found, f"{render(found)}\nresults: {a.out}")
 
 
 def _add_compare(commands: Any) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
@@ -33,7 +32,7 @@ from ..tracing import open_scene
 from ..tracing.paths.corrected_scene import check_materials, moved_search
 from ..tracing.paths.instrument_parameters import gain_name
 from ..tracing.paths.solve import Prepared
-from ..training.reach import hold_out_groups, improves
+from ..training.selection import hold_out_groups, improves, last_gain
 from .fit import LEAST_PATHS, Fit, State
 from .misfit import Misfit
 from .moves import Moves
@@ -177,7 +176,7 @@ def correct_scene(
             unseen[stage] = fit_of(parts.held, parts.held_rows, state, by).misfit
             scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
             judged[stage] = parts.units(scores[stage])
-    kept = _kept(judged, task.higher_is_better)
+    kept = last_gain(judged.items(), task.higher_is_better, confidence=CONFIDENCE)
     best = chosen[kept] if kept else None
     final = fit_of(record, split.all_train, *(best or ()))
     state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
@@ -284,19 +283,6 @@ def _at_most(split: Split, count: int) -> Split:
     """The split with a random subset of its training and validation rows."""
     rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:count]
     return replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
-
-
-def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
-    """The last stage whose mean gain over the one kept before is more than 0, with the one-sided `CONFIDENCE`.
-
-    By Student's t distribution, as receivers are few.
-    """
-    kept = ""
-    for stage, score in scores.items():
-        known = np.count_nonzero(np.isfinite(score - scores[kept]))
-        if known > 1 and improves(score, scores[kept], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
-            kept = stage
-    return kept
 
 
 def _last_is_best(scores: Mapping[str, FloatArray], higher_is_better: bool) -> bool:

@@ -12,7 +12,6 @@ from ..models.gaussian.model import PARAM
 from ..models.model import keyed, under
 from ..runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new
 from ..runs.run import Run, open_run
-from ..training.packed import PACKED
 from .format import ExportOptions
 from .gaussians import field_of
 from .source import Source
@@ -36,7 +35,7 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     """
     run = source.run
     field = field_of(run)
-    kept = {key: values for key, values in field.arrays().items() if not key.startswith((PARAM, PACKED))}
+    kept = {key: values for key, values in field.arrays().items() if not key.startswith(PARAM)}
     model = stored_arrays(run.folder / FITTED)
     arrays: dict[str, Any] = {
         VERSION: FORMAT,

@@ -1,4 +1,4 @@
-"""Complex blending of footprints on the perception plane, and its hand-written derivative.
+"""Splatting: complex blending of footprints on the perception plane, and its hand-written derivative.
 
 The recurrence is that of `wrf_mi.gaussians.recurrence`; a lane of a vector register walks the list of its tile for a
 few pixels of one column. Under either rule a weight w_i T_i depends on geometry alone. Where transmitters share one
@@ -8,22 +8,21 @@ one Q: a further transmitter costs two products per pixel instead of a footprint
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from ..backend.device import quads
-from ..backend.vectors import Complex
-from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints
+from ..backend.vectors import Complex, Pose
+from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints, depth_order, project
+from .parameters import Gaussians
 from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
-from .tiles import LANE_ROWS, Plane, TileLists
+from .tiles import LANE_ROWS, Plane, TileLists, build_lists
 
-RECORD = 16
-"""Floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal."""
+RECORD = 16  # floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal
 
-GROUP = 4
-"""Transmitters whose sums a lane keeps: more would not fit into its registers."""
+GROUP = 4  # transmitters whose sums a lane keeps: more would not fit into its registers
 
 MOST_COPIED = 1 << 16
 """Floats of a gradient table of which each lane of each thread may sum into its private copy: some MB in all.
@@ -70,6 +69,8 @@ def along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
 
     All pixels of a lane share their azimuth (cosine, sine).
     """
+    # u = (cos e cos a, cos e sin a, sin e): x cos a + y sin a is common to the pixels of a column, which saves half of
+    # each pixel's products.
     cosine, sine = azimuth
     return [[dr.fma(x, cosine, y * sine), z] for x, y, z in (record[0:3], record[3:6], record[6:9])]
 
@@ -104,6 +105,7 @@ def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
 
 def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
     """Signals of a group for one Gaussian."""
+    # Packets of four floats hold two signals; an odd group leaves half a packet and reads its floats one by one.
     if group % 2:
         values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
     else:
@@ -135,23 +137,41 @@ class Lanes:
     group: Any
 
 
-def lanes_of(plane: Plane, lists: TileLists, n: int, batch: int, shared: bool = False) -> Lanes:
-    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
+@dataclass
+class Layout:
+    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``.
+
+    ``fields`` is the number of a record's floats without the signal, ``size`` that of transmitters whose sums a lane
+    keeps.
+    """
+
+    lists: TileLists
+    plane: Plane
+    n: int
+    batch: int
+    shared: bool
+    fields: int
+    size: int
+
+
+def lanes_of(layout: Layout) -> Lanes:
+    """The lanes of all groups of transmitters."""
+    plane, lists, size = layout.plane, layout.lists, layout.size
     index_type = type(lists.index)
-    size = group_size(batch) if shared else 1
-    lane = dr.arange(index_type, batch // size * plane.lanes)
+    # Lanes of one group of transmitters follow each other, so that those of a register walk the same list.
+    lane = dr.arange(index_type, layout.batch // size * plane.lanes)
     inner, group = lane % plane.lanes, lane // plane.lanes
 
     def spread(array: Any) -> Any:
         return dr.gather(type(array), array, inner)
 
-    tile = spread(plane.tile) if shared else group * plane.tiles + spread(plane.tile)
+    tile = spread(plane.tile) if layout.shared else group * plane.tiles + spread(plane.tile)
     return Lanes(
         azimuth=[spread(a) for a in plane.azimuth],
         elevation=[[spread(c) for c in e] for e in plane.elevation],
         pixel=[[(group * size + k) * plane.pixels + spread(p) for k in range(size)] for p in plane.pixel],
         active=[spread(a) for a in plane.active],
-        start=lists.begin(tile, n),
+        start=lists.begin(tile, layout.n),
         end=dr.gather(index_type, lists.length, tile),
         group=group,
     )
@@ -171,14 +191,11 @@ def _blend_one(
 
 
 @dr.syntax
-def _forward(
-    table: Any, signals: Any, lists: TileLists, plane: Plane, n: int, product: bool, batch: int
-) -> tuple[Any, Any]:
+def _forward(table: Any, signals: Any, layout: Layout) -> tuple[Any, Any]:
     """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
+    lists, n, shared, fields, size = layout.lists, layout.n, layout.shared, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
-    shared, fields = signals is not None, 11 if product else 10
-    size = group_size(batch) if shared else 1
-    lanes = lanes_of(plane, lists, n, batch, shared)
+    lanes = lanes_of(layout)
     state = ForwardState.start(float_type, LANE_ROWS, size)
     j = index_type(0)
     while j < lanes.end:
@@ -189,7 +206,7 @@ def _forward(
         j += 1
     # Each scatter below is a kernel that would run the loop again.
     dr.eval(state.total)
-    out_re, out_im = dr.zeros(float_type, batch * plane.pixels), dr.zeros(float_type, batch * plane.pixels)
+    out_re, out_im = (dr.zeros(float_type, layout.batch * layout.plane.pixels) for _ in range(2))
     for row in range(LANE_ROWS):
         for k in range(size):
             dr.scatter(out_re, state.total[row][k][0], lanes.pixel[row][k], lanes.active[row])
@@ -234,24 +251,21 @@ def _derivatives(
 def _backward(
     table: Any,  # [batch * n * RECORD], or [n * RECORD] of a shared geometry
     signals: Any,  # [2 * batch * n] of a shared geometry, else None
-    lists: TileLists,
-    plane: Plane,
-    n: int,
-    product: bool,
-    batch: int,
+    layout: Layout,
     total: tuple[Any, Any],  # re, im, [batch * pixels] each
     gradient: tuple[Any, Any],  # re, im, [batch * pixels] each
 ) -> tuple[Any, Any]:
     """Gradients of both tables, in their layouts."""
+    lists, n, shared, fields, size = layout.lists, layout.n, layout.shared, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
-    shared, fields = signals is not None, 11 if product else 10
-    size = group_size(batch) if shared else 1
-    lanes = lanes_of(plane, lists, n, batch, shared)
+    lanes = lanes_of(layout)
     slopes, state = reverse_start(lanes.pixel, lanes.active, total, gradient)
+    # The targets of the loop's scatters exist before it: inside of a recorded loop nothing can be evaluated.
     out = dr.zeros(float_type, dr.width(table))
     out_signals = dr.zeros(float_type, dr.width(signals)) if shared else None
     dr.eval(out, out_signals, (slopes, state) if shared else None)
     copied = dr.width(table) + (dr.width(signals) if shared else 0) <= MOST_COPIED
+    # `Auto` sums into private copies of each thread, `Local` adds up within a register first and then in place.
     mode = dr.ReduceMode.Auto if copied else dr.ReduceMode.Local
     j = index_type(0)
     while j < lanes.end:
@@ -260,6 +274,7 @@ def _backward(
         record = read(table, i, fields if shared else fields + 2)
         sent = _read_signals(signals, slot, size) if shared else [tuple(record[fields:])]
         values, by_signal, is_seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
+        # Without a shared geometry a record ends with its signal, and one table takes all gradients.
         values, by_signal = (values, by_signal) if shared else (values + by_signal, [])
         for k in range(len(values)):
             dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, is_seen, mode=mode)
@@ -272,38 +287,28 @@ def _backward(
 class _Blend(dr.CustomOp):
     """Blending as one differentiable operation over per-Gaussian columns and signals."""
 
-    def eval(
-        self,
-        lists: TileLists,
-        plane: Plane,
-        n: int,
-        product: bool,
-        batch: int,
-        shared: bool,
-        columns: list[Any],
-        signal: list[Any],
-    ) -> Any:
-        self.arguments = (lists, plane, n, product, batch)
-        self.count = len(columns)
-        self.table = pack([*columns, *([] if shared else signal)])
-        self.signals = _pack_signals(signal, n, batch) if shared else None
+    def eval(self, layout: Layout, columns: list[Any], signal: list[Any]) -> Any:
+        self.layout = layout
+        self.table = pack([*columns, *([] if layout.shared else signal)])
+        self.signals = _pack_signals(signal, layout.n, layout.batch) if layout.shared else None
         dr.eval(self.table, self.signals)
-        self.total = _forward(self.table, self.signals, *self.arguments)
+        self.total = _forward(self.table, self.signals, layout)
         dr.eval(self.total)
         return self.total
 
     def backward(self) -> None:
         gradient: Any = self.grad_out()
         dr.eval(gradient)
-        out, out_signals = _backward(self.table, self.signals, *self.arguments, self.total, gradient)
+        out, out_signals = _backward(self.table, self.signals, self.layout, self.total, gradient)
         dr.eval(out, out_signals)
-        columns = unpack(out, self.count + 2)
+        count = self.layout.fields
+        columns = unpack(out, count + 2)
         if out_signals is None:
-            by_signal = columns[self.count :]
+            by_signal = columns[count:]
         else:
-            slots = _signal_slots(self.arguments[2], self.arguments[4], dr.uint32_array_t(type(out)))
+            slots = _signal_slots(self.layout.n, self.layout.batch, dr.uint32_array_t(type(out)))
             by_signal = [dr.gather(type(out), out_signals, slots + part) for part in (0, 1)]
-        self.set_grad_in("columns", columns[: self.count])
+        self.set_grad_in("columns", columns[:count])
         self.set_grad_in("signal", by_signal)
 
     def name(self) -> str:
@@ -336,5 +341,29 @@ def blend(
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)
     shared = batch > 1 and dr.width(footprints.radius) == n
-    result: tuple[Any, Any] = dr.custom(_Blend, lists, plane, n, len(blending) == 2, batch, shared, columns, signal)
+    layout = Layout(lists, plane, n, batch, shared, len(columns), group_size(batch) if shared else 1)
+    result: tuple[Any, Any] = dr.custom(_Blend, layout, columns, signal)
     return result
+
+
+def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
+    """Received complex signal per direction for each transmitter of the batch.
+
+    Args:
+        gaussians: Gaussians of one field for ``batch`` transmitters.
+        pose: pose of the receiver.
+        plane: the receiver's perception plane, see `wrf_mi.gaussians.tiles.perception_plane`.
+
+    Returns:
+        Real and imaginary part, arrays [batch * height * width], row-major.
+    """
+    batch, signal = gaussians.batch, gaussians.signal
+    if not gaussians.count:
+        dark = type(gaussians.position[0])
+        return dr.zeros(dark, batch * plane.pixels), dr.zeros(dark, batch * plane.pixels)
+    # One geometry for all transmitters is projected once.
+    gaussians = replace(gaussians, batch=1) if gaussians.shared else gaussians.spread()
+    footprints = project(gaussians, pose)
+    order = depth_order(footprints.depth, gaussians.position)
+    lists = build_lists(footprints, order, plane, gaussians.batch)
+    return blend(footprints, signal, lists, plane, batch, gaussians.blending)

@@ -20,6 +20,12 @@ Arrays = dict[str, NDArray[np.float32]]
 
 SPLIT_SHRINK = 1.6
 """Ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)."""
+SPLIT_RAD = float(np.radians(5.0))
+"""Size as seen from the receiver above which a growing Gaussian is split instead of cloned."""
+LEAST_OPACITY = 0.005
+"""Opacity below which a Gaussian is pruned (Kerbl et al. 2023)."""
+RESET_OPACITY = 0.05
+"""Largest opacity after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow back."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,6 @@ def adapt(
     rng: np.random.Generator,
     growth_fraction: float,
     max_gaussians: int,
-    split_rad: float,
-    least_opacity: float,
 ) -> DensityChange:
     """One round of pruning, cloning and splitting.
 
@@ -58,12 +62,10 @@ def adapt(
         rng: generator of the positions of split Gaussians.
         growth_fraction: share of the Gaussians that are cloned or split.
         max_gaussians: largest number of Gaussians.
-        split_rad: angular size from which a Gaussian is split rather than cloned.
-        least_opacity: Gaussians below it are removed.
     """
     keep = view_gradient_norm > 0
     if "opacity" in parameters:
-        keep &= parameters["opacity"][0] >= logit(least_opacity)
+        keep &= parameters["opacity"][0] >= logit(LEAST_OPACITY)
     if not keep.any():
         # A field without Gaussians could never recover: the strongest stays.
         keep[np.argmax(parameters["opacity"][0] if "opacity" in parameters else view_gradient_norm)] = True
@@ -72,7 +74,7 @@ def adapt(
     growing = alive[np.argsort(-view_gradient_norm[alive], kind="stable")[:room]]
     # Angular size, as a receiver sees it, decides between a clone and a split: metres far away are no detail.
     size = np.exp(parameters["log_scale"].max(axis=0)) / distance_m
-    split = growing[size[growing] > split_rad]
+    split = growing[size[growing] > SPLIT_RAD]
     source = np.concatenate([alive, growing])
     fresh = np.concatenate([np.isin(alive, split), np.ones(len(growing), bool)])
     new = {name: values[:, source].copy() for name, values in parameters.items()}
@@ -92,6 +94,6 @@ def adapt(
     return DensityChange(new, source, fresh)
 
 
-def reset_opacity(opacity_logits: NDArray[np.float32], at_most: float) -> NDArray[np.float32]:
-    """Opacity logits, limited to an opacity of ``at_most``."""
-    return np.minimum(opacity_logits, np.float32(logit(at_most)))
+def reset_opacity(opacity_logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Opacity logits, limited to `RESET_OPACITY`."""
+    return np.minimum(opacity_logits, np.float32(logit(RESET_OPACITY)))

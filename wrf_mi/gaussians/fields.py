@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 
 import drjit as dr
 import numpy as np
-from scipy.constants import speed_of_light
 
-from ..backend.vectors import times
 from ..core import InputError
 from .encoding import encode, encoded_size
 from .initial import InitialGaussians
@@ -26,9 +24,6 @@ GEOMETRY = ("position", "log_scale", "rotation")
 A field whose geometry and attenuation do not depend on the transmitter has ``static_geometry`` true, and lists in
 ``signal_parameters`` the prefixes of the parameters that affect only its signals.
 """
-
-NEAREST_M = 1e-3
-"""Smallest distance of a phase: the gradient is unbounded where an image lies in a Gaussian's centre."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +103,7 @@ class WrfGs:
         weights |= init_layer("attenuation.0", {"position": sizes["position"]}, self.width, rng)
         for i in range(1, self.layers):
             weights |= init_layer(f"attenuation.{i}", {"hidden": self.width}, self.width, rng)
+        # z starts near 2, where |delta| = 2 / sqrt(5) = 0.9.
         weights |= init_layer("attenuation.delta", {"hidden": self.width}, 2, rng, gain=0.1)
         weights["attenuation.delta.bias"][0] = 2.0
         first, second = self.signal_widths
@@ -124,12 +120,14 @@ class WrfGs:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
+        # The first network sees Gaussians alone: once for all transmitters of the batch.
         batch, hidden = tx_pos.shape[1], self.features(params)
         z = linear(params, "attenuation.delta", hidden)
         re, im = rows(z)
         # delta = z / sqrt(1 + |z|^2): |delta| < 1, so that a Gaussian never amplifies what lies behind it.
         norm = dr.rsqrt(1 + dr.square(re) + dr.square(im))
         encoded = {"transmitter": self.encoding.transmitter(tx_pos)}
+        # The only layers that grow with the pairs of Gaussian and transmitter.
         hidden = dense_of_pairs(params, "signal.0", {"feature": hidden}, encoded)
         signal = linear(params, "signal.out", dense(params, "signal.1", hidden))
         return Gaussians(
@@ -149,8 +147,6 @@ class WrfGsPlus:
     three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
     With ``static_geometry`` only the first head is present: the map from the Gaussians' signals to the receiver is then
     common to all transmitters.
-    With ``phase_hz`` each signal turns as a wave does on its way from the transmitter's image, x' = A x + b, to the
-    Gaussian: exp(-j 2 pi f abs(x' - position) / c), which the network then need not learn; A and b are not trained.
     Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
     rotation's to the quaternion before it is normalised; the heads start small, so that the static
     field dominates at first.
@@ -162,16 +158,11 @@ class WrfGsPlus:
     width: int = 256
     skip: int = 4
     static_geometry: bool = False
-    phase_hz: float = 0.0
     components: int = 1
 
     blending = "alpha"
-    signal_parameters = ("signal", "deform.", "image")
-
-    @property
-    def per_gaussian(self) -> tuple[str, ...]:
-        """Names of the per-Gaussian parameters."""
-        return (*GEOMETRY, "opacity", "signal", *(("image",) if self.phase_hz else ()))
+    per_gaussian = (*GEOMETRY, "opacity", "signal")
+    signal_parameters = ("signal", "deform.")
 
     @property
     def heads(self) -> tuple[tuple[str, int, float], ...]:
@@ -184,8 +175,6 @@ class WrfGsPlus:
         sizes, weights = self.encoding.sizes, initial.geometry()
         weights["opacity"] = initial.opacity_logit()
         weights["signal"] = np.concatenate([initial.static_signal(rng) for _ in range(self.components)])
-        if self.phase_hz:
-            weights["image"] = initial.image()
         for i in range(self.layers):
             inputs = ({"hidden": self.width} if i else {}) | (sizes if i in (0, self.skip) else {})
             weights |= init_layer(f"deform.{i}", inputs, self.width, rng)
@@ -204,40 +193,26 @@ class WrfGsPlus:
                 hidden = dense_of_pairs(params, f"deform.{i}", position, transmitter, hidden)
             else:
                 hidden = dense(params, f"deform.{i}", hidden)
+        # Every head is one small product of the last layer; what a static geometry does not need is not computed.
         offset = {head: rows(linear(params, f"deform.{head}", hidden)) for head, _, _ in self.heads}
 
         def deformed(name: str, head: str) -> list[dr.ArrayBase]:
             if head not in offset:
                 return rows(params[name])
+            # Batch-major as the network's columns: b * n + i.
             static = [dr.tile(a, batch) for a in rows(params[name])]
             return [a + d for a, d in zip(static, offset[head], strict=True)]
 
         opacity = logistic(params["opacity"].array)
-        signal = deformed("signal", "signal")
         return Gaussians(
             position=rows(params["position"]),
             scale=[dr.exp(s) for s in deformed("log_scale", "scale")],
             rotation=deformed("rotation", "rotation"),
-            signal=self._turned(signal, params, tx_pos) if self.phase_hz else signal,
+            signal=deformed("signal", "signal"),
             opacity=opacity if self.static_geometry else dr.tile(opacity, batch),
             attenuation=None,
             batch=batch,
         )
-
-    def _turned(self, signal: list[dr.ArrayBase], params: Params, tx_pos: dr.ArrayBase) -> list[dr.ArrayBase]:
-        """Signals [batch * n] with the phase of their ways from the transmitter's images."""
-        batch, position, image = tx_pos.shape[1], rows(params["position"]), rows(dr.detach(params["image"]))
-        x = [dr.repeat(c, dr.width(position[0])) for c in rows(tx_pos)]
-        away = []
-        for k in range(3):
-            a, b, c, d = (dr.tile(part, batch) for part in image[4 * k : 4 * k + 4])
-            away.append(a * x[0] + b * x[1] + c * x[2] + d - dr.tile(position[k], batch))
-        square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-        turns = dr.sqrt(dr.maximum(square, NEAREST_M**2)) * (self.phase_hz / speed_of_light)
-        # Subtract whole turns first: sines of large arguments have no digits left in float32.
-        sine, cosine = dr.sincos(-2 * dr.pi * (turns - dr.detach(dr.round(turns))))
-        re, im = signal  # a field with a phase has one component
-        return list(times((re, im), (cosine, sine)))
 
 
 @dataclass(frozen=True)
@@ -282,6 +257,7 @@ class Factorised:
         """Parameters as NumPy arrays; ``signal`` is C, [2 K, n] a component: real, then imaginary parts."""
         weights = initial.geometry()
         weights["opacity"] = initial.opacity_logit()
+        # Sums of K terms of this deviation have the deviation of a static signal.
         deviation = initial.signal / np.sqrt(self.terms)
         drawn = rng.standard_normal((2 * self.terms * self.components, initial.count))
         weights["signal"] = (drawn * deviation).astype(np.float32)

@@ -24,8 +24,6 @@ class InitialGaussians:
         opacity: alpha at the centre, common to all or of each, shape [n], in (0, 1).
         signal: standard deviation of the random starting signals.
         signals: complex signal of each, shape [n], in place of random ones; None: random.
-        image_map: affine map [n, 3, 4] of the transmitter to the image that each represents, image = A [x, 1]; None:
-            the identity.
     """
 
     position_m: NDArray[np.float64]
@@ -33,7 +31,6 @@ class InitialGaussians:
     opacity: float | NDArray[np.float64] = 0.1
     signal: float = 0.3
     signals: NDArray[np.complex128] | None = None
-    image_map: NDArray[np.float64] | None = None
 
     @property
     def count(self) -> int:
@@ -60,11 +57,6 @@ class InitialGaussians:
             return np.stack([self.signals.real, self.signals.imag]).astype(np.float32)
         return (rng.standard_normal((2, self.count)) * self.signal).astype(np.float32)
 
-    def image(self) -> NDArray[np.float32]:
-        """The parameter ``image``: `image_map`, rows [A b], shape [12, n]."""
-        maps = np.tile(np.eye(3, 4), (self.count, 1, 1)) if self.image_map is None else self.image_map
-        return np.ascontiguousarray(maps.reshape(-1, 12).T, np.float32)
-
 
 def random_gaussians(
     receivers: Sequence[Receiver],
@@ -74,6 +66,7 @@ def random_gaussians(
     size_deg: float = 7.0,
     opacity: float = 0.1,
     signal: float = 0.3,
+    *,
     sphere: bool = False,
 ) -> InitialGaussians:
     """Gaussians in random directions around the receivers, uniform over each receiver's hemisphere or full sphere.
@@ -91,6 +84,7 @@ def random_gaussians(
         direction = unit_vectors(rng.uniform(0, 2 * np.pi, len(index)), elevation)
         distance = rng.uniform(*distance_m, len(index))
         position[index] = receiver.position_m + (direction * distance[:, None]) @ receiver.to_world.T
+        # Of equal size as seen from the receiver, near or far: a receiver resolves angles, not metres.
         scale[index] = distance * np.tan(np.radians(size_deg))
     return InitialGaussians(position, scale, opacity, signal)
 

@@ -46,6 +46,7 @@ class _Rectified(dr.CustomOp):
     def eval(self, product: Any, per_gaussian: Any, per_transmitter: Any) -> Any:
         outputs, self.batch = per_transmitter.shape
         self.columns = per_gaussian.shape[1] if per_gaussian is not None else product.shape[1] // self.batch
+        # Columns are batch-major (b * n + i): a transmitter's part repeats, a Gaussian's is tiled.
         total = dr.repeat(per_transmitter.array, self.columns)
         if per_gaussian is not None and self.batch > 1:
             wide = dr.reshape(per_gaussian, (outputs, 1, self.columns)) + dr.zeros(
@@ -67,6 +68,7 @@ class _Rectified(dr.CustomOp):
         slope = kind(dr.select(self.out.array > 0, gradient.array, 0), self.out.shape)
         dr.eval(slope)
         self.set_grad_in("per_transmitter", kind(dr.block_sum(slope.array, self.columns), (outputs, self.batch)))
+        # What all transmitters of the batch share gets the sum of their gradients.
         if self.present[1]:
             parts: Any = dr.reshape(slope, (outputs, self.batch, self.columns))
             self.set_grad_in("per_gaussian", slope if self.batch == 1 else dr.sum(parts, axis=1))

@@ -12,32 +12,38 @@ depend on the number of Gaussians. Products are SciPy's (sparse) and NumPy's (de
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 
-from ..backend.device import on_device
+from ..backend.device import on_device, to_tensor
+from ..backend.recorded import Recorded
 from ..backend.vectors import Complex, Pose
 from ..core import InputError
 from ..parallel.threads import one_blas_thread, processors
 from .blend import along_azimuth, columns_of, footprint_at, pack, read
+from .fields import Factorised, WrfGs
 from .footprint import Footprints, depth_order, project
+from .network import dense, linear
 from .parameters import Gaussians
-from .recurrence import SMALLEST_FACTOR, forward_step
+from .recurrence import forward_step
 from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
-MOST_IN_STRIP = 2**32 - 1
-"""Largest number of entries of one row of tiles."""
-BLOCK = 16
-"""Transmitters at once: 4 MB of complex numbers for 360 x 90 directions, which stay in the cache."""
+MOST_IN_STRIP = 2**32 - 1  # largest number of entries of one row of tiles
+BLOCK = 16  # transmitters at once: 4 MB of complex numbers for 360 x 90 directions, which stay in the cache
+PAIRS_PER_CHUNK = 1 << 15
+"""Pairs of Gaussian and transmitter whose signals are computed at once: 16 MB of a layer of 128."""
+
+Coefficients = Callable[[NDArray[np.float32]], NDArray[np.complex64]]
+"""Coefficients c of transmitters [m, 3] in metres: [m, K], or signals [m, n]."""
 
 
 def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:
@@ -103,6 +109,7 @@ def _store(
         weight, after = forward_step(record[9:], g, before)
         for array, value in zip(out, (i, *weight), strict=True):
             dr.scatter(array, value, slot, hit)
+        # The entries of a pixel are consecutive: the next Gaussian that it sees goes to the next slot.
         next_slots.append(dr.select(hit, slot + 1, slot))
         behind.append(after)
     return next_slots, behind
@@ -136,6 +143,8 @@ def _weights(
     entries = dr.zeros(index_type, count)
     for k, visible_count in enumerate(_count(table, lists, strip, n)):
         dr.scatter(entries, visible_count, strip.pixel[k] - first, strip.active[k])
+    # Counted before they are stored, as a compressed sparse row matrix needs the begin of each pixel's entries; on the
+    # host in 64 bits, as a sum in 32 bits would wrap around unnoticed.
     start: NDArray[np.int64] = np.concatenate([[0], np.cumsum(entries.numpy(), dtype=np.int64)])
     total = int(start[-1])
     if total > MOST_IN_STRIP:
@@ -148,6 +157,7 @@ def _weights(
     dr.eval(out)
     _fill(table, lists, strip, n, fields, slots, out)
     values: NDArray[Any] = out[1].numpy()[:total]
+    # Alpha blending has real weights, product blending complex ones.
     if len(out) == 3:
         values = values + np.asarray(1j, np.result_type(values, np.complex64)) * out[2].numpy()[:total]
     return csr_array((values, out[0].numpy()[:total].astype(np.int32), start), shape=(count, n))
@@ -181,6 +191,7 @@ def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: fl
         for strip, first, count in _strips(plane):
             parts.append(_weights(table, len(columns), footprints, order, strip, first, count))
             size += parts[-1].data.nbytes + parts[-1].nnz * np.dtype(np.int32).itemsize
+            # Checked strip by strip: what does not fit is refused before it fills the memory.
             if size > most_bytes:
                 raise MemoryError(f"weights of {gaussians.count} Gaussians take more than {most_bytes / 1e6:.0f} MB")
     matrix = csr_array(vstack(parts, format="csr"))
@@ -276,29 +287,52 @@ class PixelOperator(_Operator):
         return Images((self.weights @ np.asarray(factors, self.kind)).T, self.height, self.width)
 
 
-def removal(gaussians: Gaussians, pose: Pose, plane: Plane) -> NDArray[np.float64]:
-    """Sum over the plane's pixels of |change of R| on removal of one Gaussian, [n].
+def static_signals(field: Any, params: Mapping[str, Any]) -> tuple[NDArray[np.complex64] | None, Coefficients]:
+    """Signals S = C c of a field: factors C [n, K], or None where the coefficients are the signals, and c.
 
-    In the terms of `wrf_mi.gaussians.recurrence`: removal of Gaussian i takes away w_i T_i S_i, and scales the sum Q_i
-    behind it, which it hides, by 1 / b_i. With the weights B_i = w_i T_i of `pixel_weights`, the transmittance is
-    T_i = 1 - sum_{k < i} B_k (alpha blending) or 1 - sum_{k < i} B_k (1 - delta_k) (product blending).
+    Other classes, subclasses included, may compute signals otherwise; theirs are `recorded_signals`.
     """
-    weights = pixel_weights(gaussians, pose, plane)
-    gaussian, start, length = weights.indices, weights.indptr[:-1], np.diff(weights.indptr)
-    delta = [np.array(part, float) for part in gaussians.attenuation or (np.zeros(gaussians.count),) * 2]
-    re, im = (np.array(part, float) for part in gaussians.signal)
-    sent, hidden = (weights.data * values[gaussian] for values in (re + 1j * im, 1 - delta[0] - 1j * delta[1]))
+    # In NumPy: the start of a recorded Dr.Jit function takes longer than these small products.
+    if type(field) is Factorised:
+        factors, functions = _complex(params["signal"].reshape(2, field.terms, -1)).T, cast(Any, field.functions)
+        return factors, lambda tx_pos_m: _complex(functions(params, tx_pos_m.T).reshape(2, field.terms, -1)).T
+    return None, (_wrf_gs_signals if type(field) is WrfGs else recorded_signals)(field, params)
 
-    def before(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Sum over the entries before each in its pixel."""
-        total = np.concatenate([[0], np.cumsum(values)])
-        return total[:-1] - np.repeat(total[start], length)
 
-    # T_{i+1} = T_i - B_i (1 - delta_i), with delta = 0 under alpha blending: sums of the entries in front.
-    transmittance = 1 - before(hidden)
-    # b_i = 1 - B_i (1 - delta_i) / T_i; without Gaussian i, what it hides grows from Q_i to Q_i / b_i.
-    hides = np.divide(hidden, transmittance, out=np.zeros_like(hidden), where=transmittance != 0)
-    factor = 1 - hides
-    behind = np.repeat(weights @ (re + 1j * im), length) - before(sent) - sent
-    quotient = behind * np.conj(factor) / np.maximum(np.abs(factor), SMALLEST_FACTOR) ** 2
-    return np.asarray(np.bincount(gaussian, np.abs(sent - hides * quotient), gaussians.count), float)
+def _complex(pair: Any) -> Any:
+    return pair[0] + np.complex64(1j) * pair[1]
+
+
+def _wrf_gs_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
+    # The part of the second network's first layer that depends on the Gaussians alone is computed once.
+    products: Any = linear(params, "signal.0", field.features(params), "feature")
+    count = products.shape[1]
+
+    def coefficients(tx_pos_m: Any) -> NDArray[np.complex64]:
+        out, step = np.empty((len(tx_pos_m), count), np.complex64), max(1, PAIRS_PER_CHUNK // count)
+        for first in range(0, len(tx_pos_m), step):
+            encoded = field.encoding.transmitter(tx_pos_m[first : first + step].T)
+            hidden = products[None]
+            if len(encoded):  # without octaves there is no matrix
+                hidden = hidden + (params["signal.0.transmitter"] @ encoded).T[:, :, None]
+            pair: Any = linear(params, "signal.out", dense(params, "signal.1", np.maximum(hidden, 0)))
+            out[first : first + step] = _complex(pair.swapaxes(0, 1))
+        return out
+
+    return coefficients
+
+
+def recorded_signals(field: Any, params: Mapping[str, Any]) -> Coefficients:
+    """Signals [m, n] of transmitters [m, 3] by the field's Dr.Jit function, recorded, one transmitter at a time."""
+    tensors = {name: to_tensor(values) for name, values in params.items()}
+
+    @Recorded
+    def signals(params: Mapping[str, Any], tx_pos: Any) -> Any:
+        with dr.suspend_grad():
+            return field.gaussians(params, tx_pos).signal
+
+    def coefficients(tx_pos_m: Any) -> NDArray[np.complex64]:
+        per_transmitter = (signals(tensors, to_tensor(position[:, None])) for position in tx_pos_m)
+        return np.stack([_complex([part.numpy() for part in pair]) for pair in per_transmitter])
+
+    return coefficients

@@ -115,6 +115,7 @@ def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     kind: Any = type(gaussians.signal[0])
     slot = dr.arange(dr.uint32_array_t(kind), batch * components * n)
     pair, component = (slot // (n * components)) * n + slot % n, (slot // n) % components
+    # Signals of a half, real or imaginary, one component after the other: [component, transmitter, Gaussian].
     parts = [dr.concat(gaussians.signal[half * components : (half + 1) * components]) for half in (0, 1)]
     signal = [dr.gather(kind, part, component * (batch * n) + pair) for part in parts]
     changes: dict[str, Any] = {"signal": signal, "batch": batch * components}
@@ -123,8 +124,7 @@ def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     return gaussians.mapped(lambda a: dr.gather(kind, a, pair), **changes)
 
 
-CHUNK_SIZE = 1 << 14
-"""Pairs of Gaussian and transmitter at once: 64 MB of a network of width 256."""
+CHUNK_SIZE = 1 << 14  # pairs of Gaussian and transmitter at once: 64 MB of a network of width 256
 
 
 def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_once: int = CHUNK_SIZE) -> Gaussians:
@@ -141,6 +141,7 @@ def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_on
     """
     count, batch = params["position"].shape[1], tx_pos.shape[1]
     step = max(at_once // batch, 1)
+    # An empty field still needs one call, for the types and shapes of its arrays.
     parts: list[Gaussians] = []
     with dr.suspend_grad():
         for first in range(0, max(count, 1), step):

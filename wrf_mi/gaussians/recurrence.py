@@ -65,6 +65,7 @@ def accumulate(total: Complex, weight: Sequence[Any], signal: Complex) -> Comple
 def forward_step(blending: list[Any], g: Any, t: Complex) -> tuple[tuple[Any, ...], Complex]:
     """Weight w T of a Gaussian with footprint G', and the transmittance behind it."""
     if len(blending) == 1:
+        # T stays real: its imaginary part is carried along unchanged, so that both rules have one state.
         alpha = blending[0] * g
         return (t[0] * alpha,), (dr.fma(-t[0], alpha, t[0]), t[1])
     return (g * t[0], g * t[1]), times(_factor(blending, g), t)
@@ -120,6 +121,7 @@ def reverse_step(
         Derivatives by G', by ``blending`` and by each S; T and Q behind the Gaussian.
     """
     weight, after = forward_step(blending, g, t)
+    # dL/dS = conj(w T) dL/dR: the gradient of a product of complex numbers by one of them.
     by_signal = [conjugate_times(weight, slope) for slope in slopes]
     h = _summed(slopes, signals)
     if len(blending) == 1:

@@ -179,7 +179,7 @@ def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch
     slot = dr.arange(index_type, batch * plane.tiles)
     begin = (slot // plane.tiles) * n
     index = dr.empty(index_type, check_entries(entries))
-    length = _list_tiles(boxes, column, plane, None, begin, begin + n, index, slot * n)
+    length = _list_tiles(boxes, column, plane, None, (begin, begin + n), index, slot * n)
     dr.eval(index, length)
     return TileLists(index, length)
 
@@ -198,6 +198,8 @@ def check_entries(entries: int) -> int:
 
 def _meets_columns(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase, width: dr.ArrayBase) -> Any:
     """Whether a tile that begins at a column meets columns from ``first`` on, around the full circle."""
+    # Columns from the footprint's first one to the tile, counted forwards around the circle; a tile that begins before
+    # the seam and ends behind it meets footprints that start there.
     ahead = column - first
     ahead -= width * dr.floor(ahead / width)
     return (ahead <= span) | (ahead + (TILE_COLUMNS - 1) >= width)
@@ -211,6 +213,7 @@ def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> T
     index_type: Any = type(column)
     n = dr.width(column) // batch
     rows, row_of = np.unique(plane.tile_row.numpy(), return_inverse=True)
+    # A row of tiles at a time: most Gaussians meet few rows, and the tiles of a row share the list that is searched.
     parts, starts, total = [], [], 0
     for row in rows:
         hit = (boxes[0] <= float(row) + (TILE_ROWS - 1)) & (boxes[1] >= float(row))
@@ -223,7 +226,7 @@ def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> T
         on_device(np.array([s[part] for s in starts]).T[:, row_of].ravel(), index_type)
         for part in (slice(None, -1), slice(1, None))
     )
-    walk = boxes, column, plane, members, begin, end
+    walk = boxes, column, plane, members, (begin, end)
     dr.eval(members, begin, end)
     length = _list_tiles(*walk, None, None)
     dr.eval(length)
@@ -241,17 +244,16 @@ def _list_tiles(
     column: dr.ArrayBase,  # [batch * n]
     plane: Plane,
     members: dr.ArrayBase | None,  # [entries of all rows]
-    begin: dr.ArrayBase,  # [batch * tiles]
-    end: dr.ArrayBase,  # [batch * tiles]
+    bounds: tuple[dr.ArrayBase, dr.ArrayBase],  # begin and end, [batch * tiles] each
     index: dr.ArrayBase | None,  # [entries of all tiles]
     start: dr.ArrayBase | None,  # [batch * tiles]
 ) -> dr.ArrayBase:
     """Length of each tile's list, [batch * tiles]; with ``index``, the lists are written from ``start`` on.
 
-    Each tile visits the boxes from ``begin`` to ``end``, or the boxes of its row that ``members`` lists there.
+    Each tile visits the boxes within its bounds, or the boxes of its row that ``members`` lists there.
     """
     index_type, float_type = type(column), type(boxes[0])
-    first_row, last_row, first_column, span = boxes
+    (first_row, last_row, first_column, span), (begin, end) = boxes, bounds
     tile = dr.arange(index_type, dr.width(begin)) % plane.tiles
     row, column0 = dr.gather(float_type, plane.tile_row, tile), dr.gather(float_type, plane.tile_column, tile)
     width = float_type(plane.width)

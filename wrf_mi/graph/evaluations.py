@@ -13,7 +13,7 @@ import drjit as dr
 
 from ..backend.vectors import Complex, Pose
 from ..gaussians import Gaussians
-from ..gaussians.render import splat
+from ..gaussians.blend import splat
 from ..gaussians.tiles import Plane
 from .settings import SPLATTED, TRACED, TracedConfig
 

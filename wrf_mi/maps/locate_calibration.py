@@ -30,10 +30,11 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..models import Fitted, Session
-from ..models.held_out import fit_fold, hold_out, labelled
+from ..models.held_out import fit_fold, labelled
 from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
+from ..training.selection import hold_out
 from .grid import Candidates
 from .locate_knn import Neighbours, choose_neighbours
 from .locate_likelihood import Likelihood, Silence, region_of

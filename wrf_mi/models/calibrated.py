@@ -14,8 +14,9 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tasks import task_of
-from .held_out import HeldOut, RowDistance, held_out_predictions, hold_out
-from .intervals import GAPS, Intervals, expected_size, fit_intervals
+from ..training.by_distance import GAPS, Intervals, expected_size, fit_intervals
+from ..training.selection import HeldOut, RowDistance, hold_out
+from .held_out import held_out_predictions
 from .model import (
     Arrays,
     Decomposition,
@@ -38,7 +39,7 @@ class FittedWithIntervals(Fitted):
 
     def __init__(self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals) -> None:
         self.fitted, self._record, self._rows, self._intervals = fitted, record, rows, intervals
-        self._distance = RowDistance(record, rows)
+        self._distance = RowDistance.of_rows(record, rows)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
     def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:

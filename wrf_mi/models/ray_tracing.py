@@ -42,8 +42,7 @@ from ..tracing.paths.corrected_scene import check_materials, write_corrected_sce
 from ..tracing.paths.result import join_traces
 from ..tracing.paths.solve import PAIRS_TOGETHER
 from ..tracing.tracer import Offsets, RayTracer, fit_offsets, warn_of_cross_polarization
-from ..training.config import calibration_config
-from ..training.loop_config import LoopOptions
+from ..training.config import LoopOptions, calibration_config
 from .gaussian.model import FittedField
 from .gaussian.model import check as check_field
 from .gaussian.model import fit as fit_field
@@ -60,7 +59,7 @@ alone, a part of any size costs as much as a few hundred positions."""
 
 
 @dataclass(frozen=True)
-class TracingSettings(LoopOptions, TraceOptions):
+class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its fields are made from others
     """Settings of tracing and calibration, and with ``calibration`` of the training loop.
 
     Attributes:

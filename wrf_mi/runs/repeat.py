@@ -13,7 +13,6 @@ import yaml
 from ..core import AntennaOptions, InputError
 from ..core.settings import flat
 from ..models.model import default_settings
-from .compressed import COMPRESSION
 from .folder import CONFIG, RunConfig, read_config
 
 
@@ -53,12 +52,6 @@ def command(config: RunConfig, folder: Path) -> str:
 
     Data sets that were passed as objects in Python are named by their folder, and rows by the name of their split.
     """
-    if (folder / COMPRESSION).exists():
-        how = json.loads((folder / COMPRESSION).read_text())
-        words = ["wrf-mi", "compress", how["run"]]
-        for name, value in how["how"].items():
-            words += [f"--{name.replace('_', '-')}", str(value)]
-        return shlex.join([*words, "--out", str(folder)])
     words = ["wrf-mi", "train", config.dataset, "--model", config.model, "--split", config.split]
     for option, value in (("n-train", config.n_train), ("scene", config.scene), ("material", config.material)):
         words += [] if value is None else [f"--{option}", str(value)]

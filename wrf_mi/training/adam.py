@@ -13,6 +13,7 @@ import mitsuba as mi
 from drjit.opt import Adam
 
 from ..graph.settings import TRACED_NAMES
+from .schedule import Schedule
 
 Params = dict[str, Any]
 
@@ -64,8 +65,31 @@ def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
     return {name: adam[name] for name in rates}
 
 
+@dataclass
+class ScheduledStep:
+    """Numbers of one step, opaque to a recording: as Python numbers they would be recorded as constants.
+
+    Attributes:
+        factor: factor of the learning rates.
+        decay: decay of the running mean of the parameters.
+        number: number of the step, from 1.
+        trouble: report of the steps before.
+    """
+
+    factor: Any
+    decay: Any
+    number: Any
+    trouble: NonFiniteReport
+
+    @classmethod
+    def of(cls, schedule: Schedule, t: int, trouble: NonFiniteReport) -> ScheduledStep:
+        """The step after ``t`` steps of a schedule."""
+        factor, decay = (dr.opaque(mi.Float, float(values[t])) for values in (schedule.factor, schedule.decay))
+        return cls(factor, decay, dr.opaque(mi.UInt32, t + 1), trouble)
+
+
 def guarded_step(
-    adam: Adam, params: Params, loss: Any, mean: Params, decay: Any, number: Any, trouble: NonFiniteReport
+    adam: Adam, params: Params, loss: Any, mean: Params, step: ScheduledStep
 ) -> tuple[Params, NonFiniteReport, Any]:
     """Differentiate a loss of ``params`` (`rated_params`) and take a step of Adam in place, unless a value is or was
     not finite.
@@ -75,9 +99,7 @@ def guarded_step(
         params: parameters, which hold gradients afterwards.
         loss: loss, one value.
         mean: running mean of the parameters.
-        decay: decay of the running mean.
-        number: number of the step, from 1.
-        trouble: report so far.
+        step: numbers of the step, and the report so far.
 
     Returns:
         Running mean, report, and whether the step was taken; all unevaluated.
@@ -85,14 +107,17 @@ def guarded_step(
     dr.backward(loss)
     sums = [dr.detach(loss), *(_health(params[name]) for name in watched_groups(params))]
     fine = [dr.isfinite(s) for s in sums]
-    good = reduce(operator.and_, fine)
+    good, trouble = reduce(operator.and_, fine), step.trouble
     untroubled = trouble.step == 0
+    # A masked step instead of a branch: whether values are finite is known on the device alone, and reading it here
+    # would end the recording.
     finite = good & untroubled
     adam.step(eval=False, active=finite)
-    share = dr.select(finite, decay, 1)
+    share = dr.select(finite, step.decay, 1)
     mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
     now = dr.concat([dr.select(f, mi.Float(0), mi.Float(1)) for f in fine])
+    # The first trouble is reported: what follows it has other causes.
     report = NonFiniteReport(
-        dr.select(untroubled & ~good, number, trouble.step), dr.select(untroubled, now, trouble.groups)
+        dr.select(untroubled & ~good, step.number, trouble.step), dr.select(untroubled, now, trouble.groups)
     )
     return mean, report, finite

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 7
-"""Version of ``checkpoint.npz``."""
+FORMAT = 7  # version of ``checkpoint.npz``
 GROUPS = ("param", "mean", "first", "second")
 """Groups of arrays with equal names and shapes: parameters, their running mean, and Adam's moments."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"
@@ -52,6 +51,7 @@ def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
         version = int(arrays["format"])
     if version != FORMAT:
         raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+    # A fit may go back to its best state, which has arrays of its own.
     for lead in ("", "best/"):
         _check_state(path, arrays, lead)
     return arrays
@@ -62,9 +62,10 @@ def _check_state(path: Path, arrays: Mapping[str, NDArray[Any]], lead: str) -> N
     shapes = {}
     for group in GROUPS:
         start = f"{lead}{group}/"
-        held = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
-        shapes[group] = {name: values.shape for name, values in held.items()}
-        for name, values in held.items():
+        of_group = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+        shapes[group] = {name: values.shape for name, values in of_group.items()}
+        # The backend ends the process on arrays of other types and shapes than it was recorded with.
+        for name, values in of_group.items():
             if values.dtype != np.float32 or not np.isfinite(values).all():
                 raise InputError(f"{path}: {start}{name} is not finite in single precision; train the run anew")
         if shapes[group] != shapes[GROUPS[0]]:
@@ -101,6 +102,7 @@ def cut_log(folder: Path, step: int) -> None:
     steps = [_step_of(line) for line in written]
     if damaged := steps.count(None):
         logger.warning("%s: %d damaged lines left out", path, damaged)
+    # A run that is resumed takes these steps again, and would otherwise write their lines twice.
     lines = [line + b"\n" for line, at in zip(written, steps, strict=True) if at is not None and at <= step]
     write_atomically(path, b"".join(lines))
 

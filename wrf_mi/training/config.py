@@ -1,24 +1,97 @@
-"""Settings of a fit: frozen dataclasses, written to and read from ``config.yaml``."""
+"""Settings of fits by gradients: frozen dataclasses, written to and read from ``config.yaml``."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, make_dataclass
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import NOT_NEGATIVE, Count, Inside, Positive, Share, with_settings
+from ..core.settings import (
+    NOT_NEGATIVE,
+    CheckedSettings,
+    Count,
+    Inside,
+    Positive,
+    Share,
+    ShareBelow1,
+    with_settings,
+)
 from ..gaussians.encoding import unambiguous_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
 from ..tasks import TASKS
-from .loop_config import AdamConfig, LoopConfig
 
 AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
+
+
+@dataclass(frozen=True)
+class AdamConfig:
+    """Adam (Kingma and Ba 2015): warm-up, then a cosine to ``final`` of each rate.
+
+    Attributes:
+        network: rate of all networks.
+        warm_up: steps over which rates rise from zero.
+        cosine_start: share of the steps after which rates begin to fall.
+        final: final factor of each rate.
+        ema_decay: decay per step of the running mean of the parameters, which is evaluated and stored.
+    """
+
+    network: float = 1e-3
+    warm_up: int = 100
+    cosine_start: Share = 0.0
+    final: Share = 0.01
+    ema_decay: ShareBelow1 = 0.999
+
+
+@dataclass(frozen=True)
+class LoopConfig(CheckedSettings):
+    """Settings of `wrf_mi.training.loop.TrainingLoop`.
+
+    Attributes:
+        steps: optimiser steps.
+        batch: largest number of samples in a step.
+        holdout_steps_fraction: share of the steps in which the validation rows are kept out of training. 1 keeps them
+            out to the end, as every choice of settings must; less ends with a fit on all training rows.
+        patience: number of scores on the validation rows without improvement after which the fit goes on from the best
+            state with all training rows, for a share of the steps that led to it. 0: all steps are taken, and the last
+            state counts.
+        checkpoint_every: steps between two checkpoints.
+        log_every: steps between two lines of the log.
+        validate_every: steps between two scores on the validation rows.
+        optimiser: learning rates and running mean.
+    """
+
+    steps: Count = 1000
+    batch: Count = 1
+    holdout_steps_fraction: Share = 0.7
+    patience: int = 0
+    checkpoint_every: Count = 2000
+    log_every: Count = 100
+    validate_every: Count = 1000
+    optimiser: AdamConfig = field(default_factory=AdamConfig)
+
+
+_OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}
+
+
+def _chosen(options: Any) -> list[str]:
+    """Settings that are not null, as ``--set`` takes them."""
+    values = {name: getattr(options, name) for name in _OPTIONAL}
+    return [f"{name}={value}" for name, value in values.items() if value is not None]
+
+
+LoopOptions: Any = make_dataclass(
+    "LoopOptions",
+    [(name, kind | None, None) for name, kind in _OPTIONAL.items()],
+    namespace={"chosen": _chosen},
+    frozen=True,
+)
+"""Base of settings of a model that may be trained: those of `LoopConfig`; null: the default of the training."""
 
 
 @dataclass(frozen=True)
@@ -77,15 +150,14 @@ class NetworkConfig:
         terms: terms of a factorised field; 0: 32.
         static_geometry: WRF-GS+ moves only signals with the transmitter, not rotation and scale: the map from signals
             to the receiver is then the same for all transmitters.
-        phase_hz: carrier frequency of a phase of WRF-GS+'s signals by the distance of the transmitter's image (from
-            ``initial.paths``), else of the transmitter; 0: none.
     """
 
     width: int = 0
     layers: int = 0
     terms: int = 0
     static_geometry: bool = False
-    phase_hz: float = 0.0
+
+    FIXED: ClassVar[Mapping[str, float]] = {"phase_hz": 0.0}
 
 
 @dataclass(frozen=True)
@@ -136,10 +208,7 @@ class DensityConfig:
         growth_fraction: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a
             round.
         max_gaussians: largest number of Gaussians.
-        split_deg: size above which a growing Gaussian is split instead of cloned, degrees.
-        least_opacity: opacity below which a Gaussian is pruned (alpha blending).
         reset_every: rounds between two opacity resets; 0 turns them off.
-        reset_opacity: largest opacity after a reset.
     """
 
     every: int = 1000
@@ -147,10 +216,10 @@ class DensityConfig:
     stop: Share = 0.4
     growth_fraction: Share = 0.05
     max_gaussians: Count = 320
-    split_deg: Positive = 5.0
-    least_opacity: Inside = 0.005
     reset_every: int = 0
-    reset_opacity: Inside = 0.05
+
+    # Constants of `wrf_mi.gaussians.density`, which run files of earlier versions have as settings.
+    FIXED: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
 
 
 @dataclass(frozen=True)
@@ -164,8 +233,7 @@ class LossConfig:
     ssim_weight: Share = 0.2
 
 
-PATHS_ALONE = "ray-tracing"
-"""Name of the model that trains the paths of a scene without Gaussians."""
+PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which held-out scores no longer improve (docs/speed.md); `OTHERWISE` for other models."""
 OTHERWISE = 15000
@@ -211,6 +279,7 @@ class TrainConfig(LoopConfig):
 
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
         """The settings with number of steps and scale for the training transmitters [n, 3] in metres."""
+        # A scale that encodes two transmitters alike would make the network predict their mean.
         steps = self.steps or LONG_ENOUGH.get(self.model, OTHERWISE)
         scale = self.encoding.tx_scale_m or unambiguous_scale(tx_pos_m, LEAST_TX_SCALE_M)
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
@@ -241,8 +310,7 @@ PAPER = (
 The paper states no scale of coordinates; metres are assumed. Loss, networks and Adam are the paper's by default.
 """
 
-QUICK = ("steps=6000",)
-"""Shorter schedule of the demo."""
+QUICK = ("steps=6000",)  # shorter schedule of the demo
 
 ONE_ANTENNA = (
     "batch=16",
@@ -258,8 +326,7 @@ ONE_ANTENNA = (
 """Settings of a field of signal strengths or channels that differ from a field of spectra: few numbers result."""
 PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every=50", "patience=8", "density.every=0")
 """Settings of paths alone: few parameters converge soon."""
-PATHS_OF_IMAGES = ("batch=8",)
-"""Further settings where observations are images of thousands of numbers."""
+PATHS_OF_IMAGES = ("batch=8",)  # further settings where observations are images of thousands of numbers
 HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0", "traced.surface=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "gain": ("traced.gain=0.05",),
@@ -294,6 +361,7 @@ def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
     """Settings of a task that differ from `TrainConfig`, as ``--set`` takes them; ``image``: whether observations are
     images.
     """
+    # Images are the papers' task: `TrainConfig` has their settings.
     if image:
         return JOINT_IMAGES if with_scene else ()
     return (JOINT if with_scene else ALONE).get(task, ())
@@ -318,6 +386,7 @@ def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfi
     unknown = [part for part in chosen if part not in CALIBRATED]
     if unknown or not chosen:
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
+    # All parts are held first, as the settings of paths train some of them by default.
     moved = [setting for part in chosen for setting in CALIBRATED[part]]
     more = PATHS_OF_IMAGES if images else ()
     return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *more, *HELD, *moved])

@@ -20,8 +20,7 @@ BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
 """Memory of a training step for each neuron, and beside networks, of each pair of a Gaussian and a transmitter, and for
 each number of a Gaussian (its value, gradient, moments, running mean and best state): measured on 4,000 and 16,000
 Gaussians of the three fields, within a third."""
-MOST_NUMBERS = (1 << 32) - 1
-"""Most numbers of an array of Dr.Jit."""
+MOST_NUMBERS = (1 << 32) - 1  # most numbers of an array of Dr.Jit
 
 
 def field_of(config: TrainConfig, form: Form) -> Field | None:
@@ -55,8 +54,6 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
     plus = model == "wrf-gs+"
     for wrong, text in (
         (n.static_geometry and not plus, f"static_geometry: {model} always moves signals alone"),
-        (n.phase_hz and not plus, f"phase_hz: {model} has no such phase"),
-        (n.phase_hz and (components > 1 or features), "phase_hz: needs one signal a Gaussian and positions"),
         (n.terms and model != "factorised", f"terms: {model} has none"),
     ):
         if wrong:
@@ -65,7 +62,7 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
     if model == "wrf-gs" and n.width:
         sizes["signal_widths"] = (n.width, max(1, n.width // 2))
     if plus:
-        sizes |= {"static_geometry": n.static_geometry, "phase_hz": n.phase_hz}
+        sizes["static_geometry"] = n.static_geometry
         sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
     return FIELDS[model](encoding=encoding, components=components, **sizes)
@@ -96,9 +93,9 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
     count = params["position"].shape[1] if "position" in params else 0
     for name, shape in _shapes(field).items():
         wanted = (shape[0], count) if name in field.per_gaussian else shape
-        found = params[name].shape if name in params else "none"
-        if found != wanted or not count:
-            text = f"parameter {name} of shape {found}, where the settings need {wanted}"
+        shape_in_file = params[name].shape if name in params else "none"
+        if shape_in_file != wanted or not count:
+            text = f"parameter {name} of shape {shape_in_file}, where the settings need {wanted}"
             raise InputError(f"{source}: {text}; train the run anew")
 
 
@@ -109,17 +106,20 @@ def check_memory(config: TrainConfig, field: Field) -> None:
         InputError: naming the settings to lower.
     """
     density = config.density
+    # Of the largest field that density control may grow, so that no fit ends in its middle.
     count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)
     sizes = _shapes(field)
     neurons = sum(shape[0] for name, shape in sizes.items() if name.endswith(".bias"))
-    own = sum(sizes[name][0] for name in field.per_gaussian)
-    widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=own)
+    numbers = sum(sizes[name][0] for name in field.per_gaussian)
+    widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=numbers)
     grown = count > config.initial.gaussians
     what = f"setting {'density.max_gaussians' if grown else 'initial.gaussians'}={count} with batch={config.batch}: "
     remedy = "lower one of them, or network.width"
     pairs = count * config.batch
+    # The widest layer has its width of numbers for every pair; Dr.Jit's indices of 32 bits would wrap around unnoticed.
     if pairs * widest > MOST_NUMBERS:
         raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
+    # `require_memory` knows the machine's memory, not that of a GPU.
     if not (mi.variant() or "").startswith("cuda"):
         step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
-        require_memory(step + BYTES_PER_NUMBER * count * own, f"{what}a training step", remedy)
+        require_memory(step + BYTES_PER_NUMBER * count * numbers, f"{what}a training step", remedy)

@@ -11,10 +11,11 @@ from ..datasets.observations import check_observations
 from ..graph.graph import Field, Graph
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
+from ..tracing.paths.traced_field import TracedField
 from .config import TrainConfig
 from .fields import check_memory, field_of
-from .reach import hold_out_groups
 from .schedule import Schedule, density_rounds, plan
+from .selection import hold_out_groups
 from .targets import form_of, targets_of
 
 CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
@@ -70,14 +71,36 @@ class FitPlan:
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(field, receivers, form, scene, config.traced, record.tx_antenna, config.evaluation)
         self.stages = self._stage_names()
-        # What corrects paths is chosen also on rows far from the training rows.
+        # What corrects paths is chosen also on rows far from the training rows: near them, Gaussians that interpolate
+        # always gain, whatever they do elsewhere.
         wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0
         wanted &= config.holdout_steps_fraction > 0
         self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted else split
         self.in_groups = wanted and (self.choosing is not split or self.graph.corrects)
         self.unjudged = self.in_groups and self.choosing is split
+        # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
         self.schedule = self._planned()
+        # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
+
+    @property
+    def chooses_stages(self) -> bool:
+        """Whether stages beside paths are chosen by groups of rows that are held out."""
+        return self.in_groups and self.graph.scene is not None
+
+    def traced(self) -> list[TracedField | None]:
+        """Traced side of the training rows at each port; None without a scene.
+
+        Raises:
+            InputError: a transmitter or receiver inside a solid.
+        """
+        record, rows, form = self.record, self.split.all_train, self.graph.form
+        self.graph.check(record.tx_pos_m)
+        headings = record.tx_heading_rad if form.headings else None
+        carriers = None if form.carriers_hz is None else record.carriers_hz
+        heading, carrier = (None if part is None else part[rows] for part in (headings, carriers))
+        receivers = range(len(record.receivers))
+        return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, heading, carrier)]
 
     def _stage_names(self) -> tuple[str, ...]:
         """Stages in their order: paths, Gaussians on surfaces, those of the field if there is one."""
@@ -97,6 +120,7 @@ class FitPlan:
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
         alone, end = config.traced.alone, config.holdout_steps_fraction
+        # Each stage but the last has an equal share of the steps.
         first = tuple(round(k * alone * config.steps) for k in range(1, len(self.stages)))
         if first and config.patience and 0 < end * config.steps <= first[-1]:
             share = f"{alone} of the steps" + (", twice," if len(first) > 1 else "")

@@ -7,29 +7,35 @@ that power. A mesh alone gives the surfaces that can scatter.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
+from ..backend.device import to_tensor
 from ..core import InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..gaussians.initial import InitialGaussians, gaussians_from_points, random_gaussians
+from ..graph.graph import LEVEL, SHARE
 from ..scene.coordinates import require_near
 from ..scene.scan.points import read_points
 from ..tracing import open_scene, trace_paths
+from ..tracing.paths.traced_field import TracedField
 from ..tracing.search.surfaces import scene_surfaces
 from ..tracing.sionna.scenes import MESHES
 from .config import InitialConfig
+from .fit_plan import FitPlan
+from .step import Place, evaluated
 
-LEAST_SCALE_M = 0.02
-"""Smallest starting scale, for a cluster of a single point."""
-LEAST_SHARE = 1e-3
-"""Smallest starting power relative to the strongest cluster, so that weak Gaussians can grow."""
+LEAST_SCALE_M = 0.02  # smallest starting scale, for a cluster of a single point
+LEAST_SHARE = 1e-3  # smallest starting power relative to the strongest cluster, so that weak Gaussians can grow
+LEVEL_ROWS = 64  # observations of a receiver from which its starting level is estimated
 
 
 def gaussians_from_paths(
@@ -44,8 +50,7 @@ def gaussians_from_paths(
     """Gaussians on clusters of the last points of interaction of traced paths (of direct paths: the transmitter).
 
     Points are clustered by direction and distance from their receiver, weighted by power; a cluster's mean is the
-    centre, its spread the scale, its mean power the signal and (relative to the strongest) the opacity. The affine map
-    from transmitter to image is fitted to the cluster's strongest chain of surfaces by least squares.
+    centre, its spread the scale, its mean power the signal and (relative to the strongest) the opacity.
 
     Args:
         paths: paths of the training transmitters.
@@ -61,16 +66,9 @@ def gaussians_from_paths(
     """
     if not len(paths):
         raise InputError("start from paths: no path arrives; trace more kinds of path, or start at random")
-    row = np.arange(len(paths))
-    bounces = paths.bounces
-    last = paths.vertices_m[row, np.maximum(bounces - 1, 0)]
-    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
-    rx = np.stack([receiver.position_m for receiver in receivers])[paths.rx]
-    away = last - rx
-    distance = np.linalg.norm(away, axis=1)
-    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
-    features = np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
+    last, features = _last_points(paths, tx_pos_m, receivers)
     power = np.abs(paths.gain) ** 2
+    # Centres are found on a sample, as paths may be millions; every path then joins the nearest.
     drawn = rng.choice(len(paths), min(len(paths), 40 * count), replace=False)
     few = min(count, len(np.unique(np.round(features[drawn], 6), axis=0)))
     centres, _ = kmeans2(features[drawn], few, iter=20, minit="++", rng=rng)
@@ -78,25 +76,35 @@ def gaussians_from_paths(
     used = np.unique(label)
     # With fewer clusters than Gaussians random clusters are taken more than once.
     chosen = np.concatenate([used, rng.choice(used, count - len(used))]) if len(used) < count else used
-    position, scale = np.empty((count, 3)), np.empty(count)
-    strength, phase = np.empty(count), np.empty(count)
-    affine = np.empty((count, 3, 4))
+    position, scale, strength, phase = np.empty((count, 3)), np.empty(count), np.empty(count), np.empty(count)
     for index, cluster in enumerate(chosen):
         members = np.flatnonzero(label == cluster)
         total = power[members].sum()
         share = power[members] / total if total > 0 else np.full(len(members), 1 / len(members))
         position[index] = share @ last[members]
         square = share @ ((last[members] - position[index]) ** 2).sum(axis=1)
+        # A third of the mean square distance along each axis: the Gaussian starts as a ball.
         scale[index] = max(np.sqrt(square / 3), LEAST_SCALE_M)
         strength[index] = total / paths.n_tx  # mean over all transmitters
         phase[index] = np.angle(paths.gain[members[np.argmax(power[members])]])
-        affine[index] = _image_map(paths, tx_pos_m, receivers, members)
     repeated = np.bincount(chosen, minlength=len(centres))[chosen]
+    # Copies of a cluster share its power, and are moved apart: equal Gaussians would have equal gradients for ever.
     relative = np.maximum(strength / repeated / strength.max(), LEAST_SHARE)
     amplitude = signal * np.sqrt(relative)
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
-    return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase), affine)
+    return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase))
+
+
+def _last_points(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, FloatArray]:
+    """Last point of interaction of each path [n, 3], and features [n, 4] in units of a receiver's resolution."""
+    bounces = paths.bounces
+    last = paths.vertices_m[np.arange(len(paths)), np.maximum(bounces - 1, 0)]
+    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
+    away = last - np.stack([receiver.position_m for receiver in receivers])[paths.rx]
+    distance = np.linalg.norm(away, axis=1)
+    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
+    return last, np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
 
 
 def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Generator) -> InitialGaussians:
@@ -116,25 +124,11 @@ def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Gene
         raise InputError("start from a mesh: it has no surface; give triangles with an area")
     face = rng.choice(len(corners), count, p=area / area.sum())
     a, b = rng.random((2, count, 1))
+    # Even in the triangle: points of the parallelogram's other half are mirrored into it.
     flip = a + b > 1
     a, b = np.where(flip, 1 - a, a), np.where(flip, 1 - b, b)
     first, second, third = corners[face].transpose(1, 0, 2)
     return gaussians_from_points(first + a * (second - first) + b * (third - first), count, rng)
-
-
-def _image_map(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], members: IntArray) -> FloatArray:
-    """Affine map [3, 4] from transmitter to image of the strongest chain among some paths."""
-    strongest = members[np.argmax(np.abs(paths.gain[members]))]
-    chain = (paths.objects[members] == paths.objects[strongest]).all(axis=1)
-    same = members[chain & (paths.rx[members] == paths.rx[strongest])]
-    rx = receivers[int(paths.rx[strongest])].position_m
-    image = rx + paths.arrival[same] * paths.length_m[same, None]
-    x = tx_pos_m[paths.tx[same]]
-    mean_x, mean_i = x.mean(axis=0), image.mean(axis=0)
-    # A chain of reflections is an orthogonal map (Kabsch 1976).
-    u, s, vt = np.linalg.svd((image - mean_i).T @ (x - mean_x))
-    linear = np.eye(3) if len(same) < 4 or s[-1] < 1e-6 else u @ vt
-    return np.column_stack([linear, mean_i - linear @ mean_x])
 
 
 def initial_gaussians(
@@ -176,3 +170,50 @@ def initial_gaussians(
         distance_m = config.nearest_m, config.farthest_m
         start = random_gaussians(record.receivers, config.gaussians, rng, distance_m, config.size_deg, sphere=sphere)
     return replace(start, opacity=config.opacity, signal=config.signal)
+
+
+def starting_values(
+    plan: FitPlan, sides: Sequence[TracedField | None], places: Sequence[Place], initial: InitialGaussians | None
+) -> dict[str, NDArray[np.float32]]:
+    """Starting values of a fit: Gaussians, and gains and levels that match the observations on average.
+
+    Args:
+        plan: data and graph.
+        sides: traced side of each port.
+        places: places of the ports.
+        initial: Gaussians in place of those of the settings.
+    """
+    graph, config, targets = plan.graph, plan.config, plan.targets
+    rng = np.random.default_rng([config.seed, 0])
+    values: dict[str, NDArray[np.float32]] = {}
+    if graph.field is not None:
+        placed = replace(plan.record, receivers=graph.receivers)
+        start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
+        values = graph.field.init(start, rng)
+    values |= graph.parameters(sides) | graph.cover(sides)
+    gains: dict[str, list[NDArray[np.float32]]] = {}
+    for port, side in enumerate(sides):
+        if side is not None and side.gain_name in values and len(side):
+            observed = targets.truth[port // graph.carriers, plan.known[port]]
+            # Ports of several carriers share the receiver's gain, which starts at their mean.
+            gains.setdefault(side.gain_name, []).append(graph.match_gain(port, side, observed))
+    values |= {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
+    if LEVEL in values:
+        # A receiver has one level for all of its carriers: that of the first.
+        ports = [plan.ports(receiver)[0] for receiver in range(len(plan.record.receivers))]
+        values[LEVEL][0] = [_level(plan, values, port, sides[port], places[port]) for port in ports]
+    return values
+
+
+def _level(
+    plan: FitPlan, values: Mapping[str, NDArray[np.float32]], port: int, side: TracedField | None, place: Place
+) -> float:
+    """Level at which Gaussians match a receiver's observations, or far below its paths' power, by one port."""
+    graph, targets = plan.graph, plan.targets
+    params = {name: to_tensor(value) for name, value in values.items()}
+    if side is not None:
+        return graph.power_level(side, params) + float(np.log(SHARE))
+    rows = targets.received(port, plan.known[port])[:LEVEL_ROWS]
+    reported = evaluated(graph.report(port, None), params, targets.condition[:, rows], place).numpy()
+    observed = targets.truth[port // graph.carriers, rows].astype(float)
+    return graph.models[port].missing_gain(reported.astype(float).reshape(observed.shape), observed)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .adam import NonFiniteReport, NumericsError, watched_groups
-from .loop_config import LoopConfig
+from .config import LoopConfig
 from .schedule import Schedule
 from .state import FitState
 
@@ -105,34 +105,38 @@ class TrainingLoop(ABC):
         config, state, schedule = self.config, self.state, self.schedule
         start, before = time.perf_counter(), self.seconds
         losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)
-        since = taken = 0
-        while state.step < config.steps and not (taken and stop()):
+        logged = steps = 0  # steps since the last line of the log, and in this sitting
+        while state.step < config.steps and not (steps and stop()):
             loss, trouble = self.take_step(trouble)
+            # Summed on the device: a loss that is read waits for its step, and the next one could not be queued.
             losses += loss
             dr.eval(losses)
             state = self.state
-            state.step, since, taken = state.step + 1, since + 1, taken + 1
+            state.step, logged, steps = state.step + 1, logged + 1, steps + 1
             if trouble.step[0]:  # one number, but reading it waits for the step
                 self._require_finite(trouble)
             self.seconds = before + time.perf_counter() - start
             last = state.step == config.steps
             if state.step in schedule.density:
                 self.adapt()
+            # No state of the first stage is chosen before its end: paths converge within it, and a score costs a
+            # prediction of all held-out rows.
             judged = state.step >= min(schedule.stages, default=0)
             choosing = config.patience > 0 and judged and state.step <= schedule.joined and not state.chosen
             scored = (state.step % config.validate_every == 0 and judged) or last
+            # The last state of a stage counts, too, wherever its end falls between two scores.
             scored = scored or (choosing and state.step in (*schedule.stages, schedule.joined))
             if state.step % config.log_every == 0 or scored:
                 self._require_finite(trouble)
                 score = self.validate() if scored else None
                 self.seconds = before + time.perf_counter() - start
-                left = (self.seconds - before) / taken * (config.steps - state.step)
+                left = (self.seconds - before) / steps * (config.steps - state.step)
                 held_out = state.step <= schedule.joined
-                loss = losses[0] / since
+                loss = losses[0] / logged
                 on_progress(
                     Progress(state.step, self.seconds, loss, score, held_out, state.gaussians, left, self.label)
                 )
-                losses, since = dr.zeros(mi.Float), 0
+                losses, logged = dr.zeros(mi.Float), 0
                 if score is not None and choosing and self.choose(score):
                     state, schedule = self.state, self.schedule
             if state.step % config.checkpoint_every == 0 and not last:
@@ -150,6 +154,7 @@ class TrainingLoop(ABC):
         state.keep_best(score if self.higher_is_better else -score)
         if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
             return False
+        # The steps that follow train on the validation rows, too, as many as led to the best state, in proportion.
         self.state = state.go_back()
         self.state.chosen = max(self.state.step, 1)  # 0 means that none is
         self.schedule, self.state.step = self.schedule.after(self.state.chosen)
@@ -167,6 +172,6 @@ class TrainingLoop(ABC):
             raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
         if step:
             names = ["loss", *watched_groups(self.state.adam)]
-            found = ", ".join(n for n, broken in zip(names, trouble.groups.numpy(), strict=True) if broken)
-            where = f"step {step}: not finite: {found}"
+            broken = ", ".join(n for n, flag in zip(names, trouble.groups.numpy(), strict=True) if flag)
+            where = f"step {step}: not finite: {broken}"
             raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")

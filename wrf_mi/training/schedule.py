@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.types import IntArray
-from .config import DensityConfig
-from .loop_config import AdamConfig, LoopConfig
+from .config import AdamConfig, DensityConfig, LoopConfig
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ class Schedule:
         start = len(self.rows) - left
         factor = self.factor.copy()
         if left:
+            # The remaining rates in fewer steps: they still fall to their last value.
             factor[start:] = self.factor[self.joined + np.arange(left) * last // left]
         return replace(self, factor=factor), start
 
@@ -85,6 +85,7 @@ def plan(
     """
     steps = config.steps
     joined = steps if config.holdout_steps_fraction >= 1 else round(config.holdout_steps_fraction * steps)
+    # Batches have one size, as recorded kernels do.
     batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
     if not batch:
         beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
@@ -105,6 +106,7 @@ def plan(
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
     """Factor of the learning rates: a linear warm-up, and half a cosine."""
+    # Adam's moments are sums of few gradients at first, and full rates would follow their noise: hence the warm-up.
     t, final = np.arange(steps), optimiser.final
     flat = round(optimiser.cosine_start * steps)
     cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
@@ -122,13 +124,14 @@ def density_rounds(config: DensityConfig, steps: int, before: int = 0) -> frozen
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
-    counts = [len(known) // batch for known in rows]
+    counts = [len(of_receiver) // batch for of_receiver in rows]
     epochs = -(-steps // sum(counts))
     batches, owners = [], []
     for _ in range(epochs):
         chosen = np.concatenate(
-            [rng.permutation(known)[: n * batch].reshape(n, batch) for known, n in zip(rows, counts, strict=True)]
+            [rng.permutation(r)[: n * batch].reshape(n, batch) for r, n in zip(rows, counts, strict=True)]
         )
+        # Batches of all receivers in turn: a receiver at a time would be forgotten while the others train.
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])
         owners.append(np.repeat(np.arange(len(rows)), counts)[order])

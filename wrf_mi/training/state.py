@@ -43,7 +43,7 @@ class FitState:
         step: steps taken.
         view_gradient_norm: sum since the last round of density control of each Gaussian's directional gradient, [n].
         view_gradient_steps: steps in that sum.
-        reach_m: reach of the Gaussians around training transmitters, metres (`wrf_mi.training.reach`); may be infinite.
+        reach_m: reach of the Gaussians around training transmitters, metres (`Reach`); may be infinite.
         searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
         surface: whether Gaussians on surfaces are trained.
         phase_error: standard deviation of a reflection's phase in predictions, rad (`Graph.report`), once chosen.
@@ -77,7 +77,7 @@ class FitState:
 
     def _reset_view_gradient(self) -> None:
         self.view_gradient_norm, self.view_gradient_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
-        dr.make_opaque(self.view_gradient_norm)
+        dr.make_opaque(self.view_gradient_norm)  # a literal would be recorded as a constant
 
     def params(self) -> Arrays:
         """Current parameters."""
@@ -96,12 +96,14 @@ class FitState:
         return first, second, count
 
     def _set_moments(self, first: Arrays, second: Arrays, count: int) -> None:
+        # The step count is opaque: as a number it would be a constant of recorded kernels.
         for name, (value, promoted, rate, _) in list(self.adam.state.items()):
             moments = (to_float(first[name]), to_float(second[name]))
             self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
 
     def change_density(self, change: DensityChange) -> None:
         """Replace the set of Gaussians; fresh Gaussians start without momentum, new values without a past mean."""
+        # Dr.Jit's Adam has no rows to add or drop: moments are taken out, changed in NumPy and put back.
         first, second, count = self.moments()
         before, mean = self.params(), self.mean_params()
         for name, values in change.parameters.items():
@@ -138,6 +140,7 @@ class FitState:
 
     def next_stage(self) -> FitState:
         """The best state so far as the start of another stage, at the present step, without moments."""
+        # Moments of the former stage would push the first steps of this one where its loss fell.
         state = self.go_back()
         state.step, state.best, state.waited = self.step, self.best, 0
         nothing = {name: np.zeros_like(values) for name, values in state.params().items()}
@@ -146,16 +149,16 @@ class FitState:
 
     def arrays(self) -> Arrays:
         """All arrays, for a checkpoint."""
-        kept = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
-        return self._now() | kept | {f"best/{name}": values for name, values in (self.best or {}).items()}
+        best = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
+        return self._now() | best | {f"best/{name}": values for name, values in (self.best or {}).items()}
 
     def _now(self) -> Arrays:
         """All arrays without the best state."""
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        own = {name: np.array(getattr(self, name)) for name in (*KEPT, *OF_FIT)}
-        return flat | own | {"adam_step": np.asarray(count)}
+        attributes = {name: np.array(getattr(self, name)) for name in (*KEPT, *OF_FIT)}
+        return flat | attributes | {"adam_step": np.asarray(count)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:

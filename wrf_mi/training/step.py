@@ -1,4 +1,4 @@
-"""One optimiser step and one prediction, as functions that `dr.freeze` can record.
+"""Optimiser steps and evaluations of a graph, as functions that `dr.freeze` can record.
 
 Arguments that change from step to step are opaque, so that Dr.Jit replays the recorded kernels; a captured array or a
 changing Python number would be traced anew each time.
@@ -7,8 +7,9 @@ changing Python number would be traced anew each time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -22,15 +23,19 @@ from ..backend.recorded import Recorded
 from ..backend.vectors import Complex, Pose
 from ..core import Receiver
 from ..gaussians.tiles import Plane, perception_plane
-from ..graph.evaluations import Evaluation
-from ..graph.graph import Batch, Graph, Report
-from .adam import NonFiniteReport, Params, guarded_step, rated_params
+from ..graph.graph import LEVEL, Batch, Graph, Report
+from ..graph.settings import TRACED_NAMES
+from ..tracing.paths.traced_field import TracedField
+from .adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
+from .fit_plan import FIELD, FitPlan
+from .schedule import Schedule
+from .state import FitState
+from .targets import Targets
 
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 
-CENTRES = "position"
-"""Parameter [3, n] of every field with Gaussians."""
+CENTRES = "position"  # parameter [3, n] of every field with Gaussians
 
 
 def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
@@ -43,7 +48,7 @@ def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
 
 
 class Place(NamedTuple):
-    """What a batch at one port of a graph has beside its transmitters.
+    """Constants of a batch at one port of a graph.
 
     Attributes:
         receiver: number of the receiver.
@@ -88,6 +93,12 @@ class TrainingData:
     scale: Any
     weight: Any = None
 
+    @classmethod
+    def of(cls, targets: Targets) -> TrainingData:
+        """Targets on the device."""
+        weight = None if targets.weight is None else to_float(targets.weight)
+        return cls(to_tensor(targets.condition), to_float(targets.truth), to_float(1 / targets.unit), weight)
+
     def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any, Any]:
         """Some conditions [3 or features, batch] and their observations [batch * values] at one receiver, and the
         factor of differences in the loss: one value, or [batch * values] with ``weight``.
@@ -96,6 +107,7 @@ class TrainingData:
         batch, index_type = dr.width(rows), type(rows)
         flat = self.condition.array
         tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
+        # Truth is [receiver, condition, value], flat.
         slot = dr.arange(index_type, batch * values)
         row = dr.gather(index_type, rows, slot // values) + receiver * n
         factor = dr.gather(type(self.truth), self.scale, receiver)
@@ -104,72 +116,154 @@ class TrainingData:
         return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values), factor
 
 
-def make_step(
-    report: Report,
-    rates: Mapping[str, float],
-    loss_of: Loss,
-    shape: tuple[int, ...],
-    state: Callable[[], Any] | None = None,
-    evaluation: Evaluation | None = None,
-) -> Callable[..., Any]:
-    """An optimiser step, recorded where the report can be recorded.
+@dataclass
+class StepBatch:
+    """Data of one step.
+
+    Attributes:
+        data: all conditions and observations.
+        rows: numbers of the conditions of the batch.
+        batch: their port, without conditions, which are drawn from ``data``.
+        step: numbers of the step.
+    """
+
+    data: TrainingData
+    rows: Any
+    batch: Batch
+    step: ScheduledStep
+
+
+@dataclass
+class StepResult:
+    """Result of one step.
+
+    Attributes:
+        mean: running mean of the parameters.
+        trouble: report of values that are not finite, after which nothing changes any more.
+        loss: loss of the batch before the step.
+        view_gradient_norm: norm of the gradient by each Gaussian's direction from the receiver, [n].
+    """
+
+    mean: Params
+    trouble: NonFiniteReport
+    loss: Any
+    view_gradient_norm: Any
+
+
+StepFunction = Callable[[Adam, Params, StepBatch], StepResult]
+"""Takes a step of an optimiser in place, from the running mean of its parameters."""
+
+
+class Steps:
+    """Optimiser steps of a fit, recorded by port where the evaluation of the Gaussians allows it.
 
     Args:
-        report: report of a receiver (`wrf_mi.graph.graph.Graph.report`).
-        rates: learning rate of each parameter.
-        loss_of: loss of a batch.
-        shape: shape of one observation.
-        state: returns arrays that the report reads beside its arguments; None: no arrays.
-        evaluation: evaluation of the report's Gaussians; None: one that Dr.Jit can record.
+        plan: data and graph of the fit.
+        sides: traced side of each port; None without a scene.
+        loss: loss of a batch.
 
-    Returns:
-        Function that takes step ``number`` (from 1) of ``adam`` in place, on conditions ``rows`` at the port of
-        ``batch``, which has none. It returns the new running mean of the parameters, the report of values that are not
-        finite, after which nothing changes any more, the batch's loss before the step, and the norm of the gradient by
-        each Gaussian's direction from the receiver, [n].
+    Attributes:
+        loss: loss of a batch.
+        places: places of the ports.
+        recorded: functions that take a step, by what they depend on beside their arguments.
     """
-    values = math.prod(shape)
 
-    def step(
-        adam: Adam,
-        mean: Params,
-        data: TrainingData,
-        rows: Any,
-        batch: Batch,
-        factor: Any,
-        decay: Any,
-        number: Any,
-        trouble: NonFiniteReport,
-    ) -> tuple[Params, NonFiniteReport, Any, Any]:
-        params = rated_params(adam, rates, factor)
-        condition, truth, scale = data.select(rows, batch.receiver, values)
-        truth = truth * scale
-        # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather again.
-        dr.schedule(truth, scale)
-        prediction = report(params, replace(batch, condition=condition))
-        loss = loss_of(prediction * scale, truth, dr.width(rows), *shape)
-        mean, trouble, finite = guarded_step(adam, params, loss, mean, decay, number, trouble)
-        view_gradient_norm = mi.Float(0)
-        if CENTRES in params:
-            offset = [dr.detach(params[CENTRES])[k].array - batch.pose.position[k] for k in range(3)]
-            pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
-            distance = dr.sqrt(sum(c * c for c in offset))
-            view_gradient_norm = dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
-        loss = dr.detach(loss)
-        dr.eval(adam, mean, trouble, loss, view_gradient_norm)
-        return mean, trouble, loss, view_gradient_norm
+    def __init__(self, plan: FitPlan, sides: Sequence[TracedField | None], loss: Loss) -> None:
+        self._plan, self._sides, self.loss = plan, sides, loss
+        self._data, self.places = TrainingData.of(plan.targets), places_of(plan.graph)
+        self.recorded: dict[Any, StepFunction] = {}
 
-    if evaluation is None or evaluation.recordable:
-        return Recorded(step, state)
+    def take(self, state: FitState, schedule: Schedule, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """Take the step of a schedule that follows the steps of a state; returns its loss and report."""
+        # Slots are rows of the traced side, of which each row has one, however many conditions it has.
+        t, targets = state.step, self._plan.targets
+        port, rows = int(schedule.receiver[t]), schedule.rows[t]
+        slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
+        function = self._function(port, state, schedule)
+        batch = self.places[port].batch(None, slots)
+        step = ScheduledStep.of(schedule, t, trouble)
+        result = function(state.adam, state.mean, StepBatch(self._data, mi.UInt32(rows.tolist()), batch, step))
+        state.mean = result.mean
+        state.view_gradient_norm += result.view_gradient_norm
+        state.view_gradient_steps += 1
+        dr.schedule(state.view_gradient_norm)  # evaluated together with the loop's sum of losses
+        return result.loss, result.trouble
 
-    def unrecorded(*arguments: Any) -> tuple[Params, NonFiniteReport, Any, Any]:
-        # As in a recording: a row that is a constant would compile the kernels anew.
-        dr.make_opaque(arguments)
-        result = step(*arguments)
-        evaluation.release()
-        return result
+    def _function(self, port: int, state: FitState, schedule: Schedule) -> StepFunction:
+        """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
+        plan, side = self._plan, self._sides[port]
+        graph, params = plan.graph, dict(state.adam.items())
+        if side is not None and side.refresh(params):
+            state.searched_m[port] = side.searched_at_m
+        stage = plan.stages[schedule.stage(state.chosen - 1 if state.chosen else state.step)]
+        # Gaussians of the field are evaluated in their stage alone, and no more once a reach of 0 is chosen.
+        learned = side is None or (stage == FIELD and not (state.chosen and state.reach_m == 0))
+        arrays = graph.arrays(port, side)
+        key = None if side is None and not arrays else (port, side and side.searches, learned, state.surface)
+        if key not in self.recorded:
+            # Recordings of an earlier search hold its paths: they are dropped with them.
+            self.recorded = {k: v for k, v in self.recorded.items() if k is None or k[0] != port}
+            report = graph.report(port, side, learned, surface=state.surface)
+            read = None if key is None else partial(graph.arrays, port, side)
+            if read is not None:
+                # Arrays that are made from NumPy's memory at first use must exist before a recording.
+                first = plan.targets.condition[:, plan.targets.conditions(plan.known[port][:1])]
+                evaluated(report, params, first, self.places[port])
+            self.recorded[key] = self._recorded(report, self._rates(params), read)
+        return self.recorded[key]
 
-    return unrecorded
+    def _rates(self, names: Mapping[str, Any]) -> dict[str, float]:
+        """Learning rate of each parameter."""
+        o, traced = self._plan.config.optimiser, self._plan.graph.traced
+        rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
+        rates |= {"log_scale": o.scale, LEVEL: o.level}
+        return {
+            name: traced.rate(name) if name.startswith(TRACED_NAMES) else rates.get(name, o.network) for name in names
+        }
+
+    def _recorded(self, report: Report, rates: Mapping[str, float], read: Callable[[], Any] | None) -> StepFunction:
+        """A step by a report; ``read`` returns arrays that the report reads beside its arguments."""
+        evaluation, loss_of = self._plan.graph.evaluation, self.loss
+        shape = self._plan.targets.truth.shape[2:]
+
+        def step(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
+            params = rated_params(adam, rates, inputs.step.factor)
+            condition, truth, scale = inputs.data.select(inputs.rows, inputs.batch.receiver, math.prod(shape))
+            truth = truth * scale
+            # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather
+            # again.
+            dr.schedule(truth, scale)
+            # In the receiver's unit, so that learning rates suit observations of any scale.
+            prediction = report(params, replace(inputs.batch, condition=condition))
+            loss = loss_of(prediction * scale, truth, dr.width(inputs.rows), *shape)
+            mean, trouble, finite = guarded_step(adam, params, loss, mean, inputs.step)
+            result = StepResult(mean, trouble, dr.detach(loss), _view_gradient_norm(params, inputs.batch.pose, finite))
+            dr.eval(adam, result)
+            return result
+
+        if evaluation.recordable:
+            return Recorded(step, read)
+
+        def unrecorded(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
+            # As in a recording: a row that is a constant would compile the kernels anew.
+            dr.make_opaque(adam, mean, inputs)
+            result = step(adam, mean, inputs)
+            evaluation.release()
+            return result
+
+        return unrecorded
+
+
+def _view_gradient_norm(params: Params, pose: Pose, finite: Any) -> Any:
+    """Norm of the gradient by each Gaussian's direction from the receiver, [n]: of that by its centre, times the
+    distance; 0 of a step that is not taken.
+    """
+    if CENTRES not in params:
+        return mi.Float(0)
+    offset = [dr.detach(params[CENTRES])[k].array - pose.position[k] for k in range(3)]
+    pull = [dr.grad(params[CENTRES])[k].array for k in range(3)]
+    distance = dr.sqrt(sum(c * c for c in offset))
+    return dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
 
 
 def evaluated(

@@ -81,25 +81,27 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
     Raises:
         InputError: an unknown position, or an uplink without a signal or with a different number of antennas.
     """
-    task, seen = task_of(record), np.asarray(record.observation)
+    task, observed = task_of(record), np.asarray(record.observation)
     if record.uplink is None or with_scene:
         if not np.isfinite(record.tx_pos_m[rows]).all():
             row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
             raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
-        units = np.array([task.unit(values[rows]) for values in seen])
+        units = np.array([task.unit(values[rows]) for values in observed])
         weight = _weights(record, rows)
-        found = Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(seen), units, weight=weight)
+        targets = Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(observed), units, weight=weight)
         if record.carriers_hz is None:
-            return found
+            return targets
         carriers = np.unique(record.carriers_hz[rows])
         number = np.where(np.isin(record.carriers_hz, carriers), np.searchsorted(carriers, record.carriers_hz), -1)
-        return replace(found, carriers_hz=carriers, carrier=number)
+        return replace(targets, carriers_hz=carriers, carrier=number)
     outputs = outputs_of(record)
     features, divisor = normalised_uplink(record.uplink)
-    channels = seen[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
+    # Divided as the uplink is: path loss and the radios' phases are equal in both links and need not be learned.
+    channels = observed[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
     truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
-    known = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
-    unit = float(np.sqrt(2 * np.mean(np.square(truth[0, known], dtype=float)))) or 1.0
+    received = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
+    # Root mean square of the complex numbers, whose two parts have half of the mean square each.
+    unit = float(np.sqrt(2 * np.mean(np.square(truth[0, received], dtype=float)))) or 1.0
     return Targets(np.asarray(features.T, float), truth, np.array([unit]), outputs.antennas)
 
 
@@ -113,6 +115,7 @@ def _weights(record: Record, rows: IntArray) -> FloatArray | None:
         return None
     weight = np.ones(record.observation.shape[:2])
     inverse = np.sqrt(precision)
+    # A mean of 1, so that learning rates and losses compare with those of unweighted rows.
     weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
     return weight
 
@@ -121,8 +124,8 @@ def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
     """Complex values with a last axis of real and imaginary part."""
     if not np.iscomplexobj(values):
         return np.ascontiguousarray(values, np.float32)
-    whole = np.ascontiguousarray(values, np.complex64)
-    return whole.view(np.float32).reshape(*whole.shape, 2)
+    single = np.ascontiguousarray(values, np.complex64)
+    return single.view(np.float32).reshape(*single.shape, 2)
 
 
 def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
@@ -147,8 +150,17 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
     # The tracer finds no path through many walls; what was measured there is the weakest of all.
     floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
-    given = record.frequencies_hz, outputs, basis, features, headings, floor_db, targets.carriers_hz
-    return Form(name, (size[0], size[1]), *given)
+    return Form(
+        name,
+        (size[0], size[1]),
+        record.frequencies_hz,
+        outputs,
+        basis,
+        features,
+        headings,
+        floor_db,
+        targets.carriers_hz,
+    )
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:

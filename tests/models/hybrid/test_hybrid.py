@@ -13,9 +13,9 @@ import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import make_splits
 from wrf_mi.models import Problem
-from wrf_mi.models.held_out import HeldOut
 from wrf_mi.models.hybrid.parts import HybridSettings, parts_of
 from wrf_mi.tasks.scores import cea_db
+from wrf_mi.training.selection import HeldOut
 
 UNCLEAR_DB = 0.1
 """Difference on 24 held-out rows that is no clear gain over the most trusted ingredient, kriging."""

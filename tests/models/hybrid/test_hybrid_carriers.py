@@ -11,7 +11,7 @@ import pytest
 import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.held_out import hold_out
+from wrf_mi.training.selection import hold_out
 
 CARRIERS_HZ = (0.9e9, 1.8e9, 2.4e9, 3.5e9)
 

@@ -23,25 +23,22 @@ from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
+from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
 from ...training.fields import check_params, field_of
 from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
-from ...training.judging import HeldOutReports
 from ...training.loop import Progress
-from ...training.packed import PACKED, pack_params, unpack_params
 from ...training.predictor import Predictor
-from ...training.reach import Reach
+from ...training.stage_selection import HeldOutReports
 from ...training.state import FitState
 from ...training.trainer import Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 Params = dict[str, NDArray[np.float32]]
-OF_RECEIVER = "receiver."
-"""Prefix of the names of a receiver's parameters."""
-MEANS = ("gain", "pattern")
-"""Parameters of a receiver whose mean is taken; a pose is the stated one."""
+OF_RECEIVER = "receiver."  # prefix of the names of a receiver's parameters
+MEANS = ("gain", "pattern")  # parameters of a receiver whose mean is taken; a pose is the stated one
 
 
 def without_rows(split: Split) -> tuple[int, ...]:
@@ -51,11 +48,10 @@ def without_rows(split: Split) -> tuple[int, ...]:
 
 def trained_part(record: Record, split: Split) -> tuple[Record, Split]:
     """A record and its split with the receivers alone that have training rows."""
-    new = without_rows(split)
-    if not new:
+    trained = np.setdiff1d(np.arange(len(record.receivers)), without_rows(split))
+    if len(trained) == len(record.receivers):
         return record, split
-    kept = np.setdiff1d(np.arange(len(record.receivers)), new)
-    return record.at_receivers(kept), split.at_receivers(kept)
+    return record.at_receivers(trained), split.at_receivers(trained)
 
 
 def of_all_receivers(
@@ -69,32 +65,28 @@ def of_all_receivers(
     if not new:
         return params, reach
     trained = [number for number in range(len(receivers)) if number not in new]
-    whole = dict(params)
-    for number in new:
-        for kind in MEANS:
-            names = [f"{OF_RECEIVER}{receivers[other].name}.{kind}" for other in trained]
-            found = [params[name] for name in names if name in params]
-            if found:
-                whole[f"{OF_RECEIVER}{receivers[number].name}.{kind}"] = np.mean(found, axis=0, dtype=np.float32)
+    of_all = dict(params)
+    for kind in MEANS:
+        names = [f"{OF_RECEIVER}{receivers[number].name}.{kind}" for number in trained]
+        if values := [params[name] for name in names if name in params]:
+            mean = np.asarray(np.mean(values, axis=0, dtype=np.float32))
+            of_all |= {f"{OF_RECEIVER}{receivers[number].name}.{kind}": mean for number in new}
     if LEVEL in params:
-        level = np.full((1, len(receivers)), params[LEVEL].mean(), np.float32)
-        level[:, trained] = params[LEVEL]
-        whole[LEVEL] = level
+        of_all[LEVEL] = np.full((1, len(receivers)), params[LEVEL].mean(), np.float32)
+        of_all[LEVEL][:, trained] = params[LEVEL]
     if reach is None:
-        return whole, None
-    known = [np.concatenate(reach.known_m)] * len(receivers)
-    for number, positions_m in zip(trained, reach.known_m, strict=True):
-        known[number] = positions_m
-    return whole, replace(reach, known_m=tuple(known))
+        return of_all, None
+    positions_m = [np.concatenate(reach.known_m)] * len(receivers)
+    for number, of_receiver in zip(trained, reach.known_m, strict=True):
+        positions_m[number] = of_receiver
+    return of_all, replace(reach, known_m=tuple(positions_m))
 
 
 logger = logging.getLogger(__name__)
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
-PARAM = "param/"
-"""Prefix of a parameter's array in ``model.npz``."""
-REACH = "reach_m"
-"""Array of the reach in metres: infinite where no validation chose a finite one."""
+PARAM = "param/"  # prefix of a parameter's array in ``model.npz``
+REACH = "reach_m"  # array of the reach in metres: infinite where no validation chose a finite one
 PHASE_ERROR = "phase_error"
 """Array of the standard deviation of a reflection's phase in predictions, rad, where it is not 0."""
 
@@ -102,7 +94,7 @@ PHASE_ERROR = "phase_error"
 class FittedField(Fitted):
     """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
 
-    Operators are kept in the folder ``store`` (`wrf_mi.training.static_operator`).
+    Operators are kept in the folder ``store`` (`wrf_mi.training.evaluator`).
 
     Attributes:
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
@@ -114,7 +106,7 @@ class FittedField(Fitted):
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
         self._arrays, self._problem, self._store = arrays, problem, store
         self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
-        self.params: Params = under(PARAM, arrays) or unpack_params(arrays)
+        self.params: Params = under(PARAM, arrays)
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
         used = problem.scene is None or "position" in self.params
         self.field = field_of(config, self.form) if used else None
@@ -130,16 +122,8 @@ class FittedField(Fitted):
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
         graph.cover((), self.params)
-        common = self.field, self.params, self.receivers, *form.size
-        reach = _reach(self._arrays)
-        return Predictor(
-            *common,
-            operator=self._problem.operator,
-            store=self._store,
-            graph=graph,
-            reach=reach,
-            phase_error=float(self._arrays.get(PHASE_ERROR, 0.0)),
-        )
+        reach, phase_error = _reach(self._arrays), float(self._arrays.get(PHASE_ERROR, 0.0))
+        return Predictor(graph, self.params, self._problem.operator, self._store, reach, phase_error)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""
@@ -151,8 +135,8 @@ class FittedField(Fitted):
         if self._problem.scene is None:
             return super().decompose(inputs, receiver, std)
         heading = inputs.tx_heading_rad if self.uses_heading else None
-        found, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
-        return Decomposition(Prediction(found["whole"]), found.get("traced"), found.get("learned"), paths)
+        reports, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
+        return Decomposition(Prediction(reports["whole"]), reports.get("traced"), reports.get("learned"), paths)
 
     def arrays(self) -> Arrays:
         """Parameters, form of the observations, antennas, receivers and reach."""
@@ -166,30 +150,26 @@ class FittedField(Fitted):
 
     def without_gaussians(self) -> FittedField:
         """The same paths without the Gaussians beside them."""
-        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, PACKED, REACH))}
+        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, REACH))}
         params = {name: values for name, values in self.params.items() if name.startswith(TRACED_NAMES)}
         return FittedField(other | keyed(PARAM, params), self.config, self._problem, self._store)
-
-    def packed(self, params: Params, precision: str) -> Arrays:
-        """Arrays of a field with other parameters for the same receivers, see `wrf_mi.training.packed`."""
-        kept = {key: values for key, values in self._arrays.items() if not key.startswith((PARAM, PACKED))}
-        return kept | pack_params(params, precision)
 
 
 def _reach_arrays(reach: Reach | None) -> Arrays:
     if reach is None:
         return {}
-    counts = np.array([len(known) for known in reach.known_m])
+    # Receivers observe different numbers of transmitters: flat positions and their counts, as arrays hold no lists.
+    counts = np.array([len(positions_m) for positions_m in reach.known_m])
     return {REACH: np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
 
 
 def _reach(arrays: Arrays) -> Reach | None:
     if REACH not in arrays:
         return None
-    known = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
+    known_m = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
     if np.isnan(length_m := float(arrays[REACH])):
         raise InputError(f"array {REACH}: not a number; train the run anew")
-    return Reach(tuple(known), length_m)
+    return Reach(tuple(known_m), length_m)
 
 
 def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
@@ -207,9 +187,10 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     folder, record, config = session.folder, problem.record, problem.settings
     stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
     state = None if stored is None else FitState.from_arrays(stored)
+    # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
     trainer = Trainer(*trained_part(record, split), config, state=state, scene=_scene(problem, split))
     trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
-    cut_log(folder, trainer.state.step)
+    cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
 
     def on_progress(progress: Progress) -> None:
         append_log(folder, progress)
@@ -229,7 +210,7 @@ def fit(problem: Problem, split: Split, session: Session) -> FittedField:
     if trainer.state.phase_error:
         arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
     fitted = load(arrays, problem, folder)
-    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.held_out_reports()
+    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
     del trainer
     release_memory()
     return fitted
@@ -240,6 +221,7 @@ def _used(trainer: Trainer) -> tuple[Params, Reach | None]:
     params, reach, graph = trainer.state.mean_params(), trainer.reach(), trainer.graph
     if graph.scene is None:
         return params, reach
+    # What no stage that was kept has trained is not stored: it would be evaluated in every prediction.
     if not trainer.state.surface:
         params = {name: values for name, values in params.items() if not name.startswith("surface.")}
     if graph.field is not None and reach is not None and reach.length_m == 0:
@@ -262,6 +244,7 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
         changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
         logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
     for split in splits:
+        # The first part of a fit, which takes no time: what it refuses is refused before a run folder exists.
         record, rows = trained_part(problem.record, split)
         plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
         drawn = np.random.default_rng([plan.config.seed, 0])

@@ -13,10 +13,10 @@ from ...core import InputError, Prediction, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import task_of
-from ..held_out import RowDistance, predicted_rows
-from ..intervals import LEAST, Intervals, expected_size
+from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
+from ...training.selection import RowDistance
+from ..held_out import predicted_rows
 from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed
-from .mixture import Mixture
 from .parts import PATHS, TRACED, UPLINK_PARTS
 from .paths import by_stage
 from .residuals import Residuals
@@ -51,7 +51,7 @@ class FittedHybrid(Fitted):
         facts: dict[str, Any],
     ) -> None:
         self._problem, self._known, self._facts = problem, known, facts
-        self._distance = RowDistance(problem.record, known)
+        self._distance = RowDistance.of_rows(problem.record, known)
         self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
 
     @property

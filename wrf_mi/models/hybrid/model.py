@@ -19,12 +19,21 @@ import numpy as np
 
 from ...core import InputError, Prediction, Split
 from ...tasks import task_of
+from ...training.by_distance import (
+    GAPS,
+    HeldOutScores,
+    Intervals,
+    Mixture,
+    choose_weights,
+    constant,
+    expected_size,
+    fit_intervals,
+)
+from ...training.selection import HeldOut, hold_out
 from .. import MODELS
-from ..held_out import HeldOut, fit_model, held_out_predictions, hold_out, labelled
-from ..intervals import GAPS, Intervals, expected_size, fit_intervals
+from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, from_field_arrays, known_positions, under
 from .fitted import NEGLIGIBLE, PREDICTED, STATED, FittedHybrid
-from .mixture import Mixture, choose, constant
 from .parts import KRIGING, PATHS, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
 from .residuals import Residuals, left_over
 from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
@@ -134,7 +143,8 @@ class _Fit:
         def on_group(share: float) -> None:
             self.session.report("choosing weights", share)
 
-        form, mixture = choose(score, held_out.distance_m, held_out.group, unit, len(means), on_group, trusted=0)
+        scores_of = HeldOutScores(score, held_out.distance_m, unit, len(means))
+        form, mixture = choose_weights(scores_of, held_out.group, on_group, trusted=0)
         sign = 1 if self.task.higher_is_better else -1
         scores = {
             name: sign * float(score(np.broadcast_to(alone, (len(held_out), len(means))), every).mean())

@@ -17,8 +17,9 @@ from ...tasks import instrument_of, task_of
 from ...tracing import TraceOptions
 from ...tracing.tracer import RayTracer, fit_offsets
 from ...training.config import TrainConfig, calibration_config, task_settings
+from ...training.selection import HeldOut
 from ..gaussian.model import WRF_GS_PLUS, FittedField
-from ..held_out import HeldOut, as_unseen, labelled
+from ..held_out import as_unseen, labelled
 from ..model import (
     Arrays,
     Fitted,

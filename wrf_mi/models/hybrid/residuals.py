@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...core import Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ...training.selection import rows_at_receiver
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Fitted, keyed, under
@@ -36,8 +37,7 @@ def left_over(fitted: Fitted, record: Record, split: Split) -> LeftOver:
 
 def _training_rows(record: Record, split: Split, receiver: int) -> IntArray:
     """Training rows of a split whose observations a receiver has."""
-    rows = split.all_train
-    rows = rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
+    rows = rows_at_receiver(record, split.all_train, receiver)
     if receiver in split.held_receivers:
         rows = np.intersect1d(rows, split.left[split.left[:, 0] == receiver, 1])
     return rows

@@ -22,8 +22,7 @@ from ...correction import Correction, correct_scene, default_options, write_page
 from ...correction.options import FRAME, HIDDEN, PLANES
 from ...scene.correction_data import FILE as CORRECTION
 from ...tasks import task_of
-from ...training.reach import hold_out_groups
-from ..held_out import HeldOut
+from ...training.selection import HeldOut, hold_out_groups
 from ..model import Arrays, Decomposition, Fitted, Inputs, Problem, Session
 
 logger = logging.getLogger(__name__)

@@ -25,11 +25,12 @@ from ...tracing.options import TraceOptions
 from ...tracing.paths.solve import Prepared
 from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ...tracing.tracer import check_polarization
-from ..held_out import HeldOut, held_out_predictions, hold_out
+from ...training.by_distance import unit_means
+from ...training.selection import HeldOut, hold_out
+from ..held_out import held_out_predictions
 from ..interpolation.by_task import STOPS, StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Model, Problem, Session
-from .mixture import unit_means
 from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3

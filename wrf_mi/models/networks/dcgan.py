@@ -35,7 +35,7 @@ from ...backend.device import to_float, to_tensor
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...gaussians.parameters import logistic
-from ...training.loop_config import AdamConfig
+from ...training.config import AdamConfig
 from .layers import GAIN, Linear, Module, columns, feature_count, relu
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows

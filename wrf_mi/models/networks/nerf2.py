@@ -47,7 +47,7 @@ from ...tasks.conditions import (
     placed_receivers,
     truth_of,
 )
-from ...training.loop_config import AdamConfig
+from ...training.config import AdamConfig
 from ...training.session import FitSession
 from ..model import (
     Arrays,

@@ -19,10 +19,10 @@ from drjit.opt import Adam
 from ...backend.recorded import Recorded
 from ...core import InputError
 from ...core.types import IntArray
-from ...training.adam import NonFiniteReport, Params, guarded_step, rated_params
+from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from ...training.config import AdamConfig, LoopConfig
 from ...training.loop import Progress, TrainingLoop
-from ...training.loop_config import AdamConfig, LoopConfig
 from ...training.schedule import plan
 from ...training.session import FitSession
 from ...training.state import FitState
@@ -98,12 +98,11 @@ class NetworkTrainer(TrainingLoop):
         rates, module = {name: special.get(name, rate) for name in self.state.adam}, self.network.module
 
         def step(
-            adam: Adam, mean: Params, data: Any, drawn: Any, clock: Any, report: NonFiniteReport
+            adam: Adam, mean: Params, data: Any, drawn: Any, at: ScheduledStep
         ) -> tuple[Params, NonFiniteReport, Any]:
-            factor, decay, t = clock
-            params = rated_params(adam, rates, factor)
+            params = rated_params(adam, rates, at.factor)
             loss = loss_of(module.with_state(params), data, drawn)
-            mean, report, _ = guarded_step(adam, params, loss, mean, decay, t, report)
+            mean, report, _ = guarded_step(adam, params, loss, mean, at)
             loss = dr.detach(loss)  # the graph behind it would keep the step's arrays alive
             dr.eval(adam, mean, report, loss)
             return mean, report, loss
@@ -115,16 +114,12 @@ class NetworkTrainer(TrainingLoop):
         state, schedule, t = self.state, self.schedule, self.state.step
         # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
-        # Opaque, so that the recorded kernels take them as arguments instead of being compiled for each value.
-        factor, decay = (dr.opaque(mi.Float, float(values[t])) for values in (schedule.factor, schedule.decay))
-        clock = factor, decay, dr.opaque(mi.UInt32, t + 1)
         state.mean, trouble, loss = self._step(
             state.adam,
             state.mean,
             self.network.data,
             self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
-            clock,
-            trouble,
+            ScheduledStep.of(schedule, t, trouble),
         )
         return loss, trouble
 

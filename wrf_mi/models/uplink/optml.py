@@ -33,7 +33,7 @@ from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
 from ...core.types import IntArray
-from ...training.loop_config import AdamConfig
+from ...training.config import AdamConfig
 from ...training.session import FitSession
 from ..model import (
     Arrays,

@@ -7,7 +7,7 @@ import pytest
 
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
-from wrf_mi.models.hybrid.mixture import FORMS, Mixture, RowScores, averaged, choose
+from wrf_mi.training.by_distance import FORMS, HeldOutScores, Mixture, RowScores, choose_weights
 
 ROWS = 200
 RNG = np.random.default_rng(0)
@@ -25,8 +25,15 @@ def errors_of(errors: FloatArray) -> RowScores:
     return score
 
 
+def chosen_of(
+    errors: FloatArray, distance_m: FloatArray, fold: IntArray, unit: IntArray, trusted: int | None = None
+) -> tuple[str, Mixture]:
+    scores = HeldOutScores(errors_of(errors), distance_m, unit, len(errors))
+    return choose_weights(scores, fold, lambda share: None, trusted)
+
+
 def chosen(errors: FloatArray) -> tuple[str, Mixture]:
-    return choose(errors_of(errors), DISTANCE, FOLD, EACH, len(errors), lambda share: None)
+    return chosen_of(errors, DISTANCE, FOLD, EACH)
 
 
 def test_prediction_that_is_best_everywhere_has_all_the_weight():
@@ -46,7 +53,7 @@ def test_equal_weights_hedge_where_few_rows_tell_predictions_apart_by_chance():
     for seed in range(40):
         errors = np.random.default_rng(seed).normal(size=(3, 105))
         score, rows = errors_of(errors), np.arange(105)
-        _, mixture = choose(errors_of(errors[:, :5]), np.zeros(5), rows[:5], rows[:5], 3, lambda share: None)
+        _, mixture = chosen_of(errors[:, :5], np.zeros(5), rows[:5], rows[:5])
         single = np.eye(3)[np.argmin(np.abs(errors[:, :5]).mean(axis=1))]
         others = score(mixture(np.zeros(100)), rows[5:]).mean()
         better.append(others - score(np.broadcast_to(single, (100, 3)), rows[5:]).mean())
@@ -57,7 +64,7 @@ def test_clearly_worse_predictions_have_no_share_in_a_mean():
     """Two predictions of equal errors among five of ten times these: held-out rows tell which to average."""
     errors = np.random.default_rng(4).normal(size=(7, 40)) * np.repeat([1.0, 10.0], [2, 5])[:, None]
     every = np.arange(40)
-    weights = averaged(errors_of(errors), np.zeros(40), every, every, 7).weights[0]
+    weights = HeldOutScores(errors_of(errors), np.zeros(40), every, 7).averaged(every).weights[0]
     assert weights[2:].max() == 0
     assert weights[:2] == pytest.approx([0.5, 0.5], abs=0.25)
 
@@ -67,10 +74,10 @@ def test_a_trusted_prediction_is_left_where_rows_show_a_gain():
     common, own = np.random.default_rng(1).normal(size=(2, 3, ROWS))
     errors = 3 * common[:1] + own * np.array([[0.1], [1.0], [1.0]])
     five = np.arange(5)
-    few = [choose(errors_of(errors[:, k : k + 5]), np.zeros(5), five, five, 3, lambda _: None, 0) for k in range(100)]
+    few = [chosen_of(errors[:, k : k + 5], np.zeros(5), five, five, 0) for k in range(100)]
     assert sum(form == "single" for form, _ in few) > 50
     assert all(mixture(np.zeros(1))[0, 0] == 1 for form, mixture in few if form == "single")
-    form, mixture = choose(errors_of(errors), DISTANCE, FOLD, EACH, 3, lambda _: None, 1)
+    form, mixture = chosen_of(errors, DISTANCE, FOLD, EACH, 1)
     assert form != "single"
     assert mixture(np.array([0.5]))[0, 1] < 0.2
 
@@ -79,10 +86,10 @@ def test_copies_of_a_row_are_no_evidence():
     """Six receivers of each of five rows share its error: thirty observations are as good as five."""
     errors = np.random.default_rng(8).normal(size=(2, 5)) + np.array([[0.0], [0.3]])
     copied, rows = np.repeat(errors, 6, axis=1), np.repeat(np.arange(5), 6)
-    once = choose(errors_of(errors), np.zeros(5), np.arange(5), np.arange(5), 2, lambda _: None, 1)
-    again = choose(errors_of(copied), np.zeros(30), rows, rows, 2, lambda _: None, 1)
+    once = chosen_of(errors, np.zeros(5), np.arange(5), np.arange(5), 1)
+    again = chosen_of(copied, np.zeros(30), rows, rows, 1)
     assert once[0] == again[0] == "single"
-    assert choose(errors_of(copied), np.zeros(30), rows, np.arange(30), 2, lambda _: None, 1)[0] != "single"
+    assert chosen_of(copied, np.zeros(30), rows, np.arange(30), 1)[0] != "single"
 
 
 def test_weights_follow_the_distance():
@@ -98,7 +105,7 @@ def test_weights_follow_the_distance():
 def test_more_freedom_without_evidence_is_refused():
     rows = np.arange(4)
     errors = np.array([[1.0, 1.0, 1.0, 1.0], [0.9, 1.3, 0.9, 1.3]])
-    form, mixture = choose(errors_of(errors), np.arange(4.0), rows, rows, 2, lambda share: None)
+    form, mixture = chosen_of(errors, np.arange(4.0), rows, rows)
     assert form == "averaged"
     assert mixture(np.zeros(1))[0] == pytest.approx([1.0, 0.0], abs=0.1)
 
@@ -107,6 +114,6 @@ def test_more_freedom_without_evidence_is_refused():
 def test_no_form_is_below_the_best_single_prediction_on_its_rows(form: str):
     errors = np.random.default_rng(3).normal(size=(4, ROWS)) * np.array([[1.0], [2.0], [1.5], [0.8]])
     score, every = errors_of(errors), np.arange(ROWS)
-    mixture = FORMS[form](score, DISTANCE, every, every, 4)
+    mixture = FORMS[form](HeldOutScores(score, DISTANCE, every, 4), every)
     best = max(score(np.broadcast_to(one, (ROWS, 4)), every).mean() for one in np.eye(4))
     assert score(mixture(DISTANCE), every).mean() >= best - 1e-3

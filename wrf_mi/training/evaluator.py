@@ -1,0 +1,354 @@
+"""Evaluation of a graph's reports for transmitters whose paths are known: splatted, traced, or by operator.
+
+- `SplattedReports`: Gaussians alone, as one recorded function.
+- `TracedReports`: with the paths of a scene, or Gaussians that are traced.
+- `OperatorReports`: Gaussians of static geometry, as a linear map from their signals to pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..backend.device import to_float, to_tensor
+from ..backend.recorded import Recorded
+from ..core.angles import FloatArray
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.digest import content_digest
+from ..core.types import IntArray
+from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from ..gaussians.operator import Coefficients, Images, PixelOperator, pixel_weights, static_signals
+from ..gaussians.parameters import CHUNK_SIZE
+from ..gaussians.tiles import perception_plane
+from ..graph.graph import Alone, Batch, Field, Graph, Report
+from ..graph.receivers import PIXEL
+from ..receivers.reports import SQUARED_MAGNITUDE_EPS
+from ..tracing.paths.traced_field import TracedField
+from ..version import __version__
+from .adam import Params
+from .step import device_pose, evaluated, places_of
+
+TOGETHER = 16  # transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch
+TRACED_NUMBERS = 512  # with paths, numbers in a batch of small observations
+FORMAT = 1  # version of the file of an operator
+MOST_BYTES = 1 << 30  # largest size of one receiver's weights; larger fields are evaluated directly
+
+
+@dataclass(frozen=True)
+class Request:
+    """Transmitters whose reports of one port are evaluated.
+
+    Attributes:
+        condition: positions [m, 3], metres, or features [m, features].
+        port: number of the port.
+        side: its traced side, or None.
+        slots: rows of the traced side [m].
+        weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
+        alone: component reported alone (`Graph.report`); None: both together.
+        phase_error: see `Graph.report`.
+    """
+
+    condition: FloatArray
+    port: int
+    side: TracedField | None
+    slots: IntArray
+    weight: NDArray[Any] | None = None
+    alone: Alone | None = None
+    phase_error: float = 0.0
+
+    def rows(self, chosen: slice) -> Request:
+        """The request for some of the transmitters."""
+        weight = None if self.weight is None else self.weight[chosen]
+        return replace(self, condition=self.condition[chosen], slots=self.slots[chosen], weight=weight)
+
+
+class Evaluator(ABC):
+    """Evaluates reports of a graph with one set of parameters.
+
+    Args:
+        graph: Gaussians, paths and receivers.
+
+    Attributes:
+        params: parameters, Dr.Jit tensors.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.params: Params = {}
+
+    def update(self, params: Params) -> None:
+        """Replace the parameters (Dr.Jit tensors)."""
+        self.params = params
+
+    @abstractmethod
+    def __call__(self, request: Request) -> NDArray[np.float32]:
+        """Reports [m, *shape of a report]."""
+
+
+class _InBatches(Evaluator):
+    """Evaluates batches of transmitters by functions of Dr.Jit, recorded where it can record them.
+
+    Attributes:
+        recordings: recorded functions by their names and numbers of transmitters.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__(graph)
+        self._places, self._count = places_of(graph), 0
+        self.recordings: dict[tuple[Hashable, int], Recorded] = {}
+
+    def update(self, params: Params) -> None:
+        """Replace the parameters (Dr.Jit tensors)."""
+        count = params["position"].shape[1] if "position" in params else 0
+        if count != self._count:
+            # The number of Gaussians is a constant of a recording.
+            self._count, self.recordings = count, {}
+        super().update(params)
+
+    def __call__(self, request: Request) -> NDArray[np.float32]:
+        """Reports [m, *shape of a report], batch by batch."""
+        shape, count = self.graph.models[request.port].shape, len(request.condition)
+        if self.graph.form.features:  # of one antenna of the array
+            shape = shape[-2:]
+        out, size = np.empty((count, *shape), np.float32), self._batch_size(math.prod(shape))
+        for start in range(0, count, size):
+            part = slice(start, min(start + size, count))
+            out[part] = self._evaluated(request.rows(part)).numpy().reshape(part.stop - part.start, *shape)
+        return out
+
+    @abstractmethod
+    def _batch_size(self, numbers: int) -> int:
+        """Largest number of transmitters in a batch, for reports of so many numbers."""
+
+    @abstractmethod
+    def _evaluated(self, request: Request) -> Any:
+        """Flat report of a batch, a Dr.Jit array."""
+
+    def _plain(self, report: Report, request: Request, **signal: Any) -> Any:
+        """A report that is not recorded."""
+        place = self._places[request.port]
+        return evaluated(report, self.params, request.condition.T, place, request.slots, request.weight, **signal)
+
+    def _may_record(self, size: int) -> bool:
+        """Whether functions of Gaussians are recorded for batches of a size.
+
+        Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
+        room for all: neither is for very many Gaussians.
+        """
+        return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
+
+    def _recorded(
+        self,
+        name: Hashable,
+        size: int,
+        function: Callable[[Mapping[str, Any], Batch], Any],
+        request: Request,
+        read: Callable[[], Any] | None = None,
+    ) -> Any:
+        """Evaluate a function of at most ``size`` transmitters, which Dr.Jit records at its first call by a name.
+
+        ``read`` returns the arrays that the function reads beside its arguments.
+        """
+        condition, count, place = request.condition.T, len(request.condition), self._places[request.port]
+        if (name, size) not in self.recordings:
+
+            def recordable(params: Params, batch: Batch) -> Any:
+                with dr.suspend_grad():
+                    return function(params, batch)
+
+            # Arrays that are made from NumPy's memory at first use must exist before a recording.
+            evaluated(function, self.params, condition[:, :1], place)
+            self.recordings[name, size] = Recorded(recordable, read)
+        # The number of transmitters is a constant of the recorded kernels: copies of the last one fill a batch.
+        filled = np.minimum(np.arange(size), count - 1)
+        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, size)
+        dr.make_opaque(slots)
+        weight = None if request.weight is None else to_float(request.weight[filled])
+        arrays = self.recordings[name, size](self.params, place.batch(tx, slots, weight))
+
+        def leading(values: Any) -> Any:
+            return dr.gather(type(values), values, dr.arange(mi.UInt32, count * (dr.width(values) // size)))
+
+        if count == size:
+            return arrays
+        return tuple(map(leading, arrays)) if isinstance(arrays, tuple) else leading(arrays)
+
+
+class SplattedReports(_InBatches):
+    """Reports of Gaussians alone, splatted."""
+
+    @property
+    def _pixels(self) -> bool:
+        return self.graph.form.receiver == PIXEL
+
+    def _batch_size(self, numbers: int) -> int:
+        # An image of thousands of pixels fills the processors, and one recording serves any number of transmitters.
+        return 1 if self._pixels else TOGETHER
+
+    def _evaluated(self, request: Request) -> Any:
+        size, port = self._batch_size(1), request.port
+        if not self._may_record(size):
+            return self._plain(self.graph.report(port, None, chunked=True), request)
+        # One recording serves the pixels of all ports, whose poses are arguments.
+        name = "report", None if self._pixels else port
+        return self._recorded(
+            name, size, self.graph.report(port, None), request, partial(self.graph.arrays, port, None)
+        )
+
+
+class TracedReports(_InBatches):
+    """Reports with the paths of a scene, or of Gaussians that are traced."""
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__(graph)
+        self._sides: dict[Hashable, TracedField] = {}
+
+    def _batch_size(self, numbers: int) -> int:
+        return max(TOGETHER, TRACED_NUMBERS // numbers)
+
+    def _evaluated(self, request: Request) -> Any:
+        """Paths alone where no Gaussian has a weight."""
+        port, side, weight = request.port, request.side, request.weight
+        learned = self.graph.field is not None and request.alone != "traced"
+        learned &= side is None or weight is None or bool(np.any(weight))
+        if side is not None and len(side) == 1 and self._may_record(1):
+            return self._of_one(request, side, learned)
+        # Numbers of paths differ from batch to batch, and a recording serves one: only the Gaussians' signal, which
+        # takes most of the time, is recorded.
+        signal, count = None, len(request.condition)
+        # Batches of `TOGETHER` are recorded; copies that filled others would cost more than they save.
+        if learned and TOGETHER // 2 < count <= TOGETHER and self._may_record(TOGETHER):
+            # One recording serves the poses of all receivers unless they are trained.
+            name = "signal", port if self.graph.moves else None
+            signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
+        report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
+        return self._plain(report, request, signal=signal)
+
+    def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
+        """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""
+        port, how = request.port, {"alone": request.alone, "phase_error": request.phase_error}
+        name = "both", port, learned, *how.values(), side.form
+        # The recorded function looks the side up at each call, as its arrays are read beside the arguments.
+        self._sides[name] = side
+
+        def reported(params: Mapping[str, Any], batch: Batch) -> Any:
+            return self.graph.report(port, self._sides[name], learned, **how)(params, batch)  # type: ignore[arg-type]
+
+        return self._recorded(name, 1, reported, request, lambda: self.graph.arrays(port, self._sides[name]))
+
+
+class OperatorReports(Evaluator):
+    """Magnitudes at each direction by the linear map from signals to pixels (`wrf_mi.gaussians.operator`).
+
+        operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
+
+    The file is a cache: its key is a digest of all that the weights depend on, including the package's version.
+
+    Args:
+        graph: Gaussians whose geometry and attenuation do not depend on the transmitter.
+        store: folder of the files; None: in memory only.
+    """
+
+    def __init__(self, graph: Graph, store: Path | None) -> None:
+        super().__init__(graph)
+        self._store, self._field = store, cast(Field, graph.field)
+        self._ready: dict[int, Images | PixelOperator] = {}
+
+    @cached_property
+    def _arrays(self) -> dict[str, NDArray[np.float32]]:
+        return {name: dr.detach(values).numpy() for name, values in self.params.items()}
+
+    @cached_property
+    def _signals(self) -> tuple[NDArray[np.complex64] | None, Coefficients]:
+        return static_signals(self._field, self._arrays)
+
+    def update(self, params: Params) -> None:
+        """Replace the parameters; operators are built anew at the next prediction."""
+        super().update(params)
+        self._ready = {}
+        for derived in ("_arrays", "_signals"):
+            vars(self).pop(derived, None)
+
+    def __call__(self, request: Request) -> NDArray[np.float32]:
+        """Magnitudes [m, height, width].
+
+        Raises:
+            MemoryError: weights of more than `MOST_BYTES`.
+        """
+        receiver, (factors, coefficients) = request.port, self._signals
+        if receiver not in self._ready:
+            operator = PixelOperator(self._weights(receiver), *self.graph.form.size)
+            self._ready[receiver] = operator if factors is None else operator.composed(factors)
+        return self._ready[receiver].magnitude(
+            coefficients(np.asarray(request.condition, np.float32)), SQUARED_MAGNITUDE_EPS
+        )
+
+    def key(self, receiver: int) -> str:
+        """Digest of everything that the weights at a receiver depend on."""
+        pose, size = self.graph.receivers[receiver], self.graph.form.size
+        constants = (FORMAT, __version__, *size, CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, repr(self._field))
+        # Another signal network leaves the weights as they are.
+        signal_alone = self._field.signal_parameters
+        arrays = {name: values for name, values in self._arrays.items() if not name.startswith(signal_alone)}
+        return content_digest(constants, pose.position_m, pose.to_world, arrays)
+
+    def _weights(self, receiver: int) -> csr_array:
+        """Weights [pixels, n] at a receiver: stored ones if they are valid, else built and stored."""
+        key, size = self.key(receiver), self.graph.form.size
+        path = None if self._store is None else self._store / f"operator{receiver}.npz"
+        if path is not None:
+            stored = read_weights(path, key, (size[0] * size[1], self.params["position"].shape[1]))
+            if stored is not None:
+                return stored
+        with dr.suspend_grad():
+            # Of any transmitter: geometry and attenuation are those of all.
+            gaussians = self._field.gaussians(self.params, to_tensor(np.zeros((3, 1))))
+            pose, plane = device_pose(self.graph.receivers[receiver]), perception_plane(*size, mi.Float)
+            weights = pixel_weights(gaussians, pose, plane, MOST_BYTES)
+        if path is not None:
+            write_weights(path, key, weights)
+        return weights
+
+
+def write_weights(path: Path, key: str, weights: csr_array) -> None:
+    """Store weights if the folder can be written."""
+    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+    try:
+        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
+    except OSError:  # a run in a folder of someone else is predicted all the same
+        return
+
+
+def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:
+    """Stored weights of ``shape``; None if there are none, or if they are damaged or have another key."""
+    try:
+        stored = stored_arrays(path)
+        if int(stored["format"]) != FORMAT or str(stored["key"]) != key:
+            return None
+        weights = csr_array(tuple(stored[name] for name in ("data", "indices", "indptr")), shape=shape)
+        # SciPy's product checks nothing: an index out of range would end the process.
+        weights.check_format(full_check=True)
+    except Exception:  # numpy, zipfile and scipy raise a dozen kinds on damaged files
+        return None
+    return weights
+
+
+def evaluator_of(graph: Graph, operator: bool = False, store: Path | None = None) -> Evaluator:
+    """The evaluator of a graph; ``operator``: by operator where geometry and attenuation are static."""
+    if graph.scene is not None or not graph.evaluation.recordable:
+        return TracedReports(graph)
+    static = getattr(graph.field, "static_geometry", False) and graph.form.receiver == PIXEL
+    if operator and static and graph.form.carriers_hz is None:
+        return OperatorReports(graph, store)
+    return SplattedReports(graph)

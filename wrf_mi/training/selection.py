@@ -1,0 +1,263 @@
+"""Holding out training rows, and choosing by them.
+
+Every choice of a fit (stages, steps, reach, weights, intervals) is made on the same held-out rows (`hold_out`), by the
+same rule: an option with more freedom is taken where its gain over the one before exceeds the gain's standard error
+(`improves`), since the larger of two scores of few rows is larger by chance half of the time.
+
+Validation rows are drawn among the training rows and lie near them, where every interpolation is good. Clusters of
+positions are held out with them, so that some held-out rows are as far from the others as rows to be predicted.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+from scipy.special import stdtrit
+
+from ..core import Record, Split
+from ..core.angles import FloatArray
+from ..core.types import IntArray
+from ..datasets.observations import LEAST_ROWS, fitted_receivers, rows_received
+from ..datasets.splits import rows_left
+
+Option = TypeVar("Option")
+
+GROUPS = 10  # clusters of training positions, some of which are held out together
+ROWS_OF_GROUP = 4  # least average number of rows of a cluster
+HELD_OUT = 0.25  # approximate share of the training rows that are held out in clusters
+MOST_HELD_OUT = 0.5  # largest share in a single cluster
+FOLDS = 5
+"""Parts of rows that are left to receivers, or of positions at a held-out carrier, of which one is held out; largest
+number of groups of held-out observations."""
+MOST_OBSERVATIONS, MOST_VALUES = (200, 600), 20_000
+"""Largest number of held-out observations that weights and intervals are chosen from: 600 single numbers, fewer of many
+values, but 200."""
+
+
+def improves(score: FloatArray, before: FloatArray, higher_is_better: bool, errors: float = 1.0) -> bool:
+    """Whether the mean gain of paired scores [rows] exceeds ``errors`` of its standard errors; NaN where nothing was
+    received.
+    """
+    gain = (score - before) * (1 if higher_is_better else -1)
+    gain = gain[np.isfinite(gain)]
+    # Paired scores: rows differ among each other by more than options do, which the difference removes.
+    return len(gain) > 1 and float(gain.mean()) > errors * float(gain.std(ddof=1)) / np.sqrt(len(gain))
+
+
+def last_gain(
+    scores: Iterable[tuple[Option, FloatArray]],
+    higher_is_better: bool,
+    doubt: Mapping[Option, float] | None = None,
+    confidence: float | None = None,
+) -> Option:
+    """The last option that improves on the one kept before it (`improves`); the first, if none does.
+
+    Args:
+        scores: options in the order of their freedom, each with its scores of the same rows.
+        higher_is_better: direction of the scores.
+        doubt: standard errors by which a gain has to exceed zero for an option to be left; 1 for options without.
+        confidence: one-sided confidence in a gain by Student's t distribution, in place of standard errors: the
+            rows, such as receivers, may be a handful.
+    """
+    (chosen, best), *others = scores
+    for option, score in others:
+        errors = (doubt or {}).get(chosen, 1.0)
+        if confidence is not None:
+            pairs = np.count_nonzero(np.isfinite(score - best))
+            errors = float(stdtrit(pairs - 1, confidence)) if pairs > 1 else np.inf
+        # Against the one chosen so far, not the one before: a series of unclear gains may add up to a clear one.
+        if improves(score, best, higher_is_better, errors):
+            chosen, best = option, score
+    return chosen
+
+
+def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
+    """Number of the k-means cluster of each position [n, 3]; clusters may be empty."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an empty cluster, which holds nothing out
+        return np.asarray(kmeans2(positions_m, count, iter=50, minit="++", missing="warn", rng=rng)[1], np.int64)
+
+
+def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
+    """The split with clusters of its training rows moved to the validation rows, seeded by the split.
+
+    Args:
+        split: split of a record.
+        tx_pos_m: positions of all rows [n, 3], metres.
+
+    Returns:
+        A split with validation rows near training rows and far from them; ``split`` itself if its rows are too few.
+    """
+    rows: IntArray = split.train
+    count = min(GROUPS, len(rows) // ROWS_OF_GROUP, len(np.unique(tx_pos_m[rows], axis=0)))
+    if count < 2:
+        return split
+    rng = np.random.default_rng([split.seed, 3])
+    labels, out = clusters(tx_pos_m[rows], count, rng), np.zeros(len(rows), bool)
+    for group in rng.permutation(count):
+        more = out | (labels == group)
+        # The first cluster may be larger than the share: without any, nothing could be chosen.
+        if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
+            out = more
+    if not out.any():
+        return split
+    return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
+
+
+def hold_out(record: Record, split: Split) -> Split | None:
+    """The split of the training rows whose test rows are held out: the one hold-out of every choice.
+
+    Rows are held out as the split holds out its test rows. Usually these are clusters of positions and the validation
+    rows (`hold_out_groups`); of rows that are too few for clusters, the two that lie farthest from the others.
+
+    Where the split holds out receivers, half of the trained receivers are held out instead, but for as many rows as the
+    split leaves; where it holds out a carrier, one of the trained carriers is, at held-out positions if the split's
+    test positions are not among the training rows'.
+
+    Args:
+        record: data with known positions.
+        split: split whose training and validation rows are divided.
+
+    Returns:
+        A split; None for fewer than three rows, fewer than two positions, or a single trained receiver or carrier.
+    """
+    if split.held_receivers:
+        return _without_receivers(record, split)
+    rows, positions = split.all_train, record.tx_pos_m[split.all_train]
+    if len(rows) < 3 or len(np.unique(positions, axis=0)) < 2:
+        return None
+    carriers = record.carriers_hz
+    if carriers is not None and not np.isin(carriers[split.test], carriers[rows]).any():
+        return _without_carrier(record.tx_pos_m, carriers, split)
+    groups = hold_out_groups(split, record.tx_pos_m)
+    out = groups.validation
+    if groups is split or len(out) < 2:
+        # Where rows are sparsest, as far from the others as rows to be predicted may be.
+        distance, _ = cKDTree(positions).query(positions, k=2)
+        out = np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
+    fold = _fold(split, out, out)
+    return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
+
+
+def _fold(split: Split, gone: IntArray, test: IntArray) -> Split:
+    """The split that trains without the rows that are ``gone``, and tests some of them."""
+    train, validation = (np.setdiff1d(part, gone) for part in (split.train, split.validation))
+    return Split("held out", split.seed, train, validation, test)
+
+
+def _without_receivers(record: Record, split: Split) -> Split | None:
+    trained = np.setdiff1d(np.arange(len(record.receivers)), split.held_receivers)
+    if len(trained) < 2:
+        return None
+    # The half that judges a correction (`wrf_mi.correction.correct`): offsets differ, and few say little of others.
+    group = np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2].tolist()
+    # As many rows are left to each as the split leaves to its own held-out receivers.
+    each = len(split.left) // len(split.held_receivers)
+    # Rows that are left at the split's own receivers train, but for a part that is held out as theirs are.
+    left = np.random.default_rng([split.seed, 8]).permutation(np.arange(len(split.left)) % FOLDS) != 0
+    return Split(
+        "held out",
+        split.seed,
+        split.train,
+        split.validation,
+        split.all_train,
+        (*split.held_receivers, *group),
+        np.concatenate([split.left[left], rows_left(record, split.all_train, group, each, split.seed)]),
+    )
+
+
+def _without_carrier(tx_pos_m: FloatArray, carriers_hz: FloatArray, split: Split) -> Split | None:
+    rows = split.all_train
+    carriers, place = np.unique(carriers_hz[rows]), np.unique(tx_pos_m, axis=0, return_inverse=True)[1].reshape(-1)
+    if len(carriers) < 2:
+        return None
+    measured_places = np.isin(place[split.test], place[rows]).any()
+    rng = np.random.default_rng([split.seed, 4])
+    places = rng.permutation(np.unique(place[rows]))
+    held_places = places if measured_places else places[: -(-len(places) // FOLDS)]
+    at_carrier, at_places = carriers_hz[rows] == rng.choice(carriers), np.isin(place[rows], held_places)
+    # Where test positions are new, nothing is known of them at any carrier.
+    fold = _fold(split, rows[at_carrier | (at_places & ~measured_places)], rows[at_carrier & at_places])
+    return fold if len(fold.test) and len(fold.all_train) >= 2 else None
+
+
+def rows_at_receiver(record: Record, rows: IntArray, receiver: int) -> IntArray:
+    """Those of some rows that a receiver received, whole."""
+    return rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
+
+
+class RowDistance:
+    """Distance of positions to the nearest of some rows that a receiver received.
+
+    Args:
+        known_m: ``known_m(receiver)``: positions of these rows [k, 3], metres.
+    """
+
+    def __init__(self, known_m: Callable[[int], FloatArray]) -> None:
+        self._known_m = known_m
+        self._trees: dict[int, cKDTree] = {}
+
+    @classmethod
+    def of_rows(cls, record: Record, rows: IntArray) -> RowDistance:
+        """Distance to those of the rows [n] of a record that a receiver received."""
+        return cls(lambda receiver: record.tx_pos_m[rows_at_receiver(record, rows, receiver)])
+
+    def __call__(self, tx_pos_m: FloatArray, receiver: int) -> FloatArray:
+        """Distances [m] in metres of positions [m, 3]; infinite without any row."""
+        if receiver not in self._trees:
+            self._trees[receiver] = cKDTree(np.reshape(self._known_m(receiver), (-1, 3)))
+        return np.asarray(self._trees[receiver].query(tx_pos_m)[0])
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out observations: q pairs of a receiver and a row that it received.
+
+    Attributes:
+        receiver: number of the receiver [q].
+        row: row of the record [q].
+        distance_m: distance to the nearest row that remained and that the receiver received [q], metres.
+        group: group of independent errors [q], fewer than `FOLDS`: clusters of positions, or receivers.
+    """
+
+    receiver: IntArray
+    row: IntArray
+    distance_m: FloatArray
+    group: IntArray
+
+    @classmethod
+    def of(cls, record: Record, fold: Split, seed: int) -> HeldOut:
+        """Held-out observations of a fold, or as many of them, drawn with a seed, as `MOST_OBSERVATIONS` allows."""
+        parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        # Rows that a receiver did not receive are no neighbours: distances differ between receivers of one row.
+        distance = RowDistance.of_rows(record.seen(fold), fold.all_train)
+        for receiver in fold.held_receivers or fitted_receivers(record, [fold])[0]:
+            rows = np.setdiff1d(fold.test, fold.left[fold.left[:, 0] == receiver, 1])
+            rows = rows_at_receiver(record, rows, receiver)
+            parts.append((np.full(len(rows), receiver), rows, distance(record.tx_pos_m[rows], receiver)))
+        receiver, row, away = (np.concatenate(values) for values in zip(*parts, strict=True))
+        most = int(np.clip(MOST_VALUES // int(np.prod(record.observation.shape[2:])), *MOST_OBSERVATIONS))
+        if len(row) > most:
+            drawn = np.sort(np.random.default_rng([seed, 5]).permutation(len(row))[:most])
+            receiver, row, away = receiver[drawn], row[drawn], away[drawn]
+        group = np.zeros(len(row), np.int64)
+        if fold.held_receivers:
+            group = np.unique(receiver, return_inverse=True)[1].reshape(-1) % FOLDS
+        elif (count := min(FOLDS, len(np.unique(record.tx_pos_m[row], axis=0)))) > 1:
+            group = clusters(record.tx_pos_m[row], count, np.random.default_rng([seed, 6]))
+        return cls(receiver, row, away, group)
+
+    def __len__(self) -> int:
+        """Number of held-out observations."""
+        return len(self.row)
+
+    def observed(self, record: Record) -> NDArray[Any]:
+        """Observations [q, ...]."""
+        return record.observation[self.receiver, self.row]
