@@ -19,8 +19,8 @@ from scipy.special import sph_harm_y
 
 from wrf_mi.core import pixel_directions
 from wrf_mi.core.angles import FloatArray, solid_angles
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS
 from wrf_mi.tracing.paths.instrument_parameters import TX_PATTERN, pattern_name
 from wrf_mi.tracing.paths.material_parameters import SURFACE, name_of

@@ -14,8 +14,8 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.settings import with_settings
-from wrf_mi.graph.combine import CsiReceiver
 from wrf_mi.graph.settings import TRACED_NAMES, TracedConfig
+from wrf_mi.receivers.receiver_models import CsiReceiver
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.training.config import calibration_config
 from wrf_mi.training.trainer import Trainer

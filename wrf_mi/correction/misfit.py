@@ -23,9 +23,9 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from ..core.types import IntArray
-from ..graph.combine import ArrayReceiver
-from ..graph.receivers import RECEIVERS, Form, ReceiverModel
+from ..graph.receivers import RECEIVERS, Form
 from ..receivers import minmax_scale
+from ..receivers.receiver_models import ArrayReceiver
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing.paths.corrected_scene import MovedSearch
@@ -47,7 +47,7 @@ class PathTable(NamedTuple):
     """The n paths of a misfit.
 
     Attributes:
-        entry: place of each path among the entries of its side's `wrf_mi.tracing.paths.traced_field.TracedPaths` [n].
+        entry: place of each path among the entries of its side's `wrf_mi.receivers.device_paths.TracedPaths` [n].
         side: number of its side [n], ascending.
         row: its row of `Misfit.residual` [n], ascending in a side.
         plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.
@@ -117,7 +117,7 @@ class Misfit:
         floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
         form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
         sides, self.places = list[TracedField](), list[IntArray]()
-        self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
+        self.models, self._whole = list[Any](), list[Any]()
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         for number, receiver in zip(seen, self.receivers, strict=True):
             given = record.tx_pos_m[rows], receiver, traced, prepared, heading, carriers

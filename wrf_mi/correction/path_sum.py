@@ -11,10 +11,12 @@ a factor of its sums.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +25,13 @@ from scipy.sparse import coo_array, csr_array
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..parallel.threads import on_threads
+from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
+from ..receivers.receiver_models import ComplexArray as Complex
 from ..tasks import task_of
 from ..tracing.paths.material_parameters import PREFIX
 from ..tracing.paths.plane_parameters import SHIFT, TILT
 from ..tracing.search.images import mirrored
-from .signal_reports import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:
     from .misfit import Misfit
@@ -87,16 +89,17 @@ class PathSum:
             length, self._slope = _geometry(misfit, self._mirrors, vector)
         self._unit: Complex | None = None
         if task.in_decibel:
-            self._reports: Channels = Strengths(misfit)
+            pass
         elif task.image:
             hz = np.array([side.frequency_hz for side in misfit.sides])
-            self._reports, self._k = Spectra(misfit), (2 * np.pi * hz / speed_of_light)[self._paths.side, None]
+            self._k = (2 * np.pi * hz / speed_of_light)[self._paths.side, None]
             self._unit = misfit.unit_signals(self.at)
         else:
             assert misfit.record.frequencies_hz is not None
             hz = np.asarray(misfit.record.frequencies_hz, float)
-            self._reports, self._k = Channels(), 2 * np.pi * hz[None] / speed_of_light
+            self._k = 2 * np.pi * hz[None] / speed_of_light
             self._unit = np.exp(-1j * length[:, None] * self._k)
+        self._models, self._model_of = _distinct_models(misfit)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
         self._touched: dict[bytes, _Touched] = {}
         self._unit_of: tuple[bytes, Complex] = b"", np.zeros((0, 0), complex)
@@ -172,7 +175,27 @@ class PathSum:
         return rows, residual.reshape(*total.shape[:2], residual.shape[1])
 
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
-        return self._reports.report(signal, rows) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+        reports = [model.signal_report(signal[run]) for model, run in self._runs(rows)]
+        return _joined(reports, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+
+    def _runs(self, rows: IntArray) -> list[tuple[Any, slice]]:
+        """Receiver models and ranges of consecutive rows of ascending ``rows`` that they report: no copies of them."""
+        number = self._model_of[rows]
+        bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(rows)]
+        return [(self._models[number[begin]], slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
+
+    def _slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivatives of the reports of signals of ascending rows."""
+        runs = [(run, model.signal_slopes(signal[run])) for model, run in self._runs(rows)]
+
+        def slopes(change: Complex, which: IntArray) -> FloatArray:
+            parts = []
+            for run, of_run in runs:
+                begin, end = np.searchsorted(which, [run.start, run.stop])
+                parts.append(of_run(change[begin:end], which[begin:end] - run.start))
+            return _joined(parts, self.misfit)
+
+        return slopes
 
     def _keep(self, residual: FloatArray) -> None:
         self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
@@ -207,7 +230,7 @@ class PathSum:
             changes.append((moved.rows, moved.sums(change)))
         every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
         factor = self._factor(vector)
-        slopes = self._reports.slopes((total * factor)[every], every)
+        slopes = self._slopes((total * factor)[every], every)
         result = np.zeros((len(columns), *self.misfit.observed.shape), np.float32)
 
         def fill(number: int) -> None:
@@ -307,6 +330,22 @@ class PathSum:
             if key not in self._gains:
                 self._gains[key] = self.misfit.gains(there, touched.paths)
         return self._gains[key]
+
+
+def _distinct_models(misfit: Misfit) -> tuple[list[Any], IntArray]:
+    """Receiver models with different reports of signals, and the number of that of each row."""
+    models, number_of, number = list[Any](), dict[Any, int](), np.zeros(len(misfit.observed), np.int64)
+    for model, places in zip(misfit.models, misfit.places, strict=True):
+        if model.signal_key not in number_of:
+            number_of[model.signal_key] = len(models)
+            models.append(model)
+        number[places] = number_of[model.signal_key]
+    return models, number
+
+
+def _joined(parts: Sequence[FloatArray], misfit: Misfit) -> FloatArray:
+    """Reports of consecutive rows [n, values]; without a copy of the only part."""
+    return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, misfit.observed.shape[1])), *parts])
 
 
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:

@@ -35,14 +35,14 @@ from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
+from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
-from ..tracing.paths.traced_field import TracedField, TracedOptions, TracedPaths, traced_fields
+from ..tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
 from ..tracing.tracer import check_polarization
 from .evaluations import EVALUATIONS, Evaluation
-from .phase_errors import draws_of, for_draws, mean_of_draws, with_phase_errors
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
@@ -295,10 +295,8 @@ class Graph:
         kind = type(params[LEVEL].array)
         unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
         if paths is not None:
-            re, im = paths.gain
-            power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
             # A root of squares keeps both derivatives, where a maximum would leave ``level`` without one.
-            unit = dr.sqrt(SHARE**2 * power + unit * unit)
+            unit = dr.sqrt(SHARE**2 * kind(paths.power) + unit * unit)
         return unit if batch.weight is None else unit * batch.weight
 
     def report(
@@ -331,21 +329,18 @@ class Graph:
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
-            paths = None if side is None else side(params, batch.slots)
-            drawn = paths
+            paths, signal = None if side is None else side(params, batch.slots), None
+            if self.field is not None and learned and alone != "traced":
+                signal = batch.signal or self.learned(number, params, batch, chunked)
+                if (unit := self.unit(params, batch, paths)) is not None:
+                    if (count := dr.width(unit)) > 1:
+                        unit = spread(unit, dr.width(signal[0]) // count)
+                    signal = signal[0] * unit, signal[1] * unit
+                if alone == "learned":
+                    return model(None, signal)
             if phase_error and side is not None and paths is not None and alone is None:
-                drawn = with_phase_errors(paths, side.bounces, batch.slots, phase_error)
-            if self.field is None or not learned or alone == "traced":
-                return mean_of_draws(model(drawn, None), paths, drawn)
-            signal = batch.signal or self.learned(number, params, batch, chunked)
-            if (unit := self.unit(params, batch, paths)) is not None:
-                if (count := dr.width(unit)) > 1:
-                    each = dr.width(signal[0]) // count
-                    unit = dr.gather(type(unit), unit, dr.arange(mi.UInt32, count * each) // each)
-                signal = signal[0] * unit, signal[1] * unit
-            if paths is not None and drawn is not None:
-                signal = for_draws(signal, paths.batch, drawn.batch)
-            return mean_of_draws(model(None if alone == "learned" else drawn, signal), paths, drawn)
+                return expected_report(model, paths, signal, phase_error * side.bounces_of(batch.slots))
+            return model(paths, signal)
 
         return report
 
@@ -353,7 +348,10 @@ class Graph:
         """Constants on the device that a report reads beside its arguments, inputs of a recording."""
         if side is None and self.form.receiver == "pixel":
             return []
-        return [self.models[number].arrays(mi.Float), [] if side is None else [side.arrays, draws_of(side.form[0])]]
+        return [
+            self.models[number].arrays(mi.Float),
+            [] if side is None else [side.arrays, draws_on_device(side.form[0])],
+        ]
 
     def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
         """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
 from ...backend.device import columns_on_device
-from ...backend.vectors import Pose, cross, dot, tangent_basis
+from ...backend.vectors import Complex, Float64, Pose, Vector, cross, dot, tangent_basis, times
 from ...core import Antenna
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
@@ -32,9 +32,6 @@ from ..search.surfaces import Surfaces
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
 
-Float64: Any = dr.float64_array_t(mi.Float)
-Vector = list[Any]
-Complex = tuple[Any, Any]
 Tables = tuple[Any, Any, Any, Any]
 """Permittivity, conductivity, thickness and reflected share [n] of materials, as `SlabMaterials.constants`."""
 
@@ -181,20 +178,12 @@ def _interact(
     across = [dr.select(oblique, c * scale, a) for c, a in zip(across, tangent_basis(before)[0], strict=True)]
     along_before, along_after = cross(across, before), cross(across, after)
     (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
-    s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
-    p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
+    s, p = times((te.real, te.imag), (s_re, s_im)), times((tm.real, tm.imag), (p_re, p_im))
     out = []
     for old, s_part, p_part in zip(field, s, p, strict=True):
         new = [s_part * a + p_part * b for a, b in zip(across, along_after, strict=True)]
         out.append([dr.select(met, n, o) for n, o in zip(new, old, strict=True)])
     return out[0], out[1]
-
-
-def complex_exponential(logarithm: Any, phase: Any) -> Complex:
-    """Complex numbers of a logarithmic amplitude and a phase in rad."""
-    sine, cosine = dr.sincos(phase)
-    amplitude = dr.exp(logarithm)
-    return amplitude * cosine, amplitude * sine
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:

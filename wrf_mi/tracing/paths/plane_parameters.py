@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.device import columns_on_device, on_device, to_uint
+from ...backend.vectors import Float64, Vector
 from ...core.types import IntArray
 from ..search.surfaces import Surfaces
-from .field_calculator import Float64, Level, Vector
+from .field_calculator import Level
 from .material_parameters import MaterialGrouping, SlabMaterials, slabs_of_faces
 
 SHIFT, TILT = "plane.shift", "plane.tilt"

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...backend.device import on_device
+from ...backend.vectors import Complex, Float64, complex_exponential
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..options import DISC, FACTOR
-from .field_calculator import Complex, Float64, complex_exponential
 
 NEAREST = 6
 """Gaussians that change one interaction."""

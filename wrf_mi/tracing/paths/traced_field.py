@@ -26,18 +26,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ...backend.device import columns_on_device, on_device
-from ...backend.vectors import times
+from ...backend.vectors import Float64, times
 from ...core import Antenna, InputError, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import rows_by_carrier
 from ...core.types import IntArray
+from ...receivers.device_paths import TracedPaths
 from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions
 from ..search.legs import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
-from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
+from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths
 from .instrument_parameters import (
     gain_name,
     instrument_parameters,
@@ -89,27 +90,6 @@ class TracedOptions:
         """
         if self.trace.diffraction or self.trace.scattering:
             raise InputError("traced side: diffraction and scattering have no derivative here; switch both off")
-
-
-@dataclass
-class TracedPaths:
-    """Paths to a receiver as differentiable Dr.Jit arrays: ``each`` for every transmitter of the batch.
-
-    Arrays are float64, with the transmitter as the slowest index; place holders of gain zero fill missing paths.
-
-    Attributes:
-        gain: complex gain of free-space loss, interactions, antennas and instrument, without exp(-j k length).
-        length_m: unfolded length, metres.
-        arrival: unit vectors towards the incoming wave, receiver's frame.
-        batch: number of transmitters.
-        each: number of paths of each transmitter, place holders included.
-    """
-
-    gain: Complex  # two float arrays [batch * each]
-    length_m: Any  # float [batch * each]
-    arrival: Vector  # three float arrays [batch * each]
-    batch: int
-    each: int
 
 
 class TracedField:
@@ -235,10 +215,7 @@ class TracedField:
         """
         chains, batch, each, chosen = self.chains, len(self), self._each, entries
         if rows is not None:
-            batch = dr.width(rows)
-            slot = dr.arange(mi.UInt32, batch * each)
-            row = dr.gather(mi.UInt32, rows, slot // each)
-            chosen = row * each + slot % each
+            batch, chosen = dr.width(rows), self._entries_of(rows)
         if entries is not None:
             batch, each = dr.width(entries), 1
         if chosen is not None:
@@ -251,6 +228,15 @@ class TracedField:
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
         return TracedPaths(gain, length_m, arrival, batch, each)
+
+    def _entries_of(self, rows: Any) -> Any:
+        """Places of the paths of some transmitters, place holders included, [rows * each]."""
+        slot = dr.arange(mi.UInt32, dr.width(rows) * self._each)
+        return dr.gather(mi.UInt32, rows, slot // self._each) * self._each + slot % self._each
+
+    def bounces_of(self, rows: Any | None) -> Any:
+        """Square roots of the numbers of reflections of paths of some transmitters, or with None of all."""
+        return self.bounces if rows is None else dr.gather(Float64, self.bounces, self._entries_of(rows))
 
     def _evaluated(self, chains: Chains, parameters: Mapping[str, Any]) -> EvaluatedPaths:
         """Paths with the given parameters but those of antennas and gain."""

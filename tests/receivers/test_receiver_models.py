@@ -10,9 +10,9 @@ from box_room import FREQUENCY_HZ
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.tracing.paths.traced_field import TracedPaths
+from wrf_mi.receivers.device_paths import TracedPaths
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 # isort: split
 import drjit as dr
@@ -24,9 +24,9 @@ from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import magnitude, power
-from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.receivers.device_paths import Ports, path_sum
+from wrf_mi.receivers.receiver_models import magnitude, power
 from wrf_mi.receivers.reports import minmax_scale, scaled
 
 Float64 = dr.float64_array_t(mi.Float)
