@@ -10,7 +10,7 @@ import numpy as np
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Receiver, Record
-from wrf_mi.correction.frame import rigid_motions
+from wrf_mi.correction.state import rigid_motions
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface

@@ -181,7 +181,7 @@ def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path: Path, m
     assert mean[found.kept] > mean[""] + 3
 
     again = correct_scene(tmp_path / "corrected", record, split, replace(options, steps=0))
-    supposed = {name.partition("/")[0] for name in again.fit.supposed}
+    supposed = {name.partition("/")[0] for name in again.state.posterior.supposed}
     assert not supposed & {surface.name for surface in tops}
     kept = {one["surface"] for one in write_page(again, tmp_path / "again")["materials"] if not one["absent"]}
     assert level[0] in kept
@@ -203,7 +203,7 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(
     faces = {name: kind for name, kind in found.state.materials.items() if name.startswith(("other", "hidden"))}
     assert len(faces) == 5
     assert set(faces.values()) == {material}
-    assert not found.fit.absent(found.state)
+    assert not found.state.absent()
     assert np.nanmean(found.scores[found.kept]) > 19
 
 
@@ -229,7 +229,7 @@ def test_standard_deviations_cover_the_errors(corrected: Any) -> None:
     part = found.misfit.parts[SHIFT]
     error = np.abs(found.vector[part] - shift)
     assert (error < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < found.fit.prior_deviation[part] / 2).all()
+    assert (found.deviation[part] < found.state.posterior.prior_deviation[part] / 2).all()
 
 
 def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) -> None:
