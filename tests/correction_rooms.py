@@ -17,7 +17,7 @@ from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 

@@ -17,7 +17,7 @@ from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.state import LEAST_PATHS
 from wrf_mi.datasets import make_splits, read_spectrum_folder, write_spectrum_folder
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT
 from wrf_mi.tracing.paths.solve import Prepared
 
 SECONDS, MEBIBYTES = 60, 2048

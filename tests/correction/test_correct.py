@@ -34,7 +34,7 @@ from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -348,7 +348,7 @@ def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) 
         [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
     )
     slopes = misfit.jacobian(misfit.start, columns)
-    assert [tangent.n_recordings for tangent in misfit._tangents] == [1] * len(misfit.sides)
+    assert [port.tangent.n_recordings for port in misfit.ports] == [1] * len(misfit.ports)
     seen = np.isfinite(misfit.observed).all(axis=1)
     assert (slopes[:, ~seen] == 0).all()
     for place, column in enumerate(columns):

@@ -29,8 +29,7 @@ from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
-from ..tracing.paths.material_parameters import PREFIX, QUANTITIES
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.traced_field import TracedField, traced_fields
 from .options import CorrectionOptions

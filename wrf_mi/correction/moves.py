@@ -22,8 +22,7 @@ from scipy.constants import speed_of_light
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..parallel.threads import on_threads
-from ..tracing.paths.material_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SHIFT, TILT
 from ..tracing.sionna.materials import itu_constants, itu_exponent
 from .least_squares import Noise
 from .misfit import Misfit

@@ -30,8 +30,7 @@ from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
-from ..tracing.paths.material_parameters import QUANTITIES, SURFACE, name_of
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
 from .correct import Correction
 from .options import FRAME, MATERIALS
 from .state import LEAST_PATHS, rigid_motion, scene_entries

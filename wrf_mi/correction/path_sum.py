@@ -28,8 +28,7 @@ from ..parallel.threads import on_threads
 from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
 from ..receivers.receiver_models import ComplexArray as Complex
 from ..tasks import task_of
-from ..tracing.paths.material_parameters import PREFIX
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import PREFIX, SHIFT, TILT
 from ..tracing.search.images import mirrored
 
 if TYPE_CHECKING:
@@ -170,25 +169,30 @@ class PathSum:
         return rows, residual.reshape(*total.shape[:2], residual.shape[1])
 
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
-        reports = [model.signal_report(signal[run]) for model, run in self._runs(rows)]
+        reports = [self._models[number].signal_report(signal[run]) for number, run in self._runs(rows)]
         return _joined(reports, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
-    def _runs(self, rows: IntArray) -> list[tuple[Any, slice]]:
-        """Receiver models and the ranges of ascending ``rows`` that they report: slices, which need no copies."""
+    def _runs(self, rows: IntArray) -> list[tuple[int, slice]]:
+        """Numbers of receiver models and ranges of ``rows`` that they report: slices, which need no copies.
+
+        Rows of paths lie side by side, so that there are few ranges.
+        """
         number = self._model_of[rows]
         bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(rows)]
-        return [(self._models[number[begin]], slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
+        return [(int(number[begin]), slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
 
     def _slopes(self, signal: Complex, rows: IntArray) -> Slopes:
-        """Derivatives of the reports of signals of ascending rows."""
-        runs = [(run, model.signal_slopes(signal[run])) for model, run in self._runs(rows)]
+        """Derivatives of the reports of the signals of some rows."""
+        parts: list[list[Complex]] = [[] for _ in self._models]
+        place = np.zeros(len(rows), np.int64)
+        for number, run in self._runs(rows):
+            place[run] = sum(map(len, parts[number])) + np.arange(run.stop - run.start)
+            parts[number].append(signal[run])
+        of_model = [model.signal_slopes(parts[number]) for number, model in enumerate(self._models)]
 
         def slopes(change: Complex, which: IntArray) -> FloatArray:
-            parts = []
-            for run, of_run in runs:
-                begin, end = np.searchsorted(which, [run.start, run.stop])
-                parts.append(of_run(change[begin:end], which[begin:end] - run.start))
-            return _joined(parts, self.misfit)
+            runs = self._runs(rows[which])
+            return _joined([of_model[number](change[run], place[which[run]]) for number, run in runs], self.misfit)
 
         return slopes
 

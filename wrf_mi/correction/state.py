@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..tracing.paths.material_parameters import (
+from ..tracing.paths.scene_parameters import (
     EXPONENT,
     LEAST_CONDUCTIVITY,
     LEAST_SUSCEPTIBILITY,
     PREFIX,
     QUANTITIES,
+    SHIFT,
     SURFACE,
+    TILT,
     name_of,
 )
-from ..tracing.paths.plane_parameters import SHIFT, TILT
 from ..tracing.search.surfaces import Surfaces
 from .least_squares import Noise, Prior, left_out_residuals, minimised, posterior_covariance
 from .misfit import Misfit

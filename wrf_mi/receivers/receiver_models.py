@@ -23,7 +23,7 @@ solid angle of a pixel. A model reports in three ways:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -182,9 +182,9 @@ class ArrayReceiver(PixelReceiver):
         """Scaled spectra [n, pixels] of element signals [n, m], in single precision as those of the call."""
         return np.asarray(_scaled_rows(_magnitudes(self._images(signal)))[0], float)
 
-    def signal_slopes(self, signal: ComplexArray) -> Slopes:
-        """Derivative of `signal_report` at element signals [n, m], the pixels that set the scale included."""
-        image = self._images(signal)
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
+        """Derivative of `signal_report` at parts of element signals [n, m], pixels that set the scale included."""
+        image = np.concatenate([np.zeros((0, self.height * self.width), np.complex64), *map(self._images, parts)])
         spectrum = _magnitudes(image)
         share, low, high, inverse = _scaled_rows(spectrum)
         weight = image.conj() / spectrum  # d|z| = Re(conj(z) dz) / |z|
@@ -323,7 +323,7 @@ class CsiReceiver:
         """Channels [n, 2 values] of signals [n, values], real and imaginary part in turn."""
         return np.ascontiguousarray(signal).view(float)
 
-    def signal_slopes(self, signal: ComplexArray) -> Slopes:
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
         """Derivative of `signal_report`, which is linear."""
         return lambda change, which: np.ascontiguousarray(change).view(float)
 
@@ -380,9 +380,9 @@ class PowerReceiver(CsiReceiver):
         # The call adds the constant twice: under the root of the paths' power and under the logarithm.
         return np.asarray(strength_db(signal.real + LEAST_POWER, self.floor, LEAST_POWER), float)
 
-    def signal_slopes(self, signal: ComplexArray) -> Slopes:
-        """Derivative of `signal_report` at sums of powers [n, 1]; 0 where the floor is reported."""
-        power = signal.real + LEAST_POWER
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
+        """Derivative of `signal_report` at parts of sums of powers [n, 1]; 0 where the floor is reported."""
+        power = np.concatenate([np.zeros((0, 1)), *(part.real for part in parts)]) + LEAST_POWER
         weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
         return lambda change, which: weight[which] * change.real
 

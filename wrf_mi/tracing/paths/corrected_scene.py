@@ -1,6 +1,6 @@
 """Scenes with planes and materials as training has changed them: as a folder, and for the search of paths.
 
-Planes that move take paths with them (`wrf_mi.tracing.paths.plane_parameters`), but edges that move uncover some paths
+Planes that move take paths with them (`wrf_mi.tracing.paths.scene_parameters`), but edges that move uncover some paths
 and hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated
 one, so that paths found there are paths of the stated scene with these parameters.
 """
@@ -29,8 +29,7 @@ from ...scene.materials import EXPONENT as LAW
 from ...scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
 from ..search.surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
 from ..sionna.materials import absorbs, in_itu_range
-from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
-from .plane_parameters import SHIFT, TILT
+from .scene_parameters import QUANTITIES, SHIFT, TILT, MaterialGrouping, read_materials, slabs_of_faces
 from .solve import Prepared
 
 FLAT = 0.2
@@ -148,7 +147,7 @@ def write_corrected_scene(
         folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
-            `wrf_mi.tracing.paths.material_parameters`); others are ignored.
+            `wrf_mi.tracing.paths.scene_parameters`); others are ignored.
         grouping: grouping of the parameters of materials.
         kinds: kinds of objects by name; by default ``other``.
         absent: slabs, in the order of their parameters, whose surfaces are left out.

@@ -26,8 +26,7 @@ from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scatte
 from .result import TraceResult, device_ends
 
 if TYPE_CHECKING:
-    from .material_parameters import MaterialGrouping
-    from .plane_parameters import SceneTables
+    from .scene_parameters import MaterialGrouping, SceneTables
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +83,7 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .plane_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
+        from .scene_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)

@@ -9,7 +9,7 @@ float32 corners of its files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
 further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
-searches again. Planes that move keep their paths (see `wrf_mi.tracing.paths.plane_parameters`).
+searches again. Planes that move keep their paths (see `wrf_mi.tracing.paths.scene_parameters`).
 """
 
 from __future__ import annotations
@@ -47,9 +47,8 @@ from .instrument_parameters import (
     spread_pose,
     with_antennas,
 )
-from .material_parameters import TRAINED, MaterialGrouping
-from .plane_parameters import SceneTables, renumbered
 from .result import TraceResult, without_faint
+from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
 from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 
@@ -68,10 +67,10 @@ class TracedOptions:
         tx_antenna: antenna of the transmitters, which turns with their heading.
         materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
             object in a plane, started from its named material.
-        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.plane_parameters`).
+        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
-        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.material_parameters.QUANTITIES`.
+        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.scene_parameters.QUANTITIES`.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -182,9 +181,9 @@ class TracedField:
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
-        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.paths.material_parameters`), or
+        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.paths.scene_parameters`), or
         of n surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m
-        and ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.paths.plane_parameters`);
+        and ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.paths.scene_parameters`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """

@@ -169,7 +169,7 @@ class Surfaces:
     def moved_planes(
         self, shift_m: FloatArray, tilt: FloatArray, planes: IntArray | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.plane_parameters`.
+        """Normals [k, 3] and offsets [k] in metres of some planes, see `wrf_mi.tracing.paths.scene_parameters`.
 
         Args:
             shift_m: shifts along the normals [k].
