@@ -198,7 +198,7 @@ class Misfit:
         ports, make = list[_Port](), RECEIVERS[form.receiver].make
         for number, receiver in zip(numbers, self.receivers, strict=True):
             of_receiver = record.tx_pos_m[rows], receiver, self._traced, prepared, heading, carriers
-            sides = traced_fields(prepared.scene, *of_receiver, searched=searched)
+            sides = traced_fields(*of_receiver, searched=searched)
             for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
                 at = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 models = make(at, receiver), make(replace(at, size=complete), receiver)

@@ -217,7 +217,7 @@ class Graph:
         t = self.traced
         options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
         at = self.receivers[receiver], options, self._prepared
-        sides = traced_fields(self.scene, tx_pos_m, *at, tx_heading_rad, carriers_hz, params)
+        sides = traced_fields(tx_pos_m, *at, tx_heading_rad, carriers_hz, parameters=params)
         if self.surface:
             for side in sides:
                 side.attach(self.surface)

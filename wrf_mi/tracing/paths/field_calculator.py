@@ -122,6 +122,7 @@ def evaluate_paths(
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
     and 5.3; slabs as `slab`.
     """
+    # Image method: the transmitter mirrored in all planes, in order, sends a straight wave to the receiver.
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
         image = _mirrored(image, level, level.offset_m)
@@ -129,21 +130,25 @@ def evaluate_paths(
     length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 
+    # Directions of travel, backwards: before a reflection that of after it, mirrored.
     directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
         directions.insert(0, _mirrored(directions[0], level, 0))
 
     float_type = type(length)
     zero, one = float_type(0), float_type(1)
+    # What the transmitter's antenna sends, in its frame that is turned by the heading about z.
     cosine, sine = chains.heading
     x, y, z = directions[0]
     departure = [cosine * x + sine * y, cosine * y - sine * x, z]
     sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, one]]
     real = antenna_field(tx_antenna, directions[0], sent)
     imaginary = [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
+    # The field after each interaction, as real and imaginary vectors.
     for level, before, after in zip(chains.levels, directions[:-1], directions[1:], strict=True):
         real, imaginary = _interact(level, before, after, (real, imaginary), tables, frequency_hz)
 
+    # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity.
     world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]

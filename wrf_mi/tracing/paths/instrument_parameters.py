@@ -68,6 +68,7 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
             return [float_type(0)] * 3
         return [float_type(component(parameters[name], i)) for i in range(3)]
 
+    # p = p0 + t, and the columns of R0 E(r): E's axes in the stated frame.
     moved, turned = (correction(name) for name in pose_names(receiver))
     position = [float(x) + t for x, t in zip(receiver.position_m, moved, strict=True)]
     columns = principal_axes([*(0.5 * r for r in turned), float_type(1)])
@@ -132,6 +133,7 @@ def pattern_factor(coefficients: Any, direction: Vector) -> Complex:
     float_type = type(direction[0])
     count, paths = coefficients.shape[1], dr.width(direction[0])
     vector_type: Any = dr.float64_array_t(mi.Vector3f) if float_type == Float64 else mi.Vector3f
+    # Without the constant, degree 0, which the instrument's gain is.
     harmonics = dr.sh_eval(vector_type(*direction), int(np.sqrt(count + 1)) - 1)[1:]
     tensor_type: Any = dr.tensor_t(float_type)
     # A matrix product: the reverse pass of a sum would have a kernel for each coefficient.
