@@ -117,16 +117,16 @@ def correct_scene(
     """
     begun = time.perf_counter()
     record, split, options = _checked(record, split, options)
-    paths = _Paths(scene, record, split, options, material, on_stage)
+    traced = _TracedScene(scene, record, split, options, material, on_stage)
     held = _held_out(record, split)
     # Stages are fitted to some of the rows, and judged by the others.
-    trial = paths.posterior(held.known, held.known_rows)
+    trial = traced.posterior(held.known, held.known_rows)
     _check_paths(trial, f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
-    judged = _judged_stages(trial, paths, held)
+    judged = _judged_stages(trial, traced, held)
     kept = _kept({stage: held.units(result.score) for stage, result in judged.items()}, held.higher_is_better)
     # What is kept is fitted to all rows, along the paths of the scene that the trial found.
     best = judged[kept].state if kept else None
-    final = paths.posterior(record, split.all_train, best)
+    final = traced.posterior(record, split.all_train, best)
     state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
     if best:
         state = best.at(final).solved()
@@ -147,11 +147,7 @@ def correct_scene(
 def _checked(
     record: Record, split: Split, options: CorrectionOptions | None
 ) -> tuple[Record, Split, CorrectionOptions]:
-    """The rows and receivers that may be used, and options that suit the task.
-
-    Raises:
-        InputError: data that cannot be used.
-    """
+    """The rows and receivers that may be used, and options that suit the task; an `InputError` where there are none."""
     record = record.seen(split)
     numbers, left_out = fitted_receivers(record, [split])
     warn_of_left_out(record, left_out)
@@ -165,17 +161,14 @@ def _checked(
         options = replace(options, parts=(*options.parts, GAIN))
     # An image of each receiver and row has some hundred values: as many images as one receiver's rows tell as much.
     most = max(1, options.rows // (len(record.receivers) if task.image else 1))
+    # Seeds of other purposes differ by their second number, so that subsets are independent.
     rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:most]
     split = replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
     return record, split, options
 
 
 def _check_paths(posterior: Posterior, no_paths: str) -> None:
-    """Refuse a scene of which the rows tell nothing.
-
-    Raises:
-        InputError: no path to a receiver (``no_paths``), or too few that meet any surface.
-    """
+    """Refuse a scene of which the rows tell nothing: without a path to a receiver, or to any surface."""
     if not any(side.exists.any() for side in posterior.misfit.sides):
         raise InputError(no_paths)
     if not len(posterior.free("+".join(posterior.options.parts))):
@@ -183,12 +176,8 @@ def _check_paths(posterior: Posterior, no_paths: str) -> None:
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
 
 
-class _Paths:
-    """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it.
-
-    Args:
-        scene, record, split, options, material, on_stage: see `correct_scene`.
-    """
+class _TracedScene:
+    """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it."""
 
     def __init__(
         self,
@@ -209,15 +198,14 @@ class _Paths:
         check_materials(opened)
         self._prepared = Prepared(opened)
         self._prepared.check(record.tx_pos_m, record.receivers)
+        # Surfaces of hidden faces have parameters before any path is known to meet them.
         named = [name.rpartition("/")[::2] for name in self._prepared.tables("surface").slabs.names]
         slabs = np.array([slab for slab, (thing, _) in enumerate(named) if thing in self._hidden], np.int64)
         planes = np.array([int(named[slab][1]) for slab in slabs], np.int64)
         self._hidden_surfaces = planes, slabs
 
     def posterior(self, record: Record, rows: IntArray, state: State | None = None) -> Posterior:
-        """Posterior over paths of the stated scene, or over those of a scene whose planes have moved as a state has
-        them.
-        """
+        """Posterior of rows over the paths of the stated scene, or of one whose planes a state has moved."""
         self._on_stage("tracing", 0.0)
         searched, surfaces = None, self._hidden_surfaces
         if state:
@@ -238,10 +226,10 @@ class _Judged(NamedTuple):
     score: FloatArray
 
 
-def _judged_stages(trial: Posterior, paths: _Paths, held: _HeldOut) -> dict[str, _Judged]:
+def _judged_stages(trial: Posterior, traced: _TracedScene, held: _HeldOut) -> dict[str, _Judged]:
     """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
     states = {stage: Moves(trial, stage).best() for stage in _stages(trial.options)}
-    stated = paths.posterior(held.record, held.rows).misfit
+    stated = traced.posterior(held.record, held.rows).misfit
     judged = {"": held.judged(trial.start(""), stated)}
     for stage, state in states.items():
         judged[stage] = held.judged(state, stated)
@@ -249,9 +237,9 @@ def _judged_stages(trial: Posterior, paths: _Paths, held: _HeldOut) -> dict[str,
         # Other paths make good planes better. They do not mend those that fit training rows alone, and finding them
         # takes as long as all that was done before.
         if _moves(stage) and _last_is_best(units, held.higher_is_better):
-            along_moved = paths.posterior(held.known, held.known_rows, state)
+            along_moved = traced.posterior(held.known, held.known_rows, state)
             state = Moves(along_moved, stage).continued(state)
-            judged[stage] = held.judged(state, paths.posterior(held.record, held.rows, state).misfit)
+            judged[stage] = held.judged(state, traced.posterior(held.record, held.rows, state).misfit)
     return judged
 
 
@@ -269,11 +257,9 @@ def _moves(stage: str) -> bool:
 
 
 def _error_ratio(unseen: Misfit, before: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:
-    """Error of reports that a correction does not know over that of the same reports once it does, 1 or more.
-
-    The larger of two ratios of 90 % quantiles: of the rows that were held out of every choice, which are few, and of
-    all rows by least squares without each of them, after choices that knew them all.
-    """
+    """Error of reports that a correction does not know over that of the same reports once it does, 1 or more."""
+    # The larger of two ratios of quantiles: of the rows that were held out of every choice, which are few, and of all
+    # rows by least squares without each of them, after choices that knew them all.
     count = len(final.record.receivers)
     fitted = np.abs(final.residual(vector))
     rows = fitted.reshape(count, len(final.rows), -1)[:, np.isin(final.rows, unseen.rows)]
@@ -329,11 +315,8 @@ class _HeldOut(NamedTuple):
 
 
 def _held_out(record: Record, split: Split) -> _HeldOut:
-    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those.
-
-    Raises:
-        InputError: too few training rows.
-    """
+    """Training rows in groups in space, or where a split holds receivers out half of the others."""
+    # What judges a correction has to be like what the scene shall serve: new places, or new receivers.
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
     if split.held_receivers and len(trained) >= LEAST_RECEIVERS:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])
@@ -352,12 +335,10 @@ def _held_out(record: Record, split: Split) -> _HeldOut:
 
 
 def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
-    """The last stage whose mean gain over the one kept before is more than 0, with the one-sided `CONFIDENCE`.
-
-    By Student's t distribution, as receivers are few.
-    """
+    """The last stage whose mean gain over the one kept before is more than 0, with the one-sided `CONFIDENCE`."""
     kept = ""
     for stage, score in scores.items():
+        # Quantiles of Student's t distribution rather than of a normal one, as receivers are few.
         known = np.count_nonzero(np.isfinite(score - scores[kept]))
         if known > 1 and improves(score, scores[kept], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
             kept = stage

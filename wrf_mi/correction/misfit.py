@@ -60,16 +60,8 @@ class PathTable(NamedTuple):
 
 
 class _Port:
-    """A receiver at a carrier: its traced side, and recorded functions of parameters by name.
-
-    Attributes:
-        side: traced side of the rows at this carrier.
-        model: receiver model whose reports are compared.
-        complete: receiver model of complete images, which are scored.
-        places: entries of ``Misfit.observed`` of the rows.
-        report: reports of parameters.
-        tangent: derivatives of reports at parameters, in a direction.
-        gain: real and imaginary parts of the gains of paths, by parameters and places among the side's entries.
+    """A receiver at a carrier: its traced side, receiver models of what is compared and of complete images (which are
+    scored), its rows' places in ``Misfit.observed``, and recorded functions of parameters by name.
     """
 
     def __init__(self, side: TracedField, model: Any, complete: Any, places: IntArray) -> None:
@@ -79,12 +71,13 @@ class _Port:
         """Make the functions; arrays made from NumPy's memory at first use must exist before they are recorded."""
         side, model = self.side, self.model
 
-        def report(params: Mapping[str, Any]) -> Any:
+        def report(params: Mapping[str, Any]) -> Any:  # flat reports of all rows
             with dr.suspend_grad():
                 reports = model(side(params), None)
                 dr.eval(reports)
             return reports
 
+        # Derivatives of reports in one direction: forward mode, as rows outnumber the columns of a Jacobian.
         def tangent(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
             # Gradients of the caller's arrays stay off: all columns share them, and one recording.
             values = {name: dr.copy(value) for name, value in params.items()}
@@ -97,7 +90,7 @@ class _Port:
             dr.eval(slope)
             return slope
 
-        def gain(params: Mapping[str, Any], entries: Any) -> Any:
+        def gain(params: Mapping[str, Any], entries: Any) -> Any:  # of paths by their places in the side
             with dr.suspend_grad():
                 gains = side(params, entries=entries).gain
                 dr.eval(gains)
@@ -149,6 +142,7 @@ class Misfit:
         self.record, self.rows, self._traced = record, rows, options.traced
         self.tables = prepared.tables(self._traced.materials)
         placed = placed_receivers(record, by_uplink=False)
+        # Receivers without any observation are not traced: some hundred others may have heard these rows.
         known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
         numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in numbers]
@@ -161,13 +155,14 @@ class Misfit:
             tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
             for port in self.ports:
                 port.side = port.side.select(tables, self.planes, self.slabs)
-        # The same order of entries whichever receivers have rows.
+        # The vector: materials, planes and devices in an order that is the same whichever receivers have rows.
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
             self._instruments |= instrument_parameters(receiver, self._traced.pattern_degree)
         of_scene = self.sides[0].parameters().items()
         values = {name: value for name, value in of_scene if name.startswith((PREFIX, SHIFT, TILT))} | self._instruments
         values = {name: value for name, value in values.items() if options.changes(name)}
+        # Positions of parameters in the vector, one after the other.
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
@@ -207,6 +202,7 @@ class Misfit:
 
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
+        # Of planes and surfaces that have no entry, the stated values.
         stated = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
         parameters = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
         for name in stated.keys() & parameters.keys():
@@ -229,9 +225,11 @@ class Misfit:
         stored = self.record.observation[:, self.rows]
         count = stored.shape[0] * stored.shape[1]
         if self._image:
+            # A model's coarse image has its extremes on the lattice, not between, so the observed one is scaled there.
             coarse = minmax_scale(stored[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
             return coarse.reshape(count, -1), np.ones(count)
         if np.iscomplexobj(stored):
+            # Real and imaginary parts in turn, as receiver models report channels.
             pairs = np.ascontiguousarray(stored, np.complex128).view(float).reshape(count, -1)
             power = np.square(pairs).sum(axis=1)
             # The score is relative to a row's own power, but rows in deep fades have the errors of all others.
@@ -287,6 +285,7 @@ class Misfit:
         depth = max(len(side.chains.levels) for side in self.sides)
         entries = [np.flatnonzero(side.exists) for side in self.sides]
         ports = zip(self.ports, entries, strict=True)
+        # Entries lie transmitter by transmitter, an equal number of each.
         row = [port.places[exists // (len(port.side.exists) // len(port.places))] for port, exists in ports]
         met = zip(*(side.chains.met(depth) for side in self.sides), strict=True)
         number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
@@ -311,6 +310,7 @@ class Misfit:
             with dr.suspend_grad():
                 traced = port.side(params, entries=to_uint(entry))
                 one = dr.ones(type(traced.length_m), len(entry))
+                # Each path as a transmitter's only one, so that the sum at the elements is its wave.
                 alone = replace(traced, gain=(one, dr.zeros(type(one), len(entry))))
                 real, imaginary = port.model.elements(alone, type(one))
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
@@ -321,7 +321,7 @@ class Misfit:
         slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
         for place, column in enumerate(columns):
-            direction = self._device(np.eye(1, len(vector), column)[0])
+            direction = self._device(np.eye(1, len(vector), column)[0])  # a unit vector, column by column
             for port in self.ports:
                 slopes[place, port.places] = port.tangent(params, direction).numpy().reshape(len(port.places), -1)
         slopes /= self.unit[:, None].astype(np.float32)
@@ -363,10 +363,8 @@ class Misfit:
 def _met_surfaces(
     sides: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending.
-
-    Of furniture of 100,000 facets, the paths of some rows meet hundreds.
-    """
+    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending."""
+    # Of furniture of 100,000 facets, the paths of some rows meet hundreds: parameters of all would take gigabytes.
     used = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
     for mask, further, column in zip(used, (planes, slabs), (0, 1), strict=True):
         mask[further] = True

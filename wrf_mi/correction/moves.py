@@ -142,9 +142,8 @@ def shift_choices(posterior: Posterior, sd_m: float) -> list[Choice]:
 def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], posterior: Posterior) -> list[Choice]:
     """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
     for supposed faces, and all other choices by themselves.
-
-    At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
     """
+    # At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
     # In reverse order, so that of several surfaces in a plane that with most paths stays.
     of_plane = {f"plane {material.what.rpartition('/')[2]}": material for material in reversed(materials)}
     every = [(of_plane[shift.what], shift) for shift in shifts if shift.what in of_plane]
@@ -244,11 +243,7 @@ class Moves:
     def _alternatives(
         self, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray, of_materials: bool = False
     ) -> list[Alternative]:
-        """Alternatives of a choice, those with the least cost first.
-
-        Of a material and a shift together, the best of some shifts, or with ``of_materials`` those of each material and
-        the plane where it is, are compared after least squares, too.
-        """
+        """Alternatives of a choice, those with the least cost first; some of joint ones after least squares, too."""
         expected = self.posterior.expected(vector, choice.places)
         vectors = np.tile(vector, (len(choice.values), 1))
         for other, values in zip(vectors, choice.values.values(), strict=True):
@@ -268,11 +263,9 @@ class Moves:
         return sorted(tried, key=BY_COST)
 
     def _boxes(self, state: State) -> State:
-        """All faces of a box of one material, supposed ones at their best shifts, where that is likely.
-
-        Waves that pass a cabinet lose what its front and its back do. As long as the back is missing, the front is
-        taken to lose both, and then neither fits without the other.
-        """
+        """All faces of a box of one material, supposed ones at their best shifts, where that is likely."""
+        # Waves that pass a cabinet lose what its front and its back do. As long as the back is missing, the front is
+        # taken to lose both, and then neither fits without the other.
         posterior = self.posterior
         for number, slabs in enumerate(posterior.bodies, 1):
             posterior.on_stage(f"{self.title} of boxes", number / len(posterior.bodies))
@@ -346,11 +339,9 @@ class Moves:
         differs: Callable[[Choice, Alternative, Alternative], bool],
         of_materials: bool = False,
     ) -> State:
-        """One after another of the choices doubted most as the best alternatives that differ from each other.
-
-        All parameters are adapted to it: what the others have adapted to the wrong choice makes the right one look
-        worse until they may change.
-        """
+        """One after another of the choices doubted most as the best alternatives that differ from each other."""
+        # Least squares of all parameters before a comparison: what the others have adapted to the wrong choice makes
+        # the right one look worse until they may change.
         misfit, what = (
             self.posterior.misfit,
             f"{self.title} {'of other materials' if of_materials else 'in other minima'}",
@@ -395,11 +386,9 @@ class Moves:
 
 
 def _starts(choice: Choice, tried: Sequence[Alternative], vector: FloatArray, of_materials: bool) -> list[Alternative]:
-    """Alternatives of a joint choice, of ascending cost, from which least squares start.
-
-    The best materials of the `REFINED` best shifts, or the `SHIFTS_EACH` best shifts of each material, as those whose
-    shift is right hide behind others.
-    """
+    """Alternatives of a joint choice, of ascending cost, from which least squares start."""
+    # The best materials of the `REFINED` best shifts, or the `SHIFTS_EACH` best shifts of each material: before least
+    # squares, the right one may lie behind others.
     groups = dict[str, list[Alternative]]()  # by material or by shift
     for other in tried:
         groups.setdefault(other.name.partition(",")[0 if of_materials else 2], []).append(other)

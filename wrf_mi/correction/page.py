@@ -123,6 +123,7 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
     shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
     moved_mm, sd_mm = 1e3 * correction.vector[shift], 1e3 * correction.deviation[shift]
     turned, turned_sd = (1e3 * values[tilt].reshape(-1, 2) for values in (correction.vector, correction.deviation))
+    # A quantity is measured where its standard deviation fell by half: the data then tell more than the prior.
     free = np.isin(np.arange(shift.start, shift.stop), correction.state.free)
     ratio = correction.deviation[shift] / correction.state.posterior.prior_deviation[shift]
     planes = []
@@ -147,6 +148,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
     """Each surface that paths meet: paths, constants before and after, standard deviations of their logarithms."""
     misfit, slabs, state = correction.misfit, correction.misfit.sides[0].slabs, correction.state
     fitted = slabs.fitted(misfit.named(correction.vector)) if correction.kept else slabs
+    # Constants, not their logarithms, which parameters are; their uncertainty is a factor.
     before, after = (np.column_stack([part.table, part.exponent]).tolist() for part in (slabs, fitted))
     changed, absent = state.free, state.absent()
     quantities = QUANTITIES if misfit.several_carriers else QUANTITIES[:3]
@@ -178,6 +180,7 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
     surfaces, places = misfit.sides[0].surfaces, misfit.plane_entries
     change, precision = np.zeros((2, 3 * len(surfaces.normal)))
     entries, free = scene_entries(misfit.planes, len(surfaces.normal)), np.isin(places, correction.state.free)
+    # The motion nearest to all planes, each as certain as the fit knows it; planes that were not fitted do not count.
     change[entries] = correction.vector[places]
     precision[entries[free]] = 1 / np.square(correction.deviation[places[free]])
     motion, sd = (1e3 * values for values in rigid_motion(surfaces, change, precision))
@@ -316,6 +319,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     shift = np.zeros(len(surfaces.normal)) + 1e3 * parameters.get(SHIFT, 0.0)
     figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
+    # Ceilings would hide the room.
     above = [correction.kinds.get(name) == "ceiling" for name in surfaces.names]
     shown = ~np.array(above)[surfaces.object_of(np.arange(len(triangles)))]
     if not any(plane["shift_mm"] for plane in facts["planes"]):
@@ -339,6 +343,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     room.set_box_aspect(np.maximum(high - low, 0.1))
     room.set_title(label)
     axes = figure.add_subplot(1, 2, 2)
+    # Distributions over the held-out rows: a mean that gains may hide rows that lose.
     for stage, score in correction.scores.items():
         values: FloatArray = np.sort(score[np.isfinite(score)])
         share = np.arange(1, len(values) + 1) / max(len(values), 1)

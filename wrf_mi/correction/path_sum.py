@@ -173,10 +173,8 @@ class PathSum:
         return _joined(reports, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
     def _runs(self, rows: IntArray) -> list[tuple[int, slice]]:
-        """Numbers of receiver models and ranges of ``rows`` that they report: slices, which need no copies.
-
-        Rows of paths lie side by side, so that there are few ranges.
-        """
+        """Numbers of receiver models and ranges of ``rows`` that they report."""
+        # Rows of paths lie side by side, so that there are few ranges, and slices need no copies.
         number = self._model_of[rows]
         bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(rows)]
         return [(int(number[begin]), slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
@@ -362,10 +360,7 @@ def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
 
 
 def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[FloatArray, csr_array]:
-    """Lengths [n] of all paths, and their derivatives by shifts, then tilts, of the q planes [n, 3 q].
-
-    ``mirrors``: plane that reflects each path at each interaction [n, depth], -1 for none.
-    """
+    """Lengths [n] of paths that planes ``mirrors`` [n, depth] reflect (-1: none), and slopes by planes [n, 3 q]."""
     surfaces, chosen, count = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes)
     axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
     shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))

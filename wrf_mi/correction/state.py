@@ -84,6 +84,7 @@ class State:
 
     def cost(self, noise: Noise) -> float:
         """Negative logarithm of likelihood and prior, without its constant."""
+        # Residuals of the tracer itself, as a sum over paths is linear in planes and moves get far.
         free, posterior = self.free, self.posterior
         likelihood = noise.cost(posterior.misfit.residual(self.vector))
         return likelihood + posterior.prior(self.mean, free).cost(self.vector[free])
@@ -94,6 +95,7 @@ class State:
         misfit, steps = posterior.misfit, posterior.options.steps
         steps = steps if most_steps is None else min(most_steps, steps)
 
+        # Derivatives by a sum over paths near each vector, residuals exact: steps end where the exact cost is least.
         def jacobian(vector: FloatArray) -> NDArray[np.float32]:
             return near(misfit, vector).jacobian(vector, free)
 
@@ -115,6 +117,7 @@ class State:
         if self._moves_frame:
             surfaces = misfit.sides[0].surfaces
             count = len(surfaces.normal)
+            # All planes move with the frame, and those that have entries as their entries say.
             moved = rigid_motions(surfaces) @ self.posterior.motion(self.vector, misfit.plane_entries[:0])
             moved[scene_entries(misfit.planes, count)] = self.vector[misfit.plane_entries]
             parameters |= {SHIFT: moved[:count], TILT: moved[count:].reshape(count, 2)}
@@ -175,17 +178,19 @@ class Posterior:
         bodies: Sequence[frozenset[str]] = (),
     ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
-        names = misfit.sides[0].slabs.names
+        names = misfit.sides[0].slabs.names  # <object>/<plane>
         objects = [name.partition("/")[0] for name in names]
         faces = [np.flatnonzero([thing in body for thing in objects]) for body in bodies]
         self.bodies = [slabs for slabs in faces if len(slabs) > 1]
         self.supposed = {name: slab for slab, name in enumerate(names) if objects[slab] in hidden}
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
+        # Few paths tell of no surface: their noise would move it anywhere within the prior.
         ranked = [(np.argsort(-count, kind="stable"), count) for count in misfit.counts()]
         self.planes, self.slabs = (order[count[order] >= LEAST_PATHS] for order, count in ranked)
         self.prior_deviation = np.ones(len(misfit.start))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)
+        # The start: faces that the scan lacks are absent, gains are those of the observations.
         self.stated = misfit.start.copy()
         for slab in self.supposed.values():
             self.stated[material_places(misfit, slab)] = ABSENT_VALUES
@@ -222,6 +227,7 @@ class Posterior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
         covariance = np.diag(np.square(self.prior_deviation[free]))
         if self._has_frame:
+            # Shifts and tilts are the frame's motion M w plus each plane's deviation: covariance D + M S M^T.
             _, among, which = np.intersect1d(free, self.misfit.plane_entries, return_indices=True)
             motions = self.motions[which]
             covariance[np.ix_(among, among)] += (motions * FRAME_SD**2) @ motions.T
@@ -251,6 +257,7 @@ class Posterior:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
         if not self._has_frame:
             return vector[places].copy()
+        # Without the entries themselves, which are to be judged.
         by_frame = vector.copy()
         by_frame[self.misfit.plane_entries] = self.motions @ self.motion(vector, places)
         return by_frame[places]
@@ -269,6 +276,7 @@ class Posterior:
     def refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         places = places[np.isin(places, self.free("+".join(self.options.parts)))]
+        # Materials have their prior about the alternative, planes about the stated scene.
         mean, planes = start.copy(), self.misfit.plane_entries
         mean[planes] = self.stated[planes]
         jacobian = lambda vector: trials.jacobian(vector, places)  # noqa: E731
@@ -312,6 +320,7 @@ def rigid_motion(surfaces: Surfaces, change: FloatArray, precision: FloatArray) 
     """
     motions = rigid_motions(surfaces)
     information = motions.T @ (precision[:, None] * motions)
+    # A pseudo-inverse: motions along a corridor have no information, and get none.
     inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
     fixed = np.diag(information) > 0
     return inverse @ motions.T @ (precision * change), np.where(fixed, np.sqrt(np.diag(inverse)), np.inf)

@@ -112,10 +112,7 @@ def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
 def _spherical_waves(
     paths: Paths, direction: FloatArray, radius_m: FloatArray, elements_m: FloatArray, frequencies_hz: ArrayLike
 ) -> ComplexArray:
-    """Sums [n_rx * n_tx, m, k] of spherical waves at elements [n_rx, m, 3], world axes, from the origin.
-
-    The source of each wave lies at ``radius_m`` [p] from the origin in ``direction`` [p, 3].
-    """
+    """Sums [n_rx * n_tx, m, k] at elements [n_rx, m, 3] of waves from sources at ``radius_m`` in ``direction``."""
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     channel = np.zeros((paths.n_rx * paths.n_tx, elements_m.shape[1], len(frequencies)), np.complex128)
     pair: IntArray = paths.rx * paths.n_tx + paths.tx

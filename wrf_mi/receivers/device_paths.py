@@ -71,17 +71,10 @@ class Ports:
 
 
 def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
-    """Coherent sum of a receiver's paths at m ports, spherical waves as in `wrf_mi.receivers.antenna_csi`.
-
-    Args:
-        paths: paths of a batch of transmitters.
-        ports: ports of the receiver.
-
-    Returns:
-        Real and imaginary part, float64 [batch * m]. A fixed order of summation: the same in every run.
-    """
+    """Coherent sums of a batch's paths at m ports, float64 [batch * m]: spherical waves as in `antenna_csi`."""
     each = paths.each
-    # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them.
+    # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them,
+    # the same in every run.
     lane = dr.arange(mi.UInt32, paths.batch * ports.count * each)
     port = (lane // each) % ports.count
     slot = (lane // (each * ports.count)) * each + lane % each
@@ -187,10 +180,8 @@ class ComplexMatrix:
 
 
 def _products(x: Complex, parts: Any) -> list[Any]:
-    """Real products of both parts of rows x, flat [batch * k], with both parts of a matrix, [k, 2 n]: flat [batch * n].
-
-    One matrix product in place of four, for each of which Dr.Jit would rearrange the matrix.
-    """
+    """Real products [batch * n] of both parts of rows x, flat [batch * k], with both parts of a matrix [k, 2 n]."""
+    # One matrix product in place of four, for each of which Dr.Jit would rearrange the matrix.
     rows = _tensor(dr.concat(x), parts.shape[0])
     real_products = type(parts)((rows @ parts).array, (2, rows.shape[0] // 2, 2, parts.shape[1] // 2))
     return [real_products[i, :, j].array for i in range(2) for j in range(2)]

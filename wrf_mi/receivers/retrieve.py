@@ -160,10 +160,8 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
 
 
 def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Levenberg-Marquardt from n starts [n, 2 m]: real and imaginary parts of the signals, and norms of residuals [n].
-
-    All starts take their steps together, each with a damping of its own: a step of one takes less time than its calls.
-    """
+    """Levenberg-Marquardt from n starts [n, 2 m] of real and imaginary parts: signals, and norms of residuals [n]."""
+    # All starts take their steps together, each with its damping: the calls of a single step take longer than its sums.
     flat = form.reshape(len(form), -1)
 
     def evaluated(x: FloatArray, of: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:

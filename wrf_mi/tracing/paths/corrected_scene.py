@@ -97,9 +97,7 @@ def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tup
 
 
 def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArray) -> tuple[IntArray, IntArray]:
-    """Planes [count, 3] at each corner, the largest first, that are not parallel to what larger ones span, and their
-    numbers [count]; of ``pairs`` of corner and plane [n, 2], and areas [q] and normals [q, 3] of the planes.
-    """
+    """Planes [count, 3] at each corner that are not parallel to what larger ones span, and their numbers [count]."""
     # Gram-Schmidt of the normals at all corners at once, one rank of area after another.
     corner, plane = pairs[np.lexsort((pairs[:, 1], -area[pairs[:, 1]], pairs[:, 0]))].T
     first = np.searchsorted(corner, np.arange(count + 1))
@@ -226,9 +224,7 @@ def write_corrected_scene(
 
 
 def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[np.bool_]:
-    """Mask of ``count`` surfaces that are facets of curved or small things: small, or with a neighbour in the same
-    object that bends little.
-    """
+    """Mask of ``count`` surfaces that are facets: small, or with a neighbour in their object that bends little."""
     # Curved things have many faces that bend little towards each other, which a cabinet's sides do not.
     known, area = slab_of_face >= 0, trimesh.triangles.area(surfaces.triangles)
     facets: NDArray[np.bool_] = np.bincount(slab_of_face[known], area[known], count) < FACET_M2
