@@ -118,26 +118,28 @@ def correct_scene(
     begun = time.perf_counter()
     record, split, options = _checked(record, split, options)
     traced = _TracedScene(scene, record, split, options, material, on_stage)
-    held = _held_out(record, split)
+    held_out = _held_out(record, split)
     # Stages are fitted to some of the rows, and judged by the others.
-    trial = traced.posterior(held.known, held.known_rows)
+    trial = traced.posterior(held_out.known, held_out.known_rows)
     _check_paths(trial, f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
-    judged = _judged_stages(trial, traced, held)
-    kept = _kept({stage: held.units(result.score) for stage, result in judged.items()}, held.higher_is_better)
+    judged = _judged_stages(trial, traced, held_out)
+    best_stage = _kept(
+        {stage: held_out.units(result.score) for stage, result in judged.items()}, held_out.higher_is_better
+    )
     # What is kept is fitted to all rows, along the paths of the scene that the trial found.
-    best = judged[kept].state if kept else None
+    best = judged[best_stage].state if best_stage else None
     final = traced.posterior(record, split.all_train, best)
     state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
     if best:
         state = best.at(final).solved()
         deviation[state.free], left_out = state.uncertainty()
-        unseen = judged[kept].unseen
-        before, after = held.vector_of(best, unseen), held.with_mean_gain(state.vector, final.misfit)
+        unseen = judged[best_stage].unseen
+        before, after = held_out.vector_of(best, unseen), held_out.with_mean_gain(state.vector, final.misfit)
         data = CorrectionData(record.name, split.all_train, _error_ratio(unseen, before, final.misfit, after, left_out))
     facts = {
         "rows": len(split.all_train),
-        "held_out": len(held.rows),
-        "held_out_receivers": list(held.out),
+        "held_out": len(held_out.rows),
+        "held_out_receivers": list(held_out.out),
         "paths": len(final.misfit.paths.row),
     }
     scores = {stage: result.score for stage, result in judged.items()}
@@ -226,20 +228,20 @@ class _Judged(NamedTuple):
     score: FloatArray
 
 
-def _judged_stages(trial: Posterior, traced: _TracedScene, held: _HeldOut) -> dict[str, _Judged]:
+def _judged_stages(trial: Posterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
     """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
     states = {stage: Moves(trial, stage).best() for stage in _stages(trial.options)}
-    stated = traced.posterior(held.record, held.rows).misfit
-    judged = {"": held.judged(trial.start(""), stated)}
+    stated = traced.posterior(held_out.record, held_out.rows).misfit
+    judged = {"": held_out.judged(trial.start(""), stated)}
     for stage, state in states.items():
-        judged[stage] = held.judged(state, stated)
-        units = {name: held.units(result.score) for name, result in judged.items()}
+        judged[stage] = held_out.judged(state, stated)
+        units = {name: held_out.units(result.score) for name, result in judged.items()}
         # Other paths make good planes better. They do not mend those that fit training rows alone, and finding them
         # takes as long as all that was done before.
-        if _moves(stage) and _last_is_best(units, held.higher_is_better):
-            along_moved = traced.posterior(held.known, held.known_rows, state)
+        if _moves(stage) and _last_is_best(units, held_out.higher_is_better):
+            along_moved = traced.posterior(held_out.known, held_out.known_rows, state)
             state = Moves(along_moved, stage).continued(state)
-            judged[stage] = held.judged(state, traced.posterior(held.record, held.rows, state).misfit)
+            judged[stage] = held_out.judged(state, traced.posterior(held_out.record, held_out.rows, state).misfit)
     return judged
 
 
@@ -316,16 +318,16 @@ class _HeldOut(NamedTuple):
 
 def _held_out(record: Record, split: Split) -> _HeldOut:
     """Training rows in groups in space, or where a split holds receivers out half of the others."""
-    # What judges a correction has to be like what the scene shall serve: new places, or new receivers.
+    # What held_out a correction has to be like what the scene shall serve: new places, or new receivers.
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
     if split.held_receivers and len(trained) >= LEAST_RECEIVERS:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])
         others = np.setdiff1d(trained, out)
         names = (tuple(record.receivers[number].name for number in part) for part in (out, others))
-        known, held = (
+        known, held_out = (
             record.seen(replace(split, held_receivers=tuple(hidden), left=NO_ROWS)) for hidden in (out, others)
         )
-        return _HeldOut(known, split.all_train, held, split.all_train, *names)
+        return _HeldOut(known, split.all_train, held_out, split.all_train, *names)
     groups = hold_out_groups(split, record.tx_pos_m)
     if groups is split:
         raise InputError(f"{record.name}: {len(split.train)} training rows are too few to hold some out; give more")
@@ -336,13 +338,13 @@ def _held_out(record: Record, split: Split) -> _HeldOut:
 
 def _kept(scores: Mapping[str, FloatArray], higher_is_better: bool) -> str:
     """The last stage whose mean gain over the one kept before is more than 0, with the one-sided `CONFIDENCE`."""
-    kept = ""
+    best = ""
     for stage, score in scores.items():
         # Quantiles of Student's t distribution rather than of a normal one, as receivers are few.
-        known = np.count_nonzero(np.isfinite(score - scores[kept]))
-        if known > 1 and improves(score, scores[kept], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
-            kept = stage
-    return kept
+        known = np.count_nonzero(np.isfinite(score - scores[best]))
+        if known > 1 and improves(score, scores[best], higher_is_better, float(stdtrit(known - 1, CONFIDENCE))):
+            best = stage
+    return best
 
 
 def _last_is_best(scores: Mapping[str, FloatArray], higher_is_better: bool) -> bool:

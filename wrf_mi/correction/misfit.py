@@ -309,10 +309,10 @@ class Misfit:
                 continue
             with dr.suspend_grad():
                 traced = port.side(params, entries=to_uint(entry))
-                one = dr.ones(type(traced.length_m), len(entry))
+                unit_gain = dr.ones(type(traced.length_m), len(entry))
                 # Each path as a transmitter's only one, so that the sum at the elements is its wave.
-                alone = replace(traced, gain=(one, dr.zeros(type(one), len(entry))))
-                real, imaginary = port.model.elements(alone, type(one))
+                alone = replace(traced, gain=(unit_gain, dr.zeros(type(unit_gain), len(entry))))
+                real, imaginary = port.model.elements(alone, type(unit_gain))
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
         return np.concatenate(signals)
 
@@ -377,5 +377,5 @@ def _met_surfaces(
 
 def _stride(length: int, most: int) -> int:
     """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
-    found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
-    return found if 3 * (length // found) >= most else 1
+    smallest = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
+    return smallest if 3 * (length // smallest) >= most else 1

@@ -257,7 +257,7 @@ class Moves:
         places = choice.places if trials is self.posterior.misfit else choice.plane
         work, vectors_of = partial(self.posterior.refined, trials, places=places), [start.vector for start in starts]
         # Recordings of Dr.Jit, by which a misfit is evaluated, serve one thread at a time.
-        refined = on_threads(work, vectors_of) if isinstance(trials, PathSum) else [work(one) for one in vectors_of]
+        refined = on_threads(work, vectors_of) if isinstance(trials, PathSum) else [work(start) for start in vectors_of]
         costs = self.posterior.trial_costs(trials, noise, np.stack(refined))
         tried += map(Alternative, costs, [start.name for start in starts], refined)
         return sorted(tried, key=BY_COST)

@@ -214,7 +214,7 @@ def _table(header: str, kinds: str, rows: Iterable[Sequence[str]]) -> list[str]:
 
 def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
     task, receivers = task_of(correction.misfit.record), ", ".join(facts["held_out_receivers"])
-    held = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
+    place = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
     scores = [
         (stage, *(f"{score[kind]:.{task.digits}f}" for kind in ("median", "mean")))
         for stage, score in facts["held_out_scores"].items()
@@ -225,7 +225,7 @@ def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
         f"Data: {correction.misfit.record.name}, {facts['rows']} training rows, {facts['paths']} paths. "
         f"Kept: {facts['kept']}. Duration: {facts['seconds']:.0f} s.",
         "",
-        f"{task.label} of {facts['held_out']} training rows {held} while choosing:",
+        f"{task.label} of {facts['held_out']} training rows {place} while choosing:",
         "",
         *_table("scene | median | mean", "lrr", scores),
     ]
