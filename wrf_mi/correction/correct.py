@@ -318,7 +318,7 @@ class _HeldOut(NamedTuple):
 
 def _held_out(record: Record, split: Split) -> _HeldOut:
     """Training rows in groups in space, or where a split holds receivers out half of the others."""
-    # What held_out a correction has to be like what the scene shall serve: new places, or new receivers.
+    # Rows that judge a correction have to be like what the scene shall serve: new places, or new receivers.
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
     if split.held_receivers and len(trained) >= LEAST_RECEIVERS:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])
