@@ -41,22 +41,14 @@ FLOOR = 0.5
 
 
 class PathTable(NamedTuple):
-    """The n paths of a misfit.
+    """The n paths of a misfit, and what they meet [n, depth]."""
 
-    Attributes:
-        entry: place of each path among the entries of its side's `wrf_mi.receivers.device_paths.TracedPaths` [n].
-        side: number of its side [n], ascending.
-        row: its row of `Misfit.residual` [n], ascending in a side.
-        plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.
-        reflects: whether it is reflected there [n, depth].
-    """
-
-    entry: IntArray
-    side: IntArray
-    row: IntArray
-    plane: IntArray
-    slab: IntArray
-    reflects: NDArray[np.bool_]
+    entry: IntArray  # place among the entries of the side's `wrf_mi.receivers.device_paths.TracedPaths` [n]
+    side: IntArray  # number of the side [n], ascending
+    row: IntArray  # row of `Misfit.residual` [n], ascending in a side
+    plane: IntArray  # place in `Misfit.planes`, -1 for none
+    slab: IntArray  # place in `Misfit.slabs`, -1 for none
+    reflects: NDArray[np.bool_]  # whether the path is reflected there
 
 
 class _Port:

@@ -64,9 +64,8 @@ class Choice:
 
     Attributes:
         what: name of the surface or plane.
-        places: entries of the vector that it has.
-        values: values of these entries by name of the alternative, ``material``, ``shift`` or ``material, shift``; NaN:
-            as the other planes let expect.
+        places: its entries of the vector.
+        values: values of these entries by ``material``, ``shift`` or ``material, shift``; NaN: as other planes predict.
         of_plane: whether each entry is of a plane, not of a material.
     """
 
@@ -167,12 +166,7 @@ def gains(before: float, after: float, bonus: float = 0.0) -> bool:
 
 
 class Moves:
-    """Search of a stage for the most probable choices.
-
-    Args:
-        posterior: likelihood and prior.
-        stage: the stage, its parts joined by "+".
-    """
+    """Search for the most probable choices of a stage, whose parts are joined by "+"."""
 
     def __init__(self, posterior: Posterior, stage: str) -> None:
         self.posterior, self.stage, self.title = posterior, stage, f"{stage.replace('+', ', ')}: choices"
@@ -193,7 +187,7 @@ class Moves:
         state = self._rounds(state.solved(ROUND_STEPS), range(2, ROUNDS + 1))
         moves: list[Callable[[State], State]] = [self._boxes]
         if len(self.joint) > 1:  # a single one has nothing that could hold it in the wrong place
-            moves += [self._doubted_anew, self._in_other_minima]
+            moves += [self._doubted_anew, self._otherwise]
         for move in moves:
             state = move(state)
         return state
@@ -201,7 +195,7 @@ class Moves:
     def continued(self, state: State) -> State:
         """The most probable state that is found from one over other paths."""
         state = self._rounds(state.at(self.posterior).solved(), range(1, ROUNDS + 1))
-        return self._of_other_materials(state) if self.material else state
+        return self._otherwise(state, of_materials=True) if self.material else state
 
     def _solved_if_better(self, state: State, other: State, bonus: float = 0.0) -> State:
         """Another state after least squares, or the present one where that gains nothing by the present noise."""
@@ -301,7 +295,7 @@ class Moves:
             doubt, choices = doubts[number % len(doubts)]
             number += 1
             # The half that is doubted most is left out, and then chosen beside the others.
-            most = np.argsort(-doubt(choices, state.vector), kind="stable")[: (len(choices) + 1) // 2]
+            most = np.argsort(-doubt(choices, state), kind="stable")[: (len(choices) + 1) // 2]
             doubted, other = [choices[place] for place in np.sort(most)], state
             for choice in doubted:
                 without = self._without(choice, other.vector)
@@ -312,70 +306,52 @@ class Moves:
             state = other
         return state
 
-    def _in_other_minima(self, state: State) -> State:
-        """The least plausible planes at other minima of the cost, at least `APART` wavelengths away."""
-        apart_m = APART * speed_of_light / self.posterior.frequency_hz
-
-        def differs(choice: Choice, other: Alternative, tried: Alternative) -> bool:
-            return bool(abs((other.vector - tried.vector)[choice.plane[0]]) >= apart_m)
-
-        return self._otherwise(state, self.joint, self._implausible(self.joint, state.vector), differs)
-
-    def _of_other_materials(self, state: State) -> State:
-        """The least plausible materials, furthest from their prior, replaced by others."""
-        places = np.array([choice.material for choice in self.material])
-        away = (state.vector - state.mean) / self.posterior.prior_deviation
-
-        def differs(choice: Choice, other: Alternative, tried: Alternative) -> bool:
-            return other.material != tried.material
-
-        return self._otherwise(state, self.material, np.square(away[places]).sum(axis=-1), differs, of_materials=True)
-
-    def _otherwise(
-        self,
-        state: State,
-        choices: Sequence[Choice],
-        doubt: FloatArray,
-        differs: Callable[[Choice, Alternative, Alternative], bool],
-        of_materials: bool = False,
-    ) -> State:
-        """One after another of the choices doubted most as the best alternatives that differ from each other."""
+    def _otherwise(self, state: State, of_materials: bool = False) -> State:
+        """The least plausible planes in other minima, or materials replaced by others, one after another."""
         # Least squares of all parameters before a comparison: what the others have adapted to the wrong choice makes
         # the right one look worse until they may change.
-        misfit, what = (
-            self.posterior.misfit,
-            f"{self.title} {'of other materials' if of_materials else 'in other minima'}",
-        )
-        doubtful = np.argsort(-doubt, kind="stable")[:ELSEWHERE]
-        for number, choice in enumerate([choices[place] for place in doubtful], 1):
+        choices = self.material if of_materials else self.joint
+        doubt = (self._far_from_prior if of_materials else self._implausible)(choices, state)
+        apart_m = APART * speed_of_light / self.posterior.frequency_hz
+        what = f"{self.title} {'of other materials' if of_materials else 'in other minima'}"
+        doubtful = [choices[place] for place in np.argsort(-doubt, kind="stable")[:ELSEWHERE]]
+        for number, choice in enumerate(doubtful, 1):
             self.posterior.on_stage(f"{what}, {number} of {len(doubtful)}", 0.0)
-            trials = near(misfit, state.vector)
+            trials = near(self.posterior.misfit, state.vector)
             tried = [Alternative(0.0, state.materials.get(choice.what, ""), state.vector)]
             for other in self._alternatives(trials, state.noise, choice, state.vector, of_materials):
-                if len(tried) > MINIMA:
-                    break
-                if not all(differs(choice, other, before) for before in tried):
+                same = [
+                    other.material == before.material
+                    if of_materials
+                    else abs((other.vector - before.vector)[choice.plane[0]]) < apart_m
+                    for before in tried
+                ]
+                if len(tried) > MINIMA or any(same):
                     continue
                 tried.append(other)
-                before = state
-                state = self._solved_if_better(
-                    state, state.chosen(choice.what, other.material, choice.material, other.vector)
-                )
-                if state is not before:
+                present = state
+                candidate = state.chosen(choice.what, other.material, choice.material, other.vector)
+                state = self._solved_if_better(state, candidate)
+                if state is not present:
                     break  # the other alternatives are beside what was found before
         return state
 
-    def _implausible(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
+    def _far_from_prior(self, choices: Sequence[Choice], state: State) -> FloatArray:
+        """Squared distances of materials from their prior, in standard deviations."""
+        away = (state.vector - state.mean) / self.posterior.prior_deviation
+        return np.square(away[np.array([choice.material for choice in choices])]).sum(axis=-1)
+
+    def _implausible(self, choices: Sequence[Choice], state: State) -> FloatArray:
         """Squared distances of planes from the positions predicted by the other planes, in standard deviations."""
-        posterior, places = self.posterior, [choice.plane for choice in choices]
+        posterior, vector, places = self.posterior, state.vector, [choice.plane for choice in choices]
         away = [(vector[at] - posterior.expected(vector, at)) / posterior.prior_deviation[at] for at in places]
         return np.square(away).sum(axis=1)
 
-    def _unsupported(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
+    def _unsupported(self, choices: Sequence[Choice], state: State) -> FloatArray:
         """Log-likelihoods without each surface, the higher the less observations tell of it."""
-        trials = near(self.posterior.misfit, vector)
-        noise = Noise.of(trials.residual(vector))
-        return -noise.costs(trials.mean_squares(np.stack([self._without(choice, vector) for choice in choices])))
+        trials = near(self.posterior.misfit, state.vector)
+        noise = Noise.of(trials.residual(state.vector))
+        return -noise.costs(trials.mean_squares(np.stack([self._without(choice, state.vector) for choice in choices])))
 
     def _without(self, choice: Choice, vector: FloatArray) -> FloatArray:
         """A vector [p] without the surface of a choice; its plane is where the other planes predict it."""

@@ -47,21 +47,13 @@ centimetres resonate within a few per cent of their thickness."""
 
 @dataclass(frozen=True, eq=False)
 class _Touched:
-    """The n paths that meet one of some planes and surfaces, in the order of `wrf_mi.correction.misfit.PathTable`.
+    """The n paths that meet one of some planes and surfaces, in the order of `wrf_mi.correction.misfit.PathTable`."""
 
-    Attributes:
-        key: identifies the planes and surfaces.
-        paths: these paths [n].
-        rows: their rows, each once and in the order of the paths [k].
-        adding: sums over the paths of each row [k, n].
-        slope: derivatives of their lengths by shifts and tilts [n, 3 q].
-    """
-
-    key: bytes
-    paths: IntArray
-    rows: IntArray
-    adding: csr_array
-    slope: csr_array
+    key: bytes  # identifies the planes and surfaces
+    paths: IntArray  # numbers of the paths [n]
+    rows: IntArray  # their rows, each once and in the order of the paths [k]
+    adding: csr_array  # sums over the paths of each row [k, n]
+    slope: csr_array  # derivatives of their lengths by shifts and tilts [n, 3 q]
 
     def sums(self, waves: Complex) -> Complex:
         """Sums [k, ...] of waves [n, ...] over the paths of each row."""

@@ -60,11 +60,9 @@ class TracedOptions:
 
     Attributes:
         trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
-        pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
-            `wrf_mi.tracing.paths.instrument_parameters`).
+        pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none.
         tx_antenna: antenna of the transmitters, which turns with their heading.
-        materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
-            object in a plane, started from its named material.
+        materials: whether each named material has parameters, or each surface, started from its named material.
         planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
