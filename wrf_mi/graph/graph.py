@@ -50,7 +50,7 @@ Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
 """Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
 SHARE = 0.1
-"""Unit of the learned side as a share of the paths' amplitude: it begins as a correction."""
+"""Initial learned amplitude relative to the amplitude of the paths."""
 MATCHING = 3
 """Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
 MATCHED = 256
@@ -83,7 +83,7 @@ class Batch:
 
 
 Alone = Literal["traced", "learned"]
-"""One of both sides of a graph."""
+"""Component reported alone: traced or learned."""
 Report = Callable[[Mapping[str, Any], Batch], Any]
 """``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
 
@@ -120,6 +120,7 @@ class Graph:
         evaluation: str = SPLATTED,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
+        # Phases of an array need its elements and a wavelength; paths need a carrier in any case.
         array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
         unknown = form.frequencies_hz is None and form.carriers_hz is None
         carrier = unknown and (self.kind.needs_carrier or scene is not None)
@@ -329,6 +330,7 @@ class Graph:
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
+            # The traced component, then the learned one in the receiver's unit.
             paths, signal = None if side is None else side(params, batch.slots), None
             if self.field is not None and learned and alone != "traced":
                 signal = batch.signal or self.learned(number, params, batch, chunked)
@@ -338,6 +340,7 @@ class Graph:
                     signal = signal[0] * unit, signal[1] * unit
                 if alone == "learned":
                     return model(None, signal)
+            # Single components are compared with each other: they keep the phases that the paths have.
             if phase_error and side is not None and paths is not None and alone is None:
                 return expected_report(model, paths, signal, phase_error * side.bounces_of(batch.slots))
             return model(paths, signal)
@@ -374,6 +377,7 @@ class Graph:
         # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
         rows = known[:: -(-len(known) // MATCHED)] if len(known) else known
         gain = np.zeros(2, np.float32)
+        # Reports are linear in the gain but for floors, which further passes leave behind.
         for _ in range(MATCHING if len(rows) else 0):
             with dr.suspend_grad():
                 report = unscaled(side({side.gain_name: mi.TensorXf(gain)}, to_uint(rows)), None).numpy()
