@@ -10,7 +10,7 @@ from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.correction import CorrectionOptions
 from wrf_mi.correction.misfit import Misfit
-from wrf_mi.correction.state import ABSENT, ABSENT_VALUES, Posterior, State, material_places
+from wrf_mi.correction.state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.paths.solve import Prepared
 
@@ -21,10 +21,10 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path: Path) -> No
     opened, options = open_scene(scene, CARRIER_HZ), CorrectionOptions(("materials",), depth=1, rays=4096)
     record = channels(scene, 24)
 
-    def fit(reflections: int, surfaces: tuple[np.ndarray, np.ndarray]) -> Posterior:
+    def fit(reflections: int, surfaces: tuple[np.ndarray, np.ndarray]) -> ScenePosterior:
         how = replace(options, reflections=reflections)
         misfit = Misfit(record, np.arange(12), Prepared(opened), how, surfaces=surfaces)
-        return Posterior(misfit, options, lambda what, share: None)
+        return ScenePosterior(misfit, options, lambda what, share: None)
 
     none = np.zeros(0, np.int64)
     first = fit(1, (none, none))

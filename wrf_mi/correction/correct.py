@@ -37,7 +37,7 @@ from ..training.reach import hold_out_groups, improves
 from .misfit import Misfit
 from .moves import Moves
 from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
-from .state import LEAST_PATHS, Posterior, State
+from .state import LEAST_PATHS, ScenePosterior, State
 
 LEVEL = 0.9
 """Level of the intervals for which errors of rows that a scene knows are enlarged."""
@@ -169,7 +169,7 @@ def _checked(
     return record, split, options
 
 
-def _check_paths(posterior: Posterior, no_paths: str) -> None:
+def _check_paths(posterior: ScenePosterior, no_paths: str) -> None:
     """Refuse a scene of which the rows tell nothing: without a path to a receiver, or to any surface."""
     if not any(side.exists.any() for side in posterior.misfit.sides):
         raise InputError(no_paths)
@@ -206,7 +206,7 @@ class _TracedScene:
         planes = np.array([int(named[slab][1]) for slab in slabs], np.int64)
         self._hidden_surfaces = planes, slabs
 
-    def posterior(self, record: Record, rows: IntArray, state: State | None = None) -> Posterior:
+    def posterior(self, record: Record, rows: IntArray, state: State | None = None) -> ScenePosterior:
         """Posterior of rows over the paths of the stated scene, or of one whose planes a state has moved."""
         self._on_stage("tracing", 0.0)
         searched, surfaces = None, self._hidden_surfaces
@@ -217,7 +217,7 @@ class _TracedScene:
                 parameters = {name: values.astype(np.float32) for name, values in state.scene_parameters().items()}
                 searched = moved_search(self._copy, self._prepared.surfaces, parameters, state.absent())
         misfit = Misfit(record, rows, self._prepared, self.options, searched, surfaces)
-        return Posterior(misfit, self.options, self._on_stage, self._hidden, self._boxes.members)
+        return ScenePosterior(misfit, self.options, self._on_stage, self._hidden, self._boxes.members)
 
 
 class _Judged(NamedTuple):
@@ -228,7 +228,7 @@ class _Judged(NamedTuple):
     score: FloatArray
 
 
-def _judged_stages(trial: Posterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
+def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
     """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
     states = {stage: Moves(trial, stage).best() for stage in _stages(trial.options)}
     stated = traced.posterior(held_out.record, held_out.rows).misfit

@@ -28,7 +28,7 @@ from .least_squares import Noise
 from .misfit import Misfit
 from .options import FRAME, FRAME_SD, MATERIALS, PLANES
 from .path_sum import PathSum, near
-from .state import ABSENT, ABSENT_VALUES, Posterior, State, material_places
+from .state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
@@ -59,7 +59,7 @@ APART = 1 / 8
 
 
 @dataclass(frozen=True)
-class Choice:
+class SurfaceChoice:
     """Alternatives of one surface or plane.
 
     Attributes:
@@ -90,7 +90,7 @@ class Choice:
         return bool(self.material.size and self.plane.size)
 
     @property
-    def shifts(self) -> Choice:
+    def shifts(self) -> SurfaceChoice:
         """The shifts of a joint choice, for any material."""
         values = {name.partition(", ")[2]: values[self.of_plane] for name, values in self.values.items()}
         return replace(self, places=self.plane, values=values, of_plane=self.of_plane[self.of_plane])
@@ -112,7 +112,7 @@ class Alternative(NamedTuple):
 BY_COST = attrgetter("cost")
 
 
-def material_choices(posterior: Posterior, slabs: IntArray) -> list[Choice]:
+def material_choices(posterior: ScenePosterior, slabs: IntArray) -> list[SurfaceChoice]:
     """Choices of the materials of some surfaces, in their order."""
     hz, misfit = posterior.frequency_hz, posterior.misfit
     values = dict[str, FloatArray]()
@@ -122,10 +122,10 @@ def material_choices(posterior: Posterior, slabs: IntArray) -> list[Choice]:
             values[name] = np.append(np.log([*least, thickness]), itu_exponent(name, hz))
     values[ABSENT] = ABSENT_VALUES
     names, of_plane = misfit.sides[0].slabs.names, np.zeros(len(QUANTITIES), bool)
-    return [Choice(names[slab], material_places(misfit, slab), values, of_plane) for slab in slabs]
+    return [SurfaceChoice(names[slab], material_places(misfit, slab), values, of_plane) for slab in slabs]
 
 
-def shift_choices(posterior: Posterior, sd_m: float) -> list[Choice]:
+def shift_choices(posterior: ScenePosterior, sd_m: float) -> list[SurfaceChoice]:
     """Choices of shifts of planes, with the tilts of the frame, within `FARTHEST` standard deviations of the prior."""
     misfit, step_m = posterior.misfit, STEP * speed_of_light / posterior.frequency_hz
     most = int(FARTHEST * sd_m / step_m)
@@ -135,10 +135,12 @@ def shift_choices(posterior: Posterior, sd_m: float) -> list[Choice]:
     places = [np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in posterior.planes]
     names = [f"plane {number}" for number in misfit.planes[posterior.planes]]
     pairs = zip(names, places, strict=True)
-    return [Choice(name, place, values, np.ones(3, bool)) for name, place in pairs] if most else []
+    return [SurfaceChoice(name, place, values, np.ones(3, bool)) for name, place in pairs] if most else []
 
 
-def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], posterior: Posterior) -> list[Choice]:
+def joint_choices(
+    materials: Sequence[SurfaceChoice], shifts: Sequence[SurfaceChoice], posterior: ScenePosterior
+) -> list[SurfaceChoice]:
     """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
     for supposed faces, and all other choices by themselves.
     """
@@ -147,7 +149,7 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], posteri
     of_plane = {f"plane {material.what.rpartition('/')[2]}": material for material in reversed(materials)}
     every = [(of_plane[shift.what], shift) for shift in shifts if shift.what in of_plane]
     pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what in posterior.supposed]
-    joint = list[Choice]()
+    joint = list[SurfaceChoice]()
     for material, shift in pairs:
         values = {
             f"{kind}, {place}": np.concatenate([constants, moved])
@@ -155,7 +157,7 @@ def joint_choices(materials: Sequence[Choice], shifts: Sequence[Choice], posteri
             for kind, constants in material.values.items()
         }
         places, mask = ([getattr(c, name) for c in (material, shift)] for name in ("places", "of_plane"))
-        joint.append(Choice(material.what, np.concatenate(places), values, np.concatenate(mask)))
+        joint.append(SurfaceChoice(material.what, np.concatenate(places), values, np.concatenate(mask)))
     done = {choice.what for pair in pairs for choice in pair}
     return [*joint, *(choice for choice in (*shifts, *materials) if choice.what not in done)]
 
@@ -168,10 +170,10 @@ def gains(before: float, after: float, bonus: float = 0.0) -> bool:
 class Moves:
     """Search for the most probable choices of a stage, whose parts are joined by "+"."""
 
-    def __init__(self, posterior: Posterior, stage: str) -> None:
+    def __init__(self, posterior: ScenePosterior, stage: str) -> None:
         self.posterior, self.stage, self.title = posterior, stage, f"{stage.replace('+', ', ')}: choices"
         parts, options = stage.split("+"), posterior.options
-        shifts, materials = list[Choice](), list[Choice]()
+        shifts, materials = list[SurfaceChoice](), list[SurfaceChoice]()
         if SHIFT in posterior.misfit.parts and (PLANES in parts or FRAME in parts):
             sd_m = float(np.hypot(options.shift_sd_m * (PLANES in parts), FRAME_SD[0] * (FRAME in parts)))
             shifts = shift_choices(posterior, sd_m)
@@ -211,7 +213,7 @@ class Moves:
             state = state.solved(ROUND_STEPS)
         return state
 
-    def _chosen(self, state: State, choices: Sequence[Choice], what: str) -> tuple[State, bool]:
+    def _chosen(self, state: State, choices: Sequence[SurfaceChoice], what: str) -> tuple[State, bool]:
         """Coordinate descent over choices, in sweeps until none changes; and whether one has."""
         posterior, vector, materials = self.posterior, state.vector.copy(), dict[str, str]()
         last = 0  # the choice that was changed last, or the first
@@ -235,7 +237,12 @@ class Moves:
         return state, bool(materials)
 
     def _alternatives(
-        self, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray, of_materials: bool = False
+        self,
+        trials: Misfit | PathSum,
+        noise: Noise,
+        choice: SurfaceChoice,
+        vector: FloatArray,
+        of_materials: bool = False,
     ) -> list[Alternative]:
         """Alternatives of a choice, those with the least cost first; some of joint ones after least squares, too."""
         expected = self.posterior.expected(vector, choice.places)
@@ -275,7 +282,7 @@ class Moves:
         return state
 
     def _of_one_material(
-        self, trials: Misfit | PathSum, state: State, faces: Sequence[Choice], material: str
+        self, trials: Misfit | PathSum, state: State, faces: Sequence[SurfaceChoice], material: str
     ) -> Alternative:
         """All faces of a box of a material, and the supposed ones among them where they fit best."""
         vector, supposed = state.vector.copy(), self.posterior.supposed
@@ -336,24 +343,24 @@ class Moves:
                     break  # the other alternatives are beside what was found before
         return state
 
-    def _far_from_prior(self, choices: Sequence[Choice], state: State) -> FloatArray:
+    def _far_from_prior(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Squared distances of materials from their prior, in standard deviations."""
         away = (state.vector - state.mean) / self.posterior.prior_deviation
         return np.square(away[np.array([choice.material for choice in choices])]).sum(axis=-1)
 
-    def _implausible(self, choices: Sequence[Choice], state: State) -> FloatArray:
+    def _implausible(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Squared distances of planes from the positions predicted by the other planes, in standard deviations."""
         posterior, vector, places = self.posterior, state.vector, [choice.plane for choice in choices]
         away = [(vector[at] - posterior.expected(vector, at)) / posterior.prior_deviation[at] for at in places]
         return np.square(away).sum(axis=1)
 
-    def _unsupported(self, choices: Sequence[Choice], state: State) -> FloatArray:
+    def _unsupported(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Log-likelihoods without each surface, the higher the less observations tell of it."""
         trials = near(self.posterior.misfit, state.vector)
         noise = Noise.of(trials.residual(state.vector))
         return -noise.costs(trials.mean_squares(np.stack([self._without(choice, state.vector) for choice in choices])))
 
-    def _without(self, choice: Choice, vector: FloatArray) -> FloatArray:
+    def _without(self, choice: SurfaceChoice, vector: FloatArray) -> FloatArray:
         """A vector [p] without the surface of a choice; its plane is where the other planes predict it."""
         absent = next(values for name, values in choice.values.items() if name.startswith(ABSENT))
         result = vector.copy()
@@ -361,7 +368,9 @@ class Moves:
         return result
 
 
-def _starts(choice: Choice, tried: Sequence[Alternative], vector: FloatArray, of_materials: bool) -> list[Alternative]:
+def _starts(
+    choice: SurfaceChoice, tried: Sequence[Alternative], vector: FloatArray, of_materials: bool
+) -> list[Alternative]:
     """Alternatives of a joint choice, of ascending cost, from which least squares start."""
     # The best materials of the `REFINED` best shifts, or the `SHIFTS_EACH` best shifts of each material: before least
     # squares, the right one may lie behind others.

@@ -60,7 +60,7 @@ class State:
         noise: noise of the residuals after the last least squares.
     """
 
-    posterior: Posterior
+    posterior: ScenePosterior
     stage: str
     vector: FloatArray
     mean: FloatArray
@@ -123,7 +123,7 @@ class State:
             parameters |= {SHIFT: moved[:count], TILT: moved[count:].reshape(count, 2)}
         return parameters
 
-    def at(self, posterior: Posterior) -> State:
+    def at(self, posterior: ScenePosterior) -> State:
         """The state over other rows or paths, which meet other surfaces: vector and means of their entries."""
         of_scene = self.scene_parameters(), self.posterior.misfit.of_scene(self.mean)
         vector, mean = map(posterior.misfit.vector_of, of_scene)
@@ -151,7 +151,7 @@ class State:
         return np.sqrt(np.diag(covariance)), left_out_residuals(derivative, residual, covariance, self.noise)
 
 
-class Posterior:
+class ScenePosterior:
     """Likelihood of the rows of one misfit, and the prior of its parameters.
 
     Args:
