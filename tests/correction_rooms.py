@@ -10,14 +10,14 @@ import numpy as np
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Receiver, Record
-from wrf_mi.correction.frame import rigid_motions
+from wrf_mi.correction.state import rigid_motions
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 

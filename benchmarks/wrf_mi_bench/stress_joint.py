@@ -28,8 +28,8 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.instrument_parameters import pattern_name, receiver_pose
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions

@@ -19,11 +19,11 @@ from scipy.special import sph_harm_y
 
 from wrf_mi.core import pixel_directions
 from wrf_mi.core.angles import FloatArray, solid_angles
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers import array_response, bartlett_spectrum, minmax_scale
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PowerReceiver
 from wrf_mi.receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS
 from wrf_mi.tracing.paths.instrument_parameters import TX_PATTERN, pattern_name
-from wrf_mi.tracing.paths.material_parameters import SURFACE, name_of
+from wrf_mi.tracing.paths.scene_parameters import SURFACE, name_of
 from wrf_mi.tracing.paths.traced_field import TracedField
 
 from .stress_rows import relative
@@ -134,7 +134,7 @@ class TracedOracle:
         hz = self._traced.frequency_hz
         eta = permittivity - 1j * conductivity / (2 * np.pi * hz * epsilon_0)
         cosine = np.where(met, np.abs((before * normal).sum(axis=-1)), 1)
-        through = slab(cosine, eta, slabs.thickness_m[material], hz)
+        through = slab(cosine, eta, slabs.thickness[material], hz)
         share = slabs.reflected[material]
         te, tm = (np.where(reflects, r * share, t) for r, t in through)
         across = np.cross(before, normal)

@@ -21,11 +21,10 @@ from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers import antenna_csi, csi
-from wrf_mi.tracing.paths.traced_field import TracedPaths
+from wrf_mi.receivers.device_paths import Ports, TracedPaths, path_sum
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 from .stress_fields import (
     HARD,

@@ -21,7 +21,7 @@ from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import Plane
 from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
-from wrf_mi.tracing.paths.material_parameters import MaterialGrouping, slabs_of_faces
+from wrf_mi.tracing.paths.scene_parameters import MaterialGrouping, slabs_of_faces
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 from . import register_all
@@ -38,7 +38,7 @@ class SceneWalls:
     Args:
         scene: scene from `wrf_mi.tracing.open_scene`.
         materials: whether each named material or each surface has a permittivity and a conductivity, see
-            `wrf_mi.tracing.paths.material_parameters`.
+            `wrf_mi.tracing.paths.scene_parameters`.
 
     Attributes:
         names: names of the materials, or ``object/plane`` of the surfaces, in the order of the walls.
@@ -71,7 +71,7 @@ class SceneWalls:
         from sionna.rt import RadioMaterial
 
         slabs = self._slabs
-        constants = slabs.permittivity[k], slabs.conductivity[k], slabs.thickness_m[k]
+        constants = slabs.permittivity[k], slabs.conductivity[k], slabs.thickness[k]
         names = "relative_permittivity", "conductivity", "thickness"
         return RadioMaterial(f"slab-{k}", **dict(zip(names, map(float, constants), strict=True)))
 
@@ -79,7 +79,7 @@ class SceneWalls:
         """Values for ``mi.traverse`` of trained materials, differentiable; others stay as stated.
 
         Args:
-            params: Dr.Jit tensors by the names of `wrf_mi.tracing.paths.material_parameters.SlabMaterials.parameters`.
+            params: Dr.Jit tensors by the names of `wrf_mi.tracing.paths.scene_parameters.SlabMaterials.parameters`.
         """
         tables = self._slabs.tables(params, self._stated)[:2]  # thicknesses are constants of the meshes
         return {

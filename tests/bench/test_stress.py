@@ -20,7 +20,7 @@ from wrf_mi_bench.stress_rows import held, worst_of
 from wrf_mi_bench.stress_traced import phases
 
 from wrf_mi.cli.main import main as cli
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT, PlaneTables
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, PlaneTables
 
 
 @pytest.mark.parametrize(

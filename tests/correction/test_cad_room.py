@@ -13,11 +13,11 @@ import pytest
 from cad_room import CARRIER_HZ
 
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, write_page
-from wrf_mi.correction.fit import LEAST_PATHS
 from wrf_mi.correction.misfit import Misfit
+from wrf_mi.correction.state import LEAST_PATHS
 from wrf_mi.datasets import make_splits, read_spectrum_folder, write_spectrum_folder
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT
 from wrf_mi.tracing.paths.solve import Prepared
 
 SECONDS, MEBIBYTES = 60, 2048
@@ -64,7 +64,7 @@ def test_unmet_facets_stay_one_object_of_the_written_scene(corrected: Correction
     assert facts["surfaces"] > 90_000
     assert len(facts["materials"]) == len(corrected.misfit.slabs)
     written = open_scene(tmp_path / "scene", CARRIER_HZ)
-    absent = list(corrected.fit.absent(corrected.state))
+    absent = list(corrected.state.absent())
     present = ~np.isin(corrected.misfit.tables.slab_of_face, absent)
     assert sum(thing.mi_mesh.face_count() for thing in written.objects.values()) == present.sum()
     assert (tmp_path / "scene" / "correction.json").stat().st_size < 2e6

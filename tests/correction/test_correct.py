@@ -34,7 +34,7 @@ from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
@@ -181,7 +181,7 @@ def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path: Path, m
     assert mean[found.kept] > mean[""] + 3
 
     again = correct_scene(tmp_path / "corrected", record, split, replace(options, steps=0))
-    supposed = {name.partition("/")[0] for name in again.fit.supposed}
+    supposed = {name.partition("/")[0] for name in again.state.posterior.supposed}
     assert not supposed & {surface.name for surface in tops}
     kept = {one["surface"] for one in write_page(again, tmp_path / "again")["materials"] if not one["absent"]}
     assert level[0] in kept
@@ -203,7 +203,7 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(
     faces = {name: kind for name, kind in found.state.materials.items() if name.startswith(("other", "hidden"))}
     assert len(faces) == 5
     assert set(faces.values()) == {material}
-    assert not found.fit.absent(found.state)
+    assert not found.state.absent()
     assert np.nanmean(found.scores[found.kept]) > 19
 
 
@@ -229,7 +229,7 @@ def test_standard_deviations_cover_the_errors(corrected: Any) -> None:
     part = found.misfit.parts[SHIFT]
     error = np.abs(found.vector[part] - shift)
     assert (error < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < found.fit.prior_deviation[part] / 2).all()
+    assert (found.deviation[part] < found.state.posterior.prior_deviation[part] / 2).all()
 
 
 def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected: Any) -> None:
@@ -348,7 +348,7 @@ def test_derivatives_are_those_of_finite_differences(task: str, tmp_path: Path) 
         [part.start + size.get(n, 1) * place_of.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
     )
     slopes = misfit.jacobian(misfit.start, columns)
-    assert [tangent.n_recordings for tangent in misfit._tangents] == [1] * len(misfit.sides)
+    assert [port.tangent.n_recordings for port in misfit.ports] == [1] * len(misfit.ports)
     seen = np.isfinite(misfit.observed).all(axis=1)
     assert (slopes[:, ~seen] == 0).all()
     for place, column in enumerate(columns):

@@ -17,7 +17,7 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
-from wrf_mi.tracing.paths.material_parameters import EXPONENT, SURFACE, name_of
+from wrf_mi.tracing.paths.scene_parameters import EXPONENT, SURFACE, name_of
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 

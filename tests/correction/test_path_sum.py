@@ -15,8 +15,7 @@ from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum
 from wrf_mi.tracing import open_scene
-from wrf_mi.tracing.paths.material_parameters import SURFACE, name_of
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, SURFACE, TILT, name_of
 from wrf_mi.tracing.paths.solve import Prepared
 
 ROUNDING = 1e-5

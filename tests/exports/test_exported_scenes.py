@@ -22,7 +22,7 @@ from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.paths.material_parameters import name_of
+from wrf_mi.tracing.paths.scene_parameters import name_of
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 SINGLE = 1e-6

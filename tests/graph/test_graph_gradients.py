@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
 
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.tracing.options import FACTOR
 from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
 from wrf_mi.tracing.paths.surface_gaussians import SurfaceGaussians

@@ -16,7 +16,7 @@ from small_fits import stop_after
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
-from wrf_mi.graph.combine import PowerReceiver
+from wrf_mi.receivers.receiver_models import PowerReceiver
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions

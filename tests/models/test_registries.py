@@ -30,7 +30,7 @@ PACKAGE = '''
 from dataclasses import dataclass, replace
 
 from wrf_mi.graph.receivers import RECEIVERS
-from wrf_mi.graph.combine import PowerReceiver
+from wrf_mi.receivers.receiver_models import PowerReceiver
 
 CABLE_DB = 17.0
 

@@ -10,7 +10,7 @@ from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.paths.corrected_scene import moved_triangles
-from wrf_mi.tracing.paths.plane_parameters import SHIFT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 SHIFT_M = 0.03

@@ -11,8 +11,7 @@ from correction_rooms import CARRIER_HZ, HEIGHT, LENGTH, WIDTH, true_scene
 from wrf_mi.core import Receiver
 from wrf_mi.tracing import TraceOptions, TraceResult, open_scene, trace_paths
 from wrf_mi.tracing.paths.corrected_scene import moved_search
-from wrf_mi.tracing.paths.material_parameters import slabs_of_faces
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, slabs_of_faces
 from wrf_mi.tracing.paths.solve import Prepared
 
 RECEIVER = Receiver("anchor", np.array([1.0, 1.1, 2.2]), np.array([0, 0, 0, 1.0]))

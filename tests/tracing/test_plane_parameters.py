@@ -14,8 +14,8 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.settings import with_settings
-from wrf_mi.graph.combine import CsiReceiver
 from wrf_mi.graph.settings import TRACED_NAMES, TracedConfig
+from wrf_mi.receivers.receiver_models import CsiReceiver
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.training.config import calibration_config
 from wrf_mi.training.trainer import Trainer
@@ -27,8 +27,7 @@ import mitsuba as mi
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.paths.material_parameters import MaterialGrouping, read_materials
-from wrf_mi.tracing.paths.plane_parameters import SHIFT, TILT, PlaneTables
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, MaterialGrouping, PlaneTables, read_materials
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
 Float64 = dr.float64_array_t(mi.Float)

@@ -71,7 +71,7 @@ def test_fields_are_those_of_a_search_for_each_carrier(faint: float, xml: Path, 
     scene, options = open_scene(xml, MIDDLE_HZ, THICKNESS_M), TracedOptions(OPTIONS, pattern_degree=1, faint=faint)
     tx, heading, carriers = rows()
     pattern = {"pattern.transmitter": Tensor64(np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]]))}
-    found = traced_fields(scene, tx, receiver(), options, Prepared(scene), heading, carriers)
+    found = traced_fields(tx, receiver(), options, Prepared(scene), heading, carriers)
     assert searches == [7]
     assert [field.frequency_hz for field in found] == list(CARRIERS_HZ)
     for field, hz in zip(found, CARRIERS_HZ, strict=True):
@@ -87,7 +87,7 @@ def test_fields_are_those_of_scenes_at_each_carrier(xml: Path) -> None:
     """Materials follow the laws of ITU-R P.2040 from the carrier of the search."""
     scene, options = open_scene(xml, MIDDLE_HZ, THICKNESS_M), TracedOptions(OPTIONS)
     tx, heading, carriers = rows()
-    for field in traced_fields(scene, tx, receiver(), options, Prepared(scene), heading, carriers):
+    for field in traced_fields(tx, receiver(), options, Prepared(scene), heading, carriers):
         at, there = carriers == field.frequency_hz, open_scene(xml, field.frequency_hz, THICKNESS_M)
         expected = response(TracedField(there, tx[at], receiver(), options, heading[at]), {})
         np.testing.assert_allclose(response(field, {}), expected, rtol=0, atol=SINGLE * np.abs(expected).max())
@@ -98,7 +98,7 @@ def test_moved_receivers_are_searched_as_by_refresh(xml: Path, searches: list[in
     scene, options = open_scene(xml, MIDDLE_HZ, THICKNESS_M), TracedOptions(OPTIONS)
     tx, _, carriers = rows()
     moved = {POSITION: Tensor64([0.0, 0.04, 0.0])}
-    found = traced_fields(scene, tx, receiver(), options, Prepared(scene), None, carriers, moved)
+    found = traced_fields(tx, receiver(), options, Prepared(scene), None, carriers, parameters=moved)
     assert len(searches) == 2
     stated_m = receiver().position_m
     for field, hz in zip(found, CARRIERS_HZ, strict=True):
@@ -112,7 +112,7 @@ def test_moved_receivers_are_searched_as_by_refresh(xml: Path, searches: list[in
 
 def test_rows_without_carriers_have_that_of_the_scene(xml: Path) -> None:
     scene, tx = open_scene(xml, MIDDLE_HZ, THICKNESS_M), transmitters(3)
-    [field] = traced_fields(scene, tx, receiver(), TracedOptions(OPTIONS), Prepared(scene))
+    [field] = traced_fields(tx, receiver(), TracedOptions(OPTIONS), Prepared(scene))
     assert field.frequency_hz == pytest.approx(MIDDLE_HZ)
     np.testing.assert_array_equal(
         response(field, {}), response(TracedField(scene, tx, receiver(), TracedOptions(OPTIONS)), {})
@@ -123,4 +123,4 @@ def test_wrong_positions_are_refused(xml: Path) -> None:
     scene = open_scene(xml, MIDDLE_HZ, THICKNESS_M)
     for wrong in ([[1.0, 2.0]], [[1.0, 2.0, np.nan]]):
         with pytest.raises(ValueError, match="tx_pos_m has shape"):
-            traced_fields(scene, wrong, receiver(), TracedOptions(OPTIONS), Prepared(scene))
+            traced_fields(wrong, receiver(), TracedOptions(OPTIONS), Prepared(scene))

@@ -28,7 +28,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import traced_field as traced_field_module
 from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
-from wrf_mi.tracing.paths.material_parameters import QUANTITIES
+from wrf_mi.tracing.paths.scene_parameters import QUANTITIES
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 

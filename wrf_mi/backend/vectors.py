@@ -15,9 +15,12 @@ from . import init
 init()
 
 import drjit as dr
+import mitsuba as mi
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
+Float64: Any = dr.float64_array_t(mi.Float)
+"""Double precision of the present backend: phases k d of thousands of rad."""
 
 
 @dataclass
@@ -84,3 +87,10 @@ def conjugate_times(a: Sequence[Any], b: Complex) -> Complex:
     if len(a) == 1:
         return a[0] * b[0], a[0] * b[1]
     return a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]
+
+
+def complex_exponential(logarithm: Any, phase: Any) -> Complex:
+    """Complex numbers of a logarithmic amplitude and a phase in rad."""
+    sine, cosine = dr.sincos(phase)
+    amplitude = dr.exp(logarithm)
+    return amplitude * cosine, amplitude * sine

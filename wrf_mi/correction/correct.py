@@ -33,17 +33,19 @@ from ..tracing.paths.corrected_scene import check_materials, moved_search
 from ..tracing.paths.instrument_parameters import gain_name
 from ..tracing.paths.solve import Prepared
 from ..training.selection import hold_out_groups, improves, last_gain
-from .fit import LEAST_PATHS, Fit, State
 from .misfit import Misfit
 from .moves import Moves
 from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
+from .state import LEAST_PATHS, ScenePosterior, State
 
 LEVEL = 0.9
 """Level of the intervals for which errors of rows that a scene knows are enlarged."""
-NONE = np.zeros((0, 2), np.int64)
-"""No rows are left to receivers that are held out (`wrf_mi.core.Split`)."""
+NO_ROWS = np.zeros((0, 2), np.int64)
+"""Empty array of rows retained by receivers that are held out (`wrf_mi.core.Split`)."""
 CONFIDENCE = 0.95
 """One-sided confidence in the gain of a stage: fits with more freedom also fit what no surface explains."""
+LEAST_RECEIVERS = 4
+"""Fewest trained receivers of which half decide what is kept, where a split holds receivers out."""
 
 
 @dataclass
@@ -51,8 +53,7 @@ class Correction:
     """A corrected scene.
 
     Attributes:
-        fit: fit to all training rows, with parameters of the surfaces that their paths meet.
-        state: its parameters and choices; its stage is what was changed, "" for nothing.
+        state: parameters and choices over all training rows; its stage is what was changed, "" for nothing.
         deviation: standard deviations of the parameters [p], 0 of those that were not changed.
         scores: scores of the rows held out while choosing, by stage.
         kinds: kinds of the scene's objects.
@@ -61,7 +62,6 @@ class Correction:
         facts: sizes for the page.
     """
 
-    fit: Fit
     state: State
     deviation: FloatArray
     scores: Mapping[str, FloatArray]
@@ -73,7 +73,7 @@ class Correction:
     @property
     def misfit(self) -> Misfit:
         """Residuals over all training rows."""
-        return self.fit.misfit
+        return self.state.posterior.misfit
 
     @property
     def kept(self) -> str:
@@ -115,86 +115,132 @@ def correct_scene(
         InputError: data or a scene that cannot be used, or no path to any receiver.
     """
     begun = time.perf_counter()
+    record, split, options = _checked(record, split, options)
+    traced = _TracedScene(scene, record, split, options, material, on_stage)
+    held_out = _held_out(record, split)
+    # Stages are fitted to some of the rows, and judged by the others.
+    trial = traced.posterior(held_out.known, held_out.known_rows)
+    _check_paths(trial, f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
+    judged = _judged_stages(trial, traced, held_out)
+    units = ((stage, held_out.units(result.score)) for stage, result in judged.items())
+    best_stage = last_gain(units, held_out.higher_is_better, confidence=CONFIDENCE)
+    # What is kept is fitted to all rows, along the paths of the scene that the trial found.
+    best = judged[best_stage].state if best_stage else None
+    final = traced.posterior(record, split.all_train, best)
+    state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
+    if best:
+        state = best.at(final).solved()
+        deviation[state.free], left_out = state.uncertainty()
+        unseen = judged[best_stage].unseen
+        before, after = held_out.vector_of(best, unseen), held_out.with_mean_gain(state.vector, final.misfit)
+        data = CorrectionData(record.name, split.all_train, _error_ratio(unseen, before, final.misfit, after, left_out))
+    facts = {
+        "rows": len(split.all_train),
+        "held_out": len(held_out.rows),
+        "held_out_receivers": list(held_out.out),
+        "paths": len(final.misfit.paths.row),
+    }
+    scores = {stage: result.score for stage, result in judged.items()}
+    return Correction(state, deviation, scores, _kinds(scene), data, time.perf_counter() - begun, facts)
+
+
+def _checked(
+    record: Record, split: Split, options: CorrectionOptions | None
+) -> tuple[Record, Split, CorrectionOptions]:
+    """The rows and receivers that may be used, and options that suit the task; an `InputError` where there are none."""
     record = record.seen(split)
     numbers, left_out = fitted_receivers(record, [split])
     warn_of_left_out(record, left_out)
     record, split = record.at_receivers(numbers), split.at_receivers(numbers)
-    task, name = task_of(record), record.name
+    task = task_of(record)
     if not task.receiver_with_scene:
-        raise InputError(f"{name}: no receiver model reports {task.name} from paths")
+        raise InputError(f"{record.name}: no receiver model reports {task.name} from paths")
     check_observations(record, split, complete=task.image)
     options = options or default_options(record)
     if task.in_decibel and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
     # An image of each receiver and row has some hundred values: as many images as one receiver's rows tell as much.
-    split = _at_most(split, max(1, options.rows // (len(record.receivers) if task.image else 1)))
-    carrier_hz = scene_carrier(record, split.all_train)
-    completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
-    with completed as (place, boxes):
-        opened, copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
-    supposed = frozenset(face.name for face in boxes.hidden)
-    if not supposed:
-        options = replace(options, parts=tuple(part for part in options.parts if part != HIDDEN))
-    check_materials(opened)
-    prepared = Prepared(opened)
-    prepared.check(record.tx_pos_m, record.receivers)
-    parts = _parts(record, split)
-    named = [name.rpartition("/")[::2] for name in prepared.tables("surface").slabs.names]
-    slabs = np.array([slab for slab, (thing, _) in enumerate(named) if thing in supposed], np.int64)
-    hidden = np.array([int(named[slab][1]) for slab in slabs], np.int64), slabs
+    most = max(1, options.rows // (len(record.receivers) if task.image else 1))
+    # Seeds of other purposes differ by their second number, so that subsets are independent.
+    rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:most]
+    split = replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
+    return record, split, options
 
-    def fit_of(record: Record, rows: IntArray, state: State | None = None, by: Fit | None = None) -> Fit:
-        """Fit to paths of the stated scene, or to those of a scene whose planes have moved as a state has them."""
-        on_stage("tracing", 0.0)
-        searched = None
-        if state and by and _moves(state.stage):
-            parameters = {name: values.astype(np.float32) for name, values in by.of_scene(state).items()}
-            searched = moved_search(copy, prepared.surfaces, parameters, by.absent(state))
-        # What a fit knows of surfaces stays known where no path meets them any more, such as absent ones.
-        further = (by.misfit.planes, by.misfit.slabs) if by else hidden
-        misfit = Misfit(record, rows, prepared, options, searched, further)
-        return Fit(misfit, options, on_stage, supposed, boxes.members)
 
-    trial = fit_of(parts.known, parts.known_rows)
-    if not any(side.exists.any() for side in trial.misfit.sides):
-        raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
-    if not len(trial.free("+".join(options.parts))):
+def _check_paths(posterior: ScenePosterior, no_paths: str) -> None:
+    """Refuse a scene of which the rows tell nothing: without a path to a receiver, or to any surface."""
+    if not any(side.exists.any() for side in posterior.misfit.sides):
+        raise InputError(no_paths)
+    if not len(posterior.free("+".join(posterior.options.parts))):
+        name = posterior.misfit.record.name
         raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
-    chosen = {stage: (Moves(trial, stage).best(), trial) for stage in _stages(options)}
-    stated = fit_of(parts.held, parts.held_rows).misfit
-    unseen = dict.fromkeys(chosen, stated)
-    scores = {"": stated.scores(parts.with_mean_gain(stated.vector_of(trial.misfit.of_scene(trial.stated)), stated))}
-    judged = {"": parts.units(scores[""])}
-    for stage, (state, by) in chosen.items():
-        scores[stage] = stated.scores(_vector_at(parts, stated, state, by))
-        judged[stage] = parts.units(scores[stage])
+
+
+class _TracedScene:
+    """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it."""
+
+    def __init__(
+        self,
+        scene: str | Path,
+        record: Record,
+        split: Split,
+        options: CorrectionOptions,
+        material: str | None,
+        on_stage: OnStage,
+    ) -> None:
+        carrier_hz, self._on_stage = scene_carrier(record, split.all_train), on_stage
+        completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
+        with completed as (place, boxes):
+            opened, self._copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
+        self._boxes, self._hidden = boxes, frozenset(face.name for face in boxes.hidden)
+        parts = tuple(part for part in options.parts if part != HIDDEN or self._hidden)
+        self.options = replace(options, parts=parts)
+        check_materials(opened)
+        self._prepared = Prepared(opened)
+        self._prepared.check(record.tx_pos_m, record.receivers)
+        # Surfaces of hidden faces have parameters before any path is known to meet them.
+        named = [name.rpartition("/")[::2] for name in self._prepared.tables("surface").slabs.names]
+        slabs = np.array([slab for slab, (thing, _) in enumerate(named) if thing in self._hidden], np.int64)
+        planes = np.array([int(named[slab][1]) for slab in slabs], np.int64)
+        self._hidden_surfaces = planes, slabs
+
+    def posterior(self, record: Record, rows: IntArray, state: State | None = None) -> ScenePosterior:
+        """Posterior of rows over the paths of the stated scene, or of one whose planes a state has moved."""
+        self._on_stage("tracing", 0.0)
+        searched, surfaces = None, self._hidden_surfaces
+        if state:
+            # What is known of surfaces stays known where no path meets them any more, such as absent ones.
+            surfaces = state.posterior.misfit.planes, state.posterior.misfit.slabs
+            if _moves(state.stage):
+                parameters = {name: values.astype(np.float32) for name, values in state.scene_parameters().items()}
+                searched = moved_search(self._copy, self._prepared.surfaces, parameters, state.absent())
+        misfit = Misfit(record, rows, self._prepared, self.options, searched, surfaces)
+        return ScenePosterior(misfit, self.options, self._on_stage, self._hidden, self._boxes.members)
+
+
+class _Judged(NamedTuple):
+    """A state of a stage, the misfit of rows held out of it, and their scores."""
+
+    state: State
+    unseen: Misfit
+    score: FloatArray
+
+
+def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
+    """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
+    states = {stage: Moves(trial, stage).best() for stage in _stages(trial.options)}
+    stated = traced.posterior(held_out.record, held_out.rows).misfit
+    judged = {"": held_out.judged(trial.start(""), stated)}
+    for stage, state in states.items():
+        judged[stage] = held_out.judged(state, stated)
+        units = {name: held_out.units(result.score) for name, result in judged.items()}
         # Other paths make good planes better. They do not mend those that fit training rows alone, and finding them
         # takes as long as all that was done before.
-        if _moves(stage) and _last_is_best(judged, task.higher_is_better):
-            again = fit_of(parts.known, parts.known_rows, state, by)
-            state, by = chosen[stage] = Moves(again, stage).continued(state, by), again
-            unseen[stage] = fit_of(parts.held, parts.held_rows, state, by).misfit
-            scores[stage] = unseen[stage].scores(_vector_at(parts, unseen[stage], state, by))
-            judged[stage] = parts.units(scores[stage])
-    kept = last_gain(judged.items(), task.higher_is_better, confidence=CONFIDENCE)
-    best = chosen[kept] if kept else None
-    final = fit_of(record, split.all_train, *(best or ()))
-    state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
-    if best:
-        state = final.solved(final.carried_over(*best))
-        deviation[final.free(kept)], others = final.uncertainty(state)
-        before = _vector_at(parts, unseen[kept], *best)
-        after = parts.with_mean_gain(state.vector, final.misfit)
-        ratio = _error_ratio(unseen[kept], before, final.misfit, after, others)
-        data = CorrectionData(name, split.all_train, ratio)
-    facts = {
-        "rows": len(split.all_train),
-        "held_out": len(parts.held_rows),
-        "held_out_receivers": list(parts.out),
-        "paths": len(final.misfit.paths.row),
-    }
-    seconds = time.perf_counter() - begun
-    return Correction(final, state, deviation, scores, _kinds(scene), data, seconds, facts)
+        if _moves(stage) and _last_is_best(units, held_out.higher_is_better):
+            along_moved = traced.posterior(held_out.known, held_out.known_rows, state)
+            state = Moves(along_moved, stage).continued(state)
+            judged[stage] = held_out.judged(state, traced.posterior(held_out.record, held_out.rows, state).misfit)
+    return judged
 
 
 def _stages(options: CorrectionOptions) -> list[str]:
@@ -205,84 +251,87 @@ def _stages(options: CorrectionOptions) -> list[str]:
     return stages
 
 
-def _vector_at(parts: _Parts, misfit: Misfit, state: State, by: Fit) -> FloatArray:
-    """Vector of a misfit of other rows from a state of a fit, with the mean gain at receivers held out."""
-    return parts.with_mean_gain(misfit.vector_of(by.of_scene(state)), misfit)
-
-
-def _error_ratio(unseen: Misfit, found: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:
-    """Error of reports that a correction does not know over that of the same reports once it does, 1 or more.
-
-    The larger of two ratios of 90 % quantiles: of the rows that were held out of every choice, which are few, and of
-    all rows by least squares without each of them, after choices that knew them all.
-    """
-    count = len(final.record.receivers)
-    fitted = np.abs(final.residual(vector))
-    rows = fitted.reshape(count, len(final.rows), -1)[:, np.isin(final.rows, unseen.rows)]
-    errors = (np.abs(unseen.residual(found)).reshape(rows.shape), rows), (np.abs(left_out), fitted)
-    ratios = [1.0]
-    for before, after in errors:
-        seen = np.isfinite(before) & np.isfinite(after)
-        larger, smaller = (float(np.quantile(values[seen], LEVEL)) for values in (before, after))
-        ratios.append(larger / max(smaller, float(np.finfo(np.float32).tiny)))
-    return max(ratios)
-
-
 def _moves(stage: str) -> bool:
     """Whether a stage moves planes, so that other paths may exist."""
     return not {PLANES, FRAME}.isdisjoint(stage.split("+"))
 
 
-class _Parts(NamedTuple):
-    """Observations that a correction is fitted to, ``known``, and ``held`` ones that decide what is kept."""
+def _error_ratio(unseen: Misfit, before: FloatArray, final: Misfit, vector: FloatArray, left_out: FloatArray) -> float:
+    """Error of reports that a correction does not know over that of the same reports once it does, 1 or more."""
+    # The larger of two ratios of quantiles: of the rows that were held out of every choice, which are few, and of all
+    # rows by least squares without each of them, after choices that knew them all.
+    count = len(final.record.receivers)
+    fitted = np.abs(final.residual(vector))
+    rows = fitted.reshape(count, len(final.rows), -1)[:, np.isin(final.rows, unseen.rows)]
+    errors = (np.abs(unseen.residual(before)).reshape(rows.shape), rows), (np.abs(left_out), fitted)
+    ratios = [1.0]
+    for without, with_rows in errors:
+        observed = np.isfinite(without) & np.isfinite(with_rows)
+        larger, smaller = (float(np.quantile(values[observed], LEVEL)) for values in (without, with_rows))
+        ratios.append(larger / max(smaller, float(np.finfo(np.float32).tiny)))
+    return max(ratios)
+
+
+class _HeldOut(NamedTuple):
+    """Observations that a correction is fitted to, ``known``, and those held out, which decide what is kept."""
 
     known: Record
     known_rows: IntArray
-    held: Record
-    held_rows: IntArray
-    out: tuple[str, ...] = ()  # names of the receivers of ``held``; none where rows are held out instead
+    record: Record
+    rows: IntArray
+    out: tuple[str, ...] = ()  # names of the receivers of ``record``; none where rows are held out instead
     fitted: tuple[str, ...] = ()  # names of the receivers of ``known``
+
+    @property
+    def higher_is_better(self) -> bool:
+        """Whether higher scores are better."""
+        return task_of(self.record).higher_is_better
+
+    def judged(self, state: State, unseen: Misfit) -> _Judged:
+        """A state with the scores of the rows held out."""
+        return _Judged(state, unseen, unseen.scores(self.vector_of(state, unseen)))
 
     def units(self, score: FloatArray) -> FloatArray:
         """Independent scores: those of rows, or the mean of each receiver that is held out."""
         if not self.out:
             return score
-        by_receiver = score.reshape(len(self.held.receivers), -1)
+        by_receiver = score.reshape(len(self.record.receivers), -1)
         return np.array([np.nanmean(row) for row in by_receiver if np.isfinite(row).any()])
+
+    def vector_of(self, state: State, misfit: Misfit) -> FloatArray:
+        """Vector of a misfit of other rows, with the mean gain at receivers held out."""
+        return self.with_mean_gain(misfit.vector_of(state.scene_parameters()), misfit)
 
     def with_mean_gain(self, vector: FloatArray, misfit: Misfit) -> FloatArray:
         """A vector with the mean gain of the receivers that were fitted at those that were not."""
         gains = {receiver.name: gain_name(receiver) for receiver in self.known.receivers}
         if not self.out or not set(gains.values()) <= set(misfit.parts):
             return vector
-        found = vector.copy()
+        result = vector.copy()
         mean = np.mean([vector[misfit.parts[gains[receiver]]] for receiver in self.fitted], axis=0)
         for receiver in self.out:
-            found[misfit.parts[gains[receiver]]] = mean
-        return found
+            result[misfit.parts[gains[receiver]]] = mean
+        return result
 
 
-def _parts(record: Record, split: Split) -> _Parts:
-    """Training rows in groups, or where receivers are held out half of the others, as the scene has to serve those."""
+def _held_out(record: Record, split: Split) -> _HeldOut:
+    """Training rows in groups in space, or where a split holds receivers out half of the others."""
+    # Rows that judge a correction have to be like what the scene shall serve: new places, or new receivers.
     trained = np.flatnonzero(np.isfinite(record.observation).reshape(len(record.receivers), -1).any(axis=1))
-    if split.held_receivers and len(trained) > 3:
+    if split.held_receivers and len(trained) >= LEAST_RECEIVERS:
         out = np.sort(np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2])
         others = np.setdiff1d(trained, out)
         names = (tuple(record.receivers[number].name for number in part) for part in (out, others))
-        known, held = (record.seen(replace(split, held_receivers=tuple(hide), left=NONE)) for hide in (out, others))
-        return _Parts(known, split.all_train, held, split.all_train, *names)
+        known, held_out = (
+            record.seen(replace(split, held_receivers=tuple(hidden), left=NO_ROWS)) for hidden in (out, others)
+        )
+        return _HeldOut(known, split.all_train, held_out, split.all_train, *names)
     groups = hold_out_groups(split, record.tx_pos_m)
     if groups is split:
         raise InputError(f"{record.name}: {len(split.train)} training rows are too few to hold some out; give more")
     # The regions alone judge: validation rows lie among those that the correction is fitted to, and add to few.
     rows = np.setdiff1d(groups.validation, split.validation)
-    return _Parts(record, np.setdiff1d(split.all_train, rows), record, rows)
-
-
-def _at_most(split: Split, count: int) -> Split:
-    """The split with a random subset of its training and validation rows."""
-    rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:count]
-    return replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
+    return _HeldOut(record, np.setdiff1d(split.all_train, rows), record, rows)
 
 
 def _last_is_best(scores: Mapping[str, FloatArray], higher_is_better: bool) -> bool:

@@ -54,9 +54,10 @@ class Noise:
     @classmethod
     def of(cls, residual: FloatArray) -> Noise:
         """Noise of residuals [rows, values]; a row without observation is NaN."""
-        seen = residual[np.isfinite(residual).all(axis=1)]
-        count = _independent(seen)
-        variance = float(np.median(np.square(seen).mean(axis=1))) / MEDIAN_OF_MEAN if len(seen) else 1.0
+        observed = residual[np.isfinite(residual).all(axis=1)]
+        count = _independent(observed)
+        # A median, which rows that nothing explains do not move.
+        variance = float(np.median(np.square(observed).mean(axis=1))) / MEDIAN_OF_MEAN if len(observed) else 1.0
         return cls(max(variance, LEAST_VARIANCE), min(max(count, 1.0), float(residual.shape[1])))
 
     def cost(self, residual: FloatArray) -> float:
@@ -83,11 +84,9 @@ class Noise:
 
 
 def _independent(residual: FloatArray) -> float:
-    """Participation ratio of the eigenvalues of the covariance of rows [n, values] of equal length.
-
-    The trace of the squared covariance is estimated from pairs of different rows; with the rows themselves it is too
-    large by a share of values / n, and a few rows of large residuals outweigh all others.
-    """
+    """Participation ratio of the eigenvalues of the covariance of rows [n, values] of equal length."""
+    # tr(R^2) is estimated from pairs of different rows: with the rows themselves it is too large by a share of values /
+    # n. Rows of unit length, as a few of large residuals would outweigh all others.
     size = np.linalg.norm(residual, axis=1, keepdims=True)
     unit = (residual / np.where(size > 0, size, 1))[size[:, 0] > 0]
     # The smaller of the two products of the matrix with its transpose: their squares have equal traces.
@@ -136,16 +135,18 @@ def minimised(
     """
     vector, damping = np.array(start, float), FIRST_DAMPING
     present = residual(vector)
+    # Iterated weights: the noise, and by it the weight of each row, is that of the residuals before a step.
     for step in range(steps):
         on_step(step)
         noise = Noise.of(present)
         before = noise.cost(present) + prior.cost(vector[free])
         information, slope = _normal(jacobian(vector), present, noise)
-        whole = information + prior.precision
+        matrix = information + prior.precision
+        # Gauss-Newton equations of likelihood and prior, damped by their diagonal (Marquardt).
         downhill = -slope - prior.precision @ (vector[free] - prior.mean)
         for _ in range(TRIALS):
             trial = vector.copy()
-            trial[free] += np.linalg.solve(whole + damping * np.diag(np.diag(whole)), downhill)
+            trial[free] += np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), downhill)
             tried = residual(trial)
             after = noise.cost(tried) + prior.cost(trial[free])
             if after < before:
@@ -187,16 +188,18 @@ def left_out_residuals(
         covariance: covariance [p, p] of the solution.
         noise: noise of the solution.
     """
-    found = np.full(residual.shape, np.nan)
+    left_out = np.full(residual.shape, np.nan)
     for row in np.flatnonzero(np.isfinite(residual).all(axis=1)):
+        # Leverage of all values of a row: w J^T C J.
         slope = derivative[:, row].astype(float)
         leverage = noise.weights(residual[row : row + 1])[0] * slope.T @ covariance @ slope
-        found[row] = np.linalg.solve(np.eye(len(leverage)) - leverage, residual[row])
-    return found
+        left_out[row] = np.linalg.solve(np.eye(len(leverage)) - leverage, residual[row])
+    return left_out
 
 
 def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Fisher information [p, p] and gradient [p]."""
+    # J W J^T and J W r with W split between both factors: one product in the precision of the derivatives.
     root = np.sqrt(noise.weights(residual))[:, None]
     scaled = (derivative * root.astype(derivative.dtype)).reshape(len(derivative), -1)
     values = (np.where(root > 0, residual, 0) * root).ravel()

@@ -23,18 +23,15 @@ from ..core import Record
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
 from ..core.types import IntArray
-from ..graph.combine import ArrayReceiver
-from ..graph.receivers import RECEIVERS, Form, ReceiverModel
+from ..graph.receivers import RECEIVERS, Form
 from ..receivers import minmax_scale
 from ..tasks import task_of
 from ..tasks.conditions import placed_receivers
 from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
-from ..tracing.paths.material_parameters import PREFIX, QUANTITIES
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.traced_field import TracedField, traced_fields
-from .frame import rigid_motions, scene_entries
 from .options import CorrectionOptions
 
 LATTICE = (12, 40)
@@ -44,22 +41,59 @@ FLOOR = 0.5
 
 
 class PathTable(NamedTuple):
-    """The n paths of a misfit.
+    """The n paths of a misfit, and what they meet [n, depth]."""
 
-    Attributes:
-        entry: place of each path among the entries of its side's `wrf_mi.tracing.paths.traced_field.TracedPaths` [n].
-        side: number of its side [n], ascending.
-        row: its row of `Misfit.residual` [n], ascending in a side.
-        plane, slab: what it meets, by their places in `Misfit.planes` and `Misfit.slabs` [n, depth], -1 for none.
-        reflects: whether it is reflected there [n, depth].
+    entry: IntArray  # place among the entries of the side's `wrf_mi.receivers.device_paths.TracedPaths` [n]
+    side: IntArray  # number of the side [n], ascending
+    row: IntArray  # row of `Misfit.residual` [n], ascending in a side
+    plane: IntArray  # place in `Misfit.planes`, -1 for none
+    slab: IntArray  # place in `Misfit.slabs`, -1 for none
+    reflects: NDArray[np.bool_]  # whether the path is reflected there
+
+
+class _Port:
+    """A receiver at a carrier: its traced side, receiver models of what is compared and of complete images (which are
+    scored), its rows' places in ``Misfit.observed``, and recorded functions of parameters by name.
     """
 
-    entry: IntArray
-    side: IntArray
-    row: IntArray
-    plane: IntArray
-    slab: IntArray
-    reflects: NDArray[np.bool_]
+    def __init__(self, side: TracedField, model: Any, complete: Any, places: IntArray) -> None:
+        self.side, self.model, self.complete, self.places = side, model, complete, places
+
+    def record(self, start: Mapping[str, Any]) -> None:
+        """Make the functions; arrays made from NumPy's memory at first use must exist before they are recorded."""
+        side, model = self.side, self.model
+
+        def report(params: Mapping[str, Any]) -> Any:  # flat reports of all rows
+            with dr.suspend_grad():
+                reports = model(side(params), None)
+                dr.eval(reports)
+            return reports
+
+        # Derivatives of reports in one direction: forward mode, as rows outnumber the columns of a Jacobian.
+        def tangent(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
+            # Gradients of the caller's arrays stay off: all columns share them, and one recording.
+            values = {name: dr.copy(value) for name, value in params.items()}
+            for name, value in values.items():
+                dr.enable_grad(value)
+                dr.set_grad(value, direction[name])
+            reports = model(side(values), None)
+            dr.forward_to(reports)
+            slope = dr.grad(reports)
+            dr.eval(slope)
+            return slope
+
+        def gain(params: Mapping[str, Any], entries: Any) -> Any:  # of paths by their places in the side
+            with dr.suspend_grad():
+                gains = side(params, entries=entries).gain
+                dr.eval(gains)
+            return gains
+
+        model.arrays(mi.Float)
+        report(start)
+        self.report, self.tangent = (
+            Recorded(function, lambda: [side.arrays, model.arrays(mi.Float)]) for function in (report, tangent)
+        )
+        self.gain = Recorded(gain, lambda: side.arrays)
 
 
 class Misfit:
@@ -79,9 +113,7 @@ class Misfit:
         receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
             parameters are entries of the vector.
         tables: materials and planes of the scene.
-        sides: traced side of each of these at each carrier, receiver by receiver.
-        models: receiver models of the sides.
-        places: entries of ``observed`` of each side.
+        ports: each of these receivers at each carrier, receiver by receiver.
         planes: numbers of the scene's planes whose shifts and tilts are entries of the vector, in their order.
         slabs: numbers of the scene's surfaces whose materials are.
         start: stated values of the vector [p].
@@ -99,98 +131,108 @@ class Misfit:
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
-        self.record, self.rows, task = record, rows, task_of(record)
+        self.record, self.rows, self._traced = record, rows, options.traced
+        self.tables = prepared.tables(self._traced.materials)
         placed = placed_receivers(record, by_uplink=False)
+        # Receivers without any observation are not traced: some hundred others may have heard these rows.
         known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
-        seen = np.flatnonzero(known) if known.any() else np.arange(len(placed))
-        self.receivers = [placed[number] for number in seen]
-        self._image = task.image
-        traced = options.traced
-        self.tables = prepared.tables(traced.materials)
+        numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
+        self.receivers = [placed[number] for number in numbers]
         shape = record.observation.shape[2:]
-        size, whole_size = (1, 1), (1, 1)
-        if task.image:
-            whole_size = int(shape[0]), int(shape[1])
-            self._strides = [_stride(length, most) for length, most in zip(shape, LATTICE, strict=True)]
-            size = whole_size[0] // self._strides[0], whole_size[1] // self._strides[1]
-        outputs = tuple(map(int, shape)) if task.is_complex else ()
-        floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
-        form = Form(task.receiver_with_scene, size, record.frequencies_hz, outputs, floor_db=floor_db)
-        sides, self.places = list[TracedField](), list[IntArray]()
-        self.models, self._whole = list[ReceiverModel](), list[ReceiverModel]()
-        heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
-        for number, receiver in zip(seen, self.receivers, strict=True):
-            given = record.tx_pos_m[rows], receiver, traced, prepared, heading, carriers
-            sides += traced_fields(prepared.scene, *given, searched=searched)
-            for carrier_hz, which in rows_by_carrier(carriers, len(rows)):
-                here = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
-                self.models.append(RECEIVERS[form.receiver].make(here, receiver))
-                self._whole.append(RECEIVERS[form.receiver].make(replace(here, size=whole_size), receiver))
-                self.places.append(number * len(rows) + which)
-        # The same order of entries whichever receivers are seen.
-        self._instruments = dict[str, NDArray[np.float32]]()
-        for receiver in placed:
-            self._instruments |= instrument_parameters(receiver, traced.pattern_degree)
+        self._strides = [_stride(n, most) for n, most in zip(shape, LATTICE, strict=True)] if self._image else []
+        self.ports = self._traced_ports(numbers, prepared, searched)
         self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
-            self.planes, self.slabs = _met_surfaces(sides, len(self.planes), len(self.slabs), *surfaces)
+            self.planes, self.slabs = _met_surfaces(self.sides, len(self.planes), len(self.slabs), *surfaces)
             tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
-            sides = [side.select(tables, self.planes, self.slabs) for side in sides]
-        self.sides = sides
-        every = {name: value for name, value in sides[0].parameters().items() if name.startswith((PREFIX, SHIFT, TILT))}
-        values = {name: value for name, value in (every | self._instruments).items() if options.changes(name)}
+            for port in self.ports:
+                port.side = port.side.select(tables, self.planes, self.slabs)
+        # The vector: materials, planes and devices in an order that is the same whichever receivers have rows.
+        self._instruments = dict[str, NDArray[np.float32]]()
+        for receiver in placed:
+            self._instruments |= instrument_parameters(receiver, self._traced.pattern_degree)
+        of_scene = self.sides[0].parameters().items()
+        values = {name: value for name, value in of_scene if name.startswith((PREFIX, SHIFT, TILT))} | self._instruments
+        values = {name: value for name, value in values.items() if options.changes(name)}
+        # Positions of parameters in the vector, one after the other.
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
         self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)
         self.observed, self.unit = self._observations()
-        self._reports = [self._recorded(r, tangent=False) for r in range(len(self.sides))]
-        self._tangents = [self._recorded(r, tangent=True) for r in range(len(self.sides))]
-        self._gains = [_recorded_gain(side) for side in self.sides]
+        for port in self.ports:
+            port.record(self._device(self.start))
 
-    @cached_property
-    def motions(self) -> FloatArray:
-        """Derivatives of `plane_entries` by a rigid motion of the scene [3 k, 6] (`rigid_motions`)."""
-        every = rigid_motions(self.sides[0].surfaces)
-        return every[scene_entries(self.planes, len(every) // 3)]
+    @property
+    def _image(self) -> bool:
+        return task_of(self.record).image
+
+    @property
+    def sides(self) -> list[TracedField]:
+        """Traced sides of the ports."""
+        return [port.side for port in self.ports]
+
+    def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: MovedSearch | None) -> list[_Port]:
+        """Ports of the receivers, which have these numbers in the record."""
+        record, rows, task = self.record, self.rows, task_of(self.record)
+        shape = tuple(map(int, record.observation.shape[2:]))
+        complete = (shape[0], shape[1]) if task.image else (1, 1)
+        size = tuple(n // stride for n, stride in zip(complete, self._strides or (1, 1), strict=True))
+        floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
+        outputs, receiver_name = shape if task.is_complex else (), task.receiver_with_scene
+        form = Form(receiver_name, (size[0], size[1]), record.frequencies_hz, outputs, floor_db=floor_db)
+        heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
+        ports, make = list[_Port](), RECEIVERS[form.receiver].make
+        for number, receiver in zip(numbers, self.receivers, strict=True):
+            of_receiver = record.tx_pos_m[rows], receiver, self._traced, prepared, heading, carriers
+            sides = traced_fields(*of_receiver, searched=searched)
+            for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
+                at = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
+                models = make(at, receiver), make(replace(at, size=complete), receiver)
+                ports.append(_Port(side, *models, number * len(rows) + which))
+        return ports
 
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
+        # Of planes and surfaces that have no entry, the stated values.
         stated = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
-        found = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
-        for name in stated.keys() & found.keys():
+        parameters = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
+        for name in stated.keys() & parameters.keys():
             every = stated[name].astype(float)
-            every[self.slabs if name.startswith(PREFIX) else self.planes] = found[name]
-            found[name] = every
-        return found
+            every[self.slabs if name.startswith(PREFIX) else self.planes] = parameters[name]
+            parameters[name] = every
+        return parameters
 
     def vector_of(self, parameters: Mapping[str, FloatArray]) -> FloatArray:
         """The vector [p] of parameters of the whole scene, as of `of_scene` of a misfit of other rows."""
-        every = np.zeros(len(self.start))
+        vector = np.zeros(len(self.start))
         for name, part in self.parts.items():
             numbers = self.slabs if name.startswith(PREFIX) else self.planes
             chosen = parameters[name] if name in self._instruments else parameters[name][numbers]
-            every[part] = chosen.ravel()
-        return every
+            vector[part] = chosen.ravel()
+        return vector
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
         """Observations and their units [n_rx * rows], in which residuals are."""
-        seen = self.record.observation[:, self.rows]
-        count = seen.shape[0] * seen.shape[1]
+        stored = self.record.observation[:, self.rows]
+        count = stored.shape[0] * stored.shape[1]
         if self._image:
-            coarse = minmax_scale(seen[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
+            # A model's coarse image has its extremes on the lattice, not between, so the observed one is scaled there.
+            coarse = minmax_scale(stored[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
             return coarse.reshape(count, -1), np.ones(count)
-        if np.iscomplexobj(seen):
-            pairs = np.ascontiguousarray(seen, np.complex128).view(float).reshape(count, -1)
+        if np.iscomplexobj(stored):
+            # Real and imaginary parts in turn, as receiver models report channels.
+            pairs = np.ascontiguousarray(stored, np.complex128).view(float).reshape(count, -1)
             power = np.square(pairs).sum(axis=1)
+            # The score is relative to a row's own power, but rows in deep fades have the errors of all others.
             unit = np.sqrt(power + FLOOR**2 * np.nanmedian(power))
             return pairs / unit[:, None], unit
-        return seen.astype(float).reshape(count, -1), np.ones(count)
+        return stored.astype(float).reshape(count, -1), np.ones(count)
 
     @property
     def several_carriers(self) -> bool:
         """Whether rows of several carriers tell how conductivities depend on the frequency."""
-        return len({side.frequency_hz for side in self.sides}) > 1
+        return len({port.side.frequency_hz for port in self.ports}) > 1
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
@@ -202,50 +244,41 @@ class Misfit:
     def _device(self, vector: FloatArray) -> dict[str, Any]:
         return {name: to_tensor(value) for name, value in self.named(vector).items()}
 
-    def _recorded(self, number: int, tangent: bool) -> Recorded:
-        side, model = self.sides[number], self.models[number]
-
-        def report(params: Mapping[str, Any]) -> Any:
-            with dr.suspend_grad():
-                found = model(side(params), None)
-                dr.eval(found)
-            return found
-
-        def derivative(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
-            # Gradients of the caller's arrays stay off: all columns share them, and one recording.
-            values = {name: dr.copy(value) for name, value in params.items()}
-            for name, value in values.items():
-                dr.enable_grad(value)
-                dr.set_grad(value, direction[name])
-            found = model(side(values), None)
-            dr.forward_to(found)
-            slope = dr.grad(found)
-            dr.eval(slope)
-            return slope
-
-        # Arrays that are made from NumPy's memory at first use must exist before a recording.
-        model.arrays(mi.Float)
-        report(self._device(self.start))
-        return Recorded(derivative if tangent else report, lambda: [side.arrays, model.arrays(mi.Float)])
-
     def residual(self, vector: FloatArray) -> FloatArray:
         """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
-        params, found = self._device(vector), np.zeros(self.observed.shape)
-        for report, places in zip(self._reports, self.places, strict=True):
-            found[places] = np.asarray(report(params).numpy(), float).reshape(len(places), -1)
-        return found / self.unit[:, None] - self.observed
+        params, reports = self._device(vector), np.zeros(self.observed.shape)
+        for port in self.ports:
+            reports[port.places] = np.asarray(port.report(params).numpy(), float).reshape(len(port.places), -1)
+        return reports / self.unit[:, None] - self.observed
 
     def mean_squares(self, vectors: FloatArray) -> FloatArray:
         """Means of each row's squares of `residual` at vectors [v, p], [v, n_rx * rows]."""
         return np.stack([np.square(self.residual(vector)).mean(axis=1) for vector in vectors])
+
+    def missing_gains(self, vector: FloatArray) -> dict[str, float]:
+        """Logarithm of the amplitude that reports of each receiver lack, by the name of its gain, over its carriers.
+
+        Least squares of a phase start from equal mean magnitudes, else the smallest reports would fit best.
+        """
+        missing = dict[str, list[float]]()
+        if not any(port.side.gain_name in self.parts for port in self.ports):
+            return {}
+        reports = self.residual(vector) + self.observed
+        for port in self.ports:
+            rows = port.places[np.isfinite(self.observed[port.places]).all(axis=1)]
+            if len(rows):
+                pair = (values[rows].reshape(-1, *port.model.shape) for values in (reports, self.observed))
+                missing.setdefault(port.side.gain_name, []).append(port.model.missing_gain(*pair))
+        return {name: float(np.mean(values)) for name, values in missing.items()}
 
     @cached_property
     def paths(self) -> PathTable:
         """Rows, sides and interactions of all paths, side by side."""
         depth = max(len(side.chains.levels) for side in self.sides)
         entries = [np.flatnonzero(side.exists) for side in self.sides]
-        sides = zip(self.sides, self.places, entries, strict=True)
-        row = [places[exists // (len(side.exists) // len(places))] for side, places, exists in sides]
+        ports = zip(self.ports, entries, strict=True)
+        # Entries lie transmitter by transmitter, an equal number of each.
+        row = [port.places[exists // (len(port.side.exists) // len(port.places))] for port, exists in ports]
         met = zip(*(side.chains.met(depth) for side in self.sides), strict=True)
         number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
         return PathTable(np.concatenate(entries), number, np.concatenate(row), *map(np.concatenate, met))
@@ -255,23 +288,23 @@ class Misfit:
         params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
         for number in np.unique(paths.side[which]):
             of_side = paths.side[which] == number
-            real, imaginary = self._gains[number](params, to_uint(paths.entry[which[of_side]]))
+            real, imaginary = self.ports[number].gain(params, to_uint(paths.entry[which[of_side]]))
             result[of_side] = np.asarray(real) + 1j * np.asarray(imaginary)
         return result
 
     def unit_signals(self, vector: FloatArray) -> NDArray[np.complex128]:
         """Signals [paths, elements] of all paths of a vector [p] at an array's elements, for gains of one."""
         params, signals = self._device(vector), list[NDArray[np.complex128]]()
-        for number, (side, model) in enumerate(zip(self.sides, self.models, strict=True)):
-            assert isinstance(model, ArrayReceiver)
+        for number, port in enumerate(self.ports):
             entry = self.paths.entry[self.paths.side == number]
             if not len(entry):
                 continue
             with dr.suspend_grad():
-                traced = side(params, entries=to_uint(entry))
-                one = dr.ones(type(traced.length_m), len(entry))
-                alone = replace(traced, gain=(one, dr.zeros(type(one), len(entry))))
-                real, imaginary = model.elements(alone, type(one))
+                traced = port.side(params, entries=to_uint(entry))
+                unit_gain = dr.ones(type(traced.length_m), len(entry))
+                # Each path as a transmitter's only one, so that the sum at the elements is its wave.
+                alone = replace(traced, gain=(unit_gain, dr.zeros(type(unit_gain), len(entry))))
+                real, imaginary = port.model.elements(alone, type(unit_gain))
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
         return np.concatenate(signals)
 
@@ -280,26 +313,26 @@ class Misfit:
         slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
         for place, column in enumerate(columns):
-            direction = self._device(np.eye(1, len(vector), column)[0])
-            for tangent, places in zip(self._tangents, self.places, strict=True):
-                slopes[place, places] = tangent(params, direction).numpy().reshape(len(places), -1)
+            direction = self._device(np.eye(1, len(vector), column)[0])  # a unit vector, column by column
+            for port in self.ports:
+                slopes[place, port.places] = port.tangent(params, direction).numpy().reshape(len(port.places), -1)
         slopes /= self.unit[:, None].astype(np.float32)
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return slopes
 
     def scores(self, vector: FloatArray) -> FloatArray:
-        """Scores of the task of whole reports, [n_rx * rows]; NaN where nothing was received."""
+        """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""
         task, params = task_of(self.record), self._device(vector)
-        seen = self.record.observation[:, self.rows]
-        seen = seen.reshape(-1, *seen.shape[2:])
-        found = np.full(len(seen), np.nan)
-        for side, model, places in zip(self.sides, self._whole, self.places, strict=True):
+        stored = self.record.observation[:, self.rows]
+        stored = stored.reshape(-1, *stored.shape[2:])
+        scores = np.full(len(stored), np.nan)
+        for port in self.ports:
             with dr.suspend_grad():
-                report = model(side(params), None).numpy()
-            truth, pairs = seen[places], np.asarray(report, float)
+                report = port.complete(port.side(params), None).numpy()
+            truth, pairs = stored[port.places], np.asarray(report, float)
             values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
-            found[places] = task.score(values.reshape(truth.shape), truth)
-        return found
+            scores[port.places] = task.score(values.reshape(truth.shape), truth)
+        return scores
 
     def accept(self, vector: FloatArray) -> None:
         """Nothing, as residuals are exact at all vectors (`wrf_mi.correction.path_sum.PathSum.accept`)."""
@@ -322,10 +355,8 @@ class Misfit:
 def _met_surfaces(
     sides: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending.
-
-    Of furniture of 100,000 facets, the paths of some rows meet hundreds.
-    """
+    """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending."""
+    # Of furniture of 100,000 facets, the paths of some rows meet hundreds: parameters of all would take gigabytes.
     used = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
     for mask, further, column in zip(used, (planes, slabs), (0, 1), strict=True):
         mask[further] = True
@@ -336,19 +367,7 @@ def _met_surfaces(
     return np.flatnonzero(used[0]), np.flatnonzero(used[1])
 
 
-def _recorded_gain(side: TracedField) -> Recorded:
-    """Function of parameters and of places of paths: real and imaginary parts of their gains."""
-
-    def gain(params: Mapping[str, Any], entries: Any) -> Any:
-        with dr.suspend_grad():
-            found = side(params, entries=entries).gain
-            dr.eval(found)
-        return found
-
-    return Recorded(gain, lambda: side.arrays)
-
-
 def _stride(length: int, most: int) -> int:
     """Smallest divisor of a length that leaves at most ``most`` values; 1 if it leaves less than a third of them."""
-    found = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
-    return found if 3 * (length // found) >= most else 1
+    smallest = next(stride for stride in range(1, length + 1) if length % stride == 0 and length // stride <= most)
+    return smallest if 3 * (length // smallest) >= most else 1

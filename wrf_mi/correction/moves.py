@@ -1,35 +1,47 @@
-"""Moves of a fit between local minima: each is kept where it makes a state more probable by more than `GAIN`.
+"""Moves of a state between local minima of its posterior.
 
-Rounds take the best alternative of one surface after another, and then least squares. Afterwards, all faces of a box
-take one material, and what is least certain is chosen anew: choices that were made while others were still wrong may
-hold these where they are, as either fits only beside the other.
+Least squares reach the solution from within a quarter of a wavelength of each path's length and with roughly the right
+materials. So alternatives are tried: common building materials, absence, and shifts of planes on a lattice. Rounds take
+the best alternative of one surface after another, and then least squares. Afterwards, all faces of a box take one
+material, and what is least certain is chosen anew: choices that were made while others were still wrong may hold these
+where they are, as either fits only beside the other. A move counts where it makes the state more probable (`gains`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..parallel.threads import on_threads
-from ..tracing.paths.plane_parameters import SHIFT
-from .choices import ABSENT, Choice, joint_choices, material_choices, shift_choices
-from .fit import Fit, State
+from ..tracing.paths.scene_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SHIFT, TILT
+from ..tracing.sionna.materials import itu_constants, itu_exponent
 from .least_squares import Noise
 from .misfit import Misfit
 from .options import FRAME, FRAME_SD, MATERIALS, PLANES
 from .path_sum import PathSum, near
+from .state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
 
+COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
+"""Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
+JOINT = 10
+"""Number of planes whose material and shift are chosen together."""
+STEP = 1 / 16
+"""Step of the shifts, wavelengths: paths change by up to an eighth."""
+FARTHEST = 2.0
+"""Largest shift tried, in standard deviations of the prior."""
 GAIN = 0.5
-"""Least increase of the log-likelihood for which a choice changes."""
-SWEEPS = 3
-ROUNDS = 3
-"""Largest number of rounds: planes that are off hide the right material, and conversely."""
+"""Least increase of the log-posterior for which a state changes: that of a parameter off by a standard deviation."""
+SWEEPS, ROUNDS = 3, 3
+"""Most sweeps over choices, and rounds: planes that are off hide the right material, and conversely."""
 ROUND_STEPS = 3
 """Largest number of least-squares steps between choices."""
 REFINED = 8
@@ -45,55 +57,152 @@ ELSEWHERE, MINIMA = 3, 2
 APART = 1 / 8
 """Least distance of minima, wavelengths: paths change by up to a quarter."""
 
-Alternative = tuple[float, str, FloatArray]
-"""Cost, name and vector [p] of an alternative of a choice."""
+
+@dataclass(frozen=True)
+class SurfaceChoice:
+    """Alternatives of one surface or plane.
+
+    Attributes:
+        what: name of the surface or plane.
+        places: its entries of the vector.
+        values: values of these entries by ``material``, ``shift`` or ``material, shift``; NaN: as other planes predict.
+        of_plane: whether each entry is of a plane, not of a material.
+    """
+
+    what: str
+    places: IntArray
+    values: Mapping[str, FloatArray]
+    of_plane: NDArray[np.bool_]
+
+    @property
+    def material(self) -> IntArray:
+        """Entries of a material."""
+        return self.places[~self.of_plane]
+
+    @property
+    def plane(self) -> IntArray:
+        """Entries of a plane."""
+        return self.places[self.of_plane]
+
+    @property
+    def joint(self) -> bool:
+        """Whether material and shift are chosen together."""
+        return bool(self.material.size and self.plane.size)
+
+    @property
+    def shifts(self) -> SurfaceChoice:
+        """The shifts of a joint choice, for any material."""
+        values = {name.partition(", ")[2]: values[self.of_plane] for name, values in self.values.items()}
+        return replace(self, places=self.plane, values=values, of_plane=self.of_plane[self.of_plane])
+
+
+class Alternative(NamedTuple):
+    """An alternative of a choice, and its cost with all other entries as they are."""
+
+    cost: float
+    name: str
+    vector: FloatArray
+
+    @property
+    def material(self) -> str:
+        """Name of the material."""
+        return self.name.partition(",")[0]
+
+
+BY_COST = attrgetter("cost")
+
+
+def material_choices(posterior: ScenePosterior, slabs: IntArray) -> list[SurfaceChoice]:
+    """Choices of the materials of some surfaces, in their order."""
+    hz, misfit = posterior.frequency_hz, posterior.misfit
+    values = dict[str, FloatArray]()
+    for name, (permittivity, conductivity, thickness) in itu_constants(hz).items():
+        if name in COMMON:
+            least = max(permittivity - 1, LEAST_SUSCEPTIBILITY), max(conductivity, LEAST_CONDUCTIVITY)
+            values[name] = np.append(np.log([*least, thickness]), itu_exponent(name, hz))
+    values[ABSENT] = ABSENT_VALUES
+    names, of_plane = misfit.sides[0].slabs.names, np.zeros(len(QUANTITIES), bool)
+    return [SurfaceChoice(names[slab], material_places(misfit, slab), values, of_plane) for slab in slabs]
+
+
+def shift_choices(posterior: ScenePosterior, sd_m: float) -> list[SurfaceChoice]:
+    """Choices of shifts of planes, with the tilts of the frame, within `FARTHEST` standard deviations of the prior."""
+    misfit, step_m = posterior.misfit, STEP * speed_of_light / posterior.frequency_hz
+    most = int(FARTHEST * sd_m / step_m)
+    shifts = step_m * np.arange(-most, most + 1)
+    values = {f"{1e3 * shift:+.0f} mm": np.array([shift, np.nan, np.nan]) for shift in shifts}
+    shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
+    places = [np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in posterior.planes]
+    names = [f"plane {number}" for number in misfit.planes[posterior.planes]]
+    pairs = zip(names, places, strict=True)
+    return [SurfaceChoice(name, place, values, np.ones(3, bool)) for name, place in pairs] if most else []
+
+
+def joint_choices(
+    materials: Sequence[SurfaceChoice], shifts: Sequence[SurfaceChoice], posterior: ScenePosterior
+) -> list[SurfaceChoice]:
+    """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
+    for supposed faces, and all other choices by themselves.
+    """
+    # At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
+    # In reverse order, so that of several surfaces in a plane that with most paths stays.
+    of_plane = {f"plane {material.what.rpartition('/')[2]}": material for material in reversed(materials)}
+    every = [(of_plane[shift.what], shift) for shift in shifts if shift.what in of_plane]
+    pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what in posterior.supposed]
+    joint = list[SurfaceChoice]()
+    for material, shift in pairs:
+        values = {
+            f"{kind}, {place}": np.concatenate([constants, moved])
+            for place, moved in shift.values.items()
+            for kind, constants in material.values.items()
+        }
+        places, mask = ([getattr(c, name) for c in (material, shift)] for name in ("places", "of_plane"))
+        joint.append(SurfaceChoice(material.what, np.concatenate(places), values, np.concatenate(mask)))
+    done = {choice.what for pair in pairs for choice in pair}
+    return [*joint, *(choice for choice in (*shifts, *materials) if choice.what not in done)]
+
+
+def gains(before: float, after: float, bonus: float = 0.0) -> bool:
+    """Whether a move is accepted, of costs before and after it: the one rule for all moves."""
+    return before - after + bonus > GAIN
 
 
 class Moves:
-    """Search of a stage for the most probable choices.
+    """Search for the most probable choices of a stage, whose parts are joined by "+"."""
 
-    Args:
-        fit: least squares and prior.
-        stage: the stage, its parts joined by "+".
-    """
-
-    def __init__(self, fit: Fit, stage: str) -> None:
-        self.fit, self.stage, self.title = fit, stage, f"{stage.replace('+', ', ')}: choices"
-        parts, options, misfit = stage.split("+"), fit.options, fit.misfit
-        shifts, materials = list[Choice](), list[Choice]()
-        if SHIFT in misfit.parts and (PLANES in parts or FRAME in parts):
+    def __init__(self, posterior: ScenePosterior, stage: str) -> None:
+        self.posterior, self.stage, self.title = posterior, stage, f"{stage.replace('+', ', ')}: choices"
+        parts, options = stage.split("+"), posterior.options
+        shifts, materials = list[SurfaceChoice](), list[SurfaceChoice]()
+        if SHIFT in posterior.misfit.parts and (PLANES in parts or FRAME in parts):
             sd_m = float(np.hypot(options.shift_sd_m * (PLANES in parts), FRAME_SD[0] * (FRAME in parts)))
-            shifts = shift_choices(misfit, fit.planes, sd_m, fit.frequency_hz)
+            shifts = shift_choices(posterior, sd_m)
         if MATERIALS in parts:
-            materials = material_choices(misfit, fit.slabs, fit.frequency_hz)
-        self.choices = joint_choices(materials, shifts, fit.supposed)
+            materials = material_choices(posterior, posterior.slabs)
+        self.choices = joint_choices(materials, shifts, posterior)
         self.joint = [choice for choice in self.choices if choice.joint]
         self.material = [choice for choice in self.choices if choice.material.size]
 
     def best(self) -> State:
         """The most probable state that is found from the stated one."""
-        fit = self.fit
-        state, _ = self._chosen(fit.start(self.stage), self.choices, f"{self.title}, round 1")
-        state = self._rounds(fit.solved(state, ROUND_STEPS), range(2, ROUNDS + 1))
-        state = self._boxes(state)
-        if len(self.joint) < 2:
-            return state
-        state = self._without_doubts(state)
-        return self._otherwise(state, self.joint, self._implausible(self.joint, state.vector))
+        state, _ = self._chosen(self.posterior.start(self.stage), self.choices, f"{self.title}, round 1")
+        state = self._rounds(state.solved(ROUND_STEPS), range(2, ROUNDS + 1))
+        moves: list[Callable[[State], State]] = [self._boxes]
+        if len(self.joint) > 1:  # a single one has nothing that could hold it in the wrong place
+            moves += [self._doubted_anew, self._otherwise]
+        for move in moves:
+            state = move(state)
+        return state
 
-    def continued(self, state: State, by: Fit) -> State:
-        """The most probable state that is found from one of a fit to other paths."""
-        state = self._rounds(self.fit.solved(self.fit.carried_over(state, by)), range(1, ROUNDS + 1))
-        if not self.material:
-            return state
-        places = np.array([choice.material for choice in self.material])
-        away = (state.vector - state.mean) / self.fit.prior_deviation
-        return self._otherwise(state, self.material, np.square(away[places]).sum(axis=-1), of_materials=True)
+    def continued(self, state: State) -> State:
+        """The most probable state that is found from one over other paths."""
+        state = self._rounds(state.at(self.posterior).solved(), range(1, ROUNDS + 1))
+        return self._otherwise(state, of_materials=True) if self.material else state
 
-    def _better(self, state: State, other: State, bonus: float = 0.0) -> bool:
-        """Whether another state is more probable by `GAIN`, less a bonus, with the noise of the present one."""
-        gain = self.fit.cost(state, state.noise) - self.fit.cost(other, state.noise)
-        return gain + bonus > GAIN
+    def _solved_if_better(self, state: State, other: State, bonus: float = 0.0) -> State:
+        """Another state after least squares, or the present one where that gains nothing by the present noise."""
+        other = other.solved(ROUND_STEPS)
+        return other if gains(state.cost(state.noise), other.cost(state.noise), bonus) else state
 
     def _rounds(self, state: State, numbers: Iterable[int]) -> State:
         """Rounds of choices and least squares, until a round changes no choice."""
@@ -101,102 +210,91 @@ class Moves:
             state, changed = self._chosen(state, self.choices, f"{self.title}, round {number}")
             if not changed:
                 break
-            state = self.fit.solved(state, ROUND_STEPS)
+            state = state.solved(ROUND_STEPS)
         return state
 
-    def _chosen(self, state: State, choices: Sequence[Choice], what: str) -> tuple[State, bool]:
+    def _chosen(self, state: State, choices: Sequence[SurfaceChoice], what: str) -> tuple[State, bool]:
         """Coordinate descent over choices, in sweeps until none changes; and whether one has."""
-        fit, vector, chosen = self.fit, state.vector.copy(), dict[str, str]()
+        posterior, vector, materials = self.posterior, state.vector.copy(), dict[str, str]()
         last = 0  # the choice that was changed last, or the first
         for sweep in range(SWEEPS):
-            trials = near(fit.misfit, vector)
+            trials = near(posterior.misfit, vector)
             noise, changed = Noise.of(trials.residual(vector)), False
             for number, choice in enumerate(choices):
                 if sweep and not changed and number >= last:
                     break  # the alternatives of the others were tried beside what is chosen now
-                fit.on_stage(what, (sweep + number / len(choices)) / SWEEPS)
-                least, name, other = self._alternatives(trials, noise, choice, vector)[0]
-                if least < fit.trial_costs(trials, noise, vector[None])[0] - GAIN:
-                    chosen[choice.what], vector, changed = name.partition(",")[0], other, True
-                    last = number
-                    trials.accept(other)
+                posterior.on_stage(what, (sweep + number / len(choices)) / SWEEPS)
+                best = self._alternatives(trials, noise, choice, vector)[0]
+                if gains(posterior.trial_costs(trials, noise, vector[None])[0], best.cost):
+                    materials[choice.what], vector, changed, last = best.material, best.vector, True, number
+                    trials.accept(vector)
             if not changed:
                 break
         state = replace(state, vector=vector)
         for choice in choices:
-            if choice.what in chosen and choice.material.size:
-                state = state.changed(choice, chosen[choice.what], vector)
-        return state, bool(chosen)
+            if choice.what in materials and choice.material.size:
+                state = state.chosen(choice.what, materials[choice.what], choice.material, vector)
+        return state, bool(materials)
 
     def _alternatives(
-        self, trials: Misfit | PathSum, noise: Noise, choice: Choice, vector: FloatArray, of_materials: bool = False
+        self,
+        trials: Misfit | PathSum,
+        noise: Noise,
+        choice: SurfaceChoice,
+        vector: FloatArray,
+        of_materials: bool = False,
     ) -> list[Alternative]:
-        """Alternatives of a choice, those with the least cost first.
-
-        Of a material and a shift together, the best of some shifts, or with ``of_materials`` those of each material and
-        the plane where it is, are compared after least squares, too.
-        """
-        expected = self.fit.expected(vector, choice.places)
+        """Alternatives of a choice, those with the least cost first; some of joint ones after least squares, too."""
+        expected = self.posterior.expected(vector, choice.places)
         vectors = np.tile(vector, (len(choice.values), 1))
         for other, values in zip(vectors, choice.values.values(), strict=True):
             other[choice.places] = np.where(np.isnan(values), expected, values)
-        costs = self.fit.trial_costs(trials, noise, vectors)
-        tried = sorted(zip(costs, choice.values, vectors, strict=True), key=itemgetter(0))
-        if choice.joint:
-            # A plane that is tilted, too, fits at the right shift only once its tilts do.
-            groups = dict[str, list[tuple[str, FloatArray]]]()  # by material or by shift
-            for _, name, other in tried:
-                groups.setdefault(name.partition(",")[0 if of_materials else 2], []).append((name, other))
-            few = [group[0] for group in groups.values()][:REFINED]
-            if of_materials:
-                few = [one for group in groups.values() for one in group[:SHIFTS_EACH]]
-                for material, group in groups.items():  # also where the plane is: the shifts are those of a lattice
-                    in_place = group[0][1].copy()
-                    in_place[choice.plane] = vector[choice.plane]
-                    few.append((material, in_place))
-            places = choice.places if trials is self.fit.misfit else choice.plane
-            work = partial(self.fit.refined, trials, places=places)
-            starts = [other for _, other in few]
-            better = on_threads(work, starts) if isinstance(trials, PathSum) else [work(start) for start in starts]
-            costs = self.fit.trial_costs(trials, noise, np.stack(better))
-            tried += zip(costs, [name for name, _ in few], better, strict=True)
-        return sorted(tried, key=itemgetter(0))
+        costs = self.posterior.trial_costs(trials, noise, vectors)
+        tried = sorted(map(Alternative, costs, choice.values, vectors), key=BY_COST)
+        if not choice.joint:
+            return tried
+        # A plane that is tilted, too, fits at the right shift only once its tilts do.
+        starts = _starts(choice, tried, vector, of_materials)
+        places = choice.places if trials is self.posterior.misfit else choice.plane
+        work, vectors_of = partial(self.posterior.refined, trials, places=places), [start.vector for start in starts]
+        # Recordings of Dr.Jit, by which a misfit is evaluated, serve one thread at a time.
+        refined = on_threads(work, vectors_of) if isinstance(trials, PathSum) else [work(start) for start in vectors_of]
+        costs = self.posterior.trial_costs(trials, noise, np.stack(refined))
+        tried += map(Alternative, costs, [start.name for start in starts], refined)
+        return sorted(tried, key=BY_COST)
 
     def _boxes(self, state: State) -> State:
-        """All faces of a box of one material, supposed ones at their best shifts, where that is likely.
-
-        Waves that pass a cabinet lose what its front and its back do. As long as the back is missing, the front is
-        taken to lose both, and then neither fits without the other.
-        """
-        fit = self.fit
-        shifts = {choice.what: choice.shifts for choice in self.joint if choice.what in fit.supposed}
-        for number, slabs in enumerate(fit.bodies, 1):
-            fit.on_stage(f"{self.title} of boxes", number / len(fit.bodies))
-            faces, trials = material_choices(fit.misfit, slabs, fit.frequency_hz), near(fit.misfit, state.vector)
-            alternatives = list[Alternative]()
-            for material in faces[0].values:
-                if material == ABSENT:
-                    continue
-                vector = state.vector.copy()
-                for face in faces:
-                    vector[face.places] = face.values[material]
-                for face in faces:
-                    if face.what in shifts:
-                        vector = self._alternatives(trials, state.noise, shifts[face.what], vector)[0][2]
-                alternatives.append((fit.trial_costs(trials, state.noise, vector[None])[0], material, vector))
-            _, material, vector = min(alternatives, key=itemgetter(0))
-            changed = [face for face in faces if state.materials.get(face.what) != material]
-            if not changed:
-                continue
+        """All faces of a box of one material, supposed ones at their best shifts, where that is likely."""
+        # Waves that pass a cabinet lose what its front and its back do. As long as the back is missing, the front is
+        # taken to lose both, and then neither fits without the other.
+        posterior = self.posterior
+        for number, slabs in enumerate(posterior.bodies, 1):
+            posterior.on_stage(f"{self.title} of boxes", number / len(posterior.bodies))
+            faces, trials = material_choices(posterior, slabs), near(posterior.misfit, state.vector)
+            materials = [material for material in faces[0].values if material != ABSENT]
+            best = min((self._of_one_material(trials, state, faces, name) for name in materials), key=BY_COST)
+            changed = [face for face in faces if state.materials.get(face.what) != best.name]
             other = state
             for face in changed:
-                other = other.changed(face, material, vector)
-            other = fit.solved(other, ROUND_STEPS)
-            if self._better(state, other, LIKELY * len(changed)):
-                state = other
+                other = other.chosen(face.what, best.name, face.places, best.vector)
+            if changed:
+                state = self._solved_if_better(state, other, LIKELY * len(changed))
         return state
 
-    def _without_doubts(self, state: State) -> State:
+    def _of_one_material(
+        self, trials: Misfit | PathSum, state: State, faces: Sequence[SurfaceChoice], material: str
+    ) -> Alternative:
+        """All faces of a box of a material, and the supposed ones among them where they fit best."""
+        vector, supposed = state.vector.copy(), self.posterior.supposed
+        for face in faces:
+            vector[face.places] = face.values[material]
+        shifts = {choice.what: choice.shifts for choice in self.joint if choice.what in supposed}
+        for face in faces:
+            if face.what in shifts:
+                vector = self._alternatives(trials, state.noise, shifts[face.what], vector)[0].vector
+        return Alternative(self.posterior.trial_costs(trials, state.noise, vector[None])[0], material, vector)
+
+    def _doubted_anew(self, state: State) -> State:
         """Doubtful surfaces are chosen anew, until each reason for doubt has failed."""
         doubts = [(self._implausible, self.joint), (self._unsupported, self.material)]
         failed, number = 0, 0
@@ -204,59 +302,86 @@ class Moves:
             doubt, choices = doubts[number % len(doubts)]
             number += 1
             # The half that is doubted most is left out, and then chosen beside the others.
-            most = np.argsort(-doubt(choices, state.vector), kind="stable")[: (len(choices) + 1) // 2]
+            most = np.argsort(-doubt(choices, state), kind="stable")[: (len(choices) + 1) // 2]
             doubted, other = [choices[place] for place in np.sort(most)], state
             for choice in doubted:
-                other = other.changed(choice, ABSENT, self._without(choice, other.vector))
+                without = self._without(choice, other.vector)
+                other = other.chosen(choice.what, ABSENT, choice.material, without)
             other, _ = self._chosen(other, doubted, f"{self.title} in doubt, {number} of {RECONSIDERED}")
-            other = self.fit.solved(other, ROUND_STEPS)
-            state, failed = (other, 0) if self._better(state, other) else (state, failed + 1)
+            other = self._solved_if_better(state, other)
+            failed = failed + 1 if other is state else 0
+            state = other
         return state
 
-    def _otherwise(
-        self, state: State, choices: Sequence[Choice], doubt: FloatArray, of_materials: bool = False
-    ) -> State:
-        """One after another of the choices doubted most in another minimum of its plane, or of another material.
-
-        All parameters are adapted to it: what the others have adapted to the wrong choice makes the right one look
-        worse until they may change.
-        """
-        apart_m, fit = APART * speed_of_light / self.fit.frequency_hz, self.fit
+    def _otherwise(self, state: State, of_materials: bool = False) -> State:
+        """The least plausible planes in other minima, or materials replaced by others, one after another."""
+        # Least squares of all parameters before a comparison: what the others have adapted to the wrong choice makes
+        # the right one look worse until they may change.
+        choices = self.material if of_materials else self.joint
+        doubt = (self._far_from_prior if of_materials else self._implausible)(choices, state)
+        apart_m = APART * speed_of_light / self.posterior.frequency_hz
         what = f"{self.title} {'of other materials' if of_materials else 'in other minima'}"
-        doubtful = np.argsort(-doubt, kind="stable")[:ELSEWHERE]
-        for number, choice in enumerate([choices[place] for place in doubtful], 1):
-            fit.on_stage(f"{what}, {number} of {len(doubtful)}", 0.0)
-            trials, tried = near(fit.misfit, state.vector), [(state.materials.get(choice.what), state.vector)]
-            for _, name, vector in self._alternatives(trials, state.noise, choice, state.vector, of_materials):
-                material = name.partition(",")[0]
-                known = [
-                    material == other if of_materials else abs((vector - tried_vector)[choice.plane[0]]) < apart_m
-                    for other, tried_vector in tried
+        doubtful = [choices[place] for place in np.argsort(-doubt, kind="stable")[:ELSEWHERE]]
+        for number, choice in enumerate(doubtful, 1):
+            self.posterior.on_stage(f"{what}, {number} of {len(doubtful)}", 0.0)
+            trials = near(self.posterior.misfit, state.vector)
+            tried = [Alternative(0.0, state.materials.get(choice.what, ""), state.vector)]
+            for other in self._alternatives(trials, state.noise, choice, state.vector, of_materials):
+                same = [
+                    other.material == before.material
+                    if of_materials
+                    else abs((other.vector - before.vector)[choice.plane[0]]) < apart_m
+                    for before in tried
                 ]
-                if len(tried) > MINIMA or any(known):
+                if len(tried) > MINIMA or any(same):
                     continue
-                tried.append((material, vector))
-                other = fit.solved(state.changed(choice, material, vector), ROUND_STEPS)
-                if self._better(state, other):
-                    state = other
+                tried.append(other)
+                present = state
+                candidate = state.chosen(choice.what, other.material, choice.material, other.vector)
+                state = self._solved_if_better(state, candidate)
+                if state is not present:
                     break  # the other alternatives are beside what was found before
         return state
 
-    def _implausible(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
-        """Squared distances of planes from where the others let expect them, in standard deviations."""
-        fit, places = self.fit, [choice.plane for choice in choices]
-        away = [(vector[place] - fit.expected(vector, place)) / fit.prior_deviation[place] for place in places]
+    def _far_from_prior(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
+        """Squared distances of materials from their prior, in standard deviations."""
+        away = (state.vector - state.mean) / self.posterior.prior_deviation
+        return np.square(away[np.array([choice.material for choice in choices])]).sum(axis=-1)
+
+    def _implausible(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
+        """Squared distances of planes from the positions predicted by the other planes, in standard deviations."""
+        posterior, vector, places = self.posterior, state.vector, [choice.plane for choice in choices]
+        away = [(vector[at] - posterior.expected(vector, at)) / posterior.prior_deviation[at] for at in places]
         return np.square(away).sum(axis=1)
 
-    def _unsupported(self, choices: Sequence[Choice], vector: FloatArray) -> FloatArray:
+    def _unsupported(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Log-likelihoods without each surface, the higher the less observations tell of it."""
-        trials = near(self.fit.misfit, vector)
-        noise = Noise.of(trials.residual(vector))
-        return -noise.costs(trials.mean_squares(np.stack([self._without(choice, vector) for choice in choices])))
+        trials = near(self.posterior.misfit, state.vector)
+        noise = Noise.of(trials.residual(state.vector))
+        return -noise.costs(trials.mean_squares(np.stack([self._without(choice, state.vector) for choice in choices])))
 
-    def _without(self, choice: Choice, vector: FloatArray) -> FloatArray:
-        """A vector [p] without the surface of a choice; its plane is where the others let expect it."""
+    def _without(self, choice: SurfaceChoice, vector: FloatArray) -> FloatArray:
+        """A vector [p] without the surface of a choice; its plane is where the other planes predict it."""
         absent = next(values for name, values in choice.values.items() if name.startswith(ABSENT))
         result = vector.copy()
-        result[choice.places] = np.where(choice.of_plane, self.fit.expected(vector, choice.places), absent)
+        result[choice.places] = np.where(choice.of_plane, self.posterior.expected(vector, choice.places), absent)
         return result
+
+
+def _starts(
+    choice: SurfaceChoice, tried: Sequence[Alternative], vector: FloatArray, of_materials: bool
+) -> list[Alternative]:
+    """Alternatives of a joint choice, of ascending cost, from which least squares start."""
+    # The best materials of the `REFINED` best shifts, or the `SHIFTS_EACH` best shifts of each material: before least
+    # squares, the right one may lie behind others.
+    groups = dict[str, list[Alternative]]()  # by material or by shift
+    for other in tried:
+        groups.setdefault(other.name.partition(",")[0 if of_materials else 2], []).append(other)
+    if not of_materials:
+        return [group[0] for group in groups.values()][:REFINED]
+    starts = [other for group in groups.values() for other in group[:SHIFTS_EACH]]
+    for material, group in groups.items():  # also where the plane is: the shifts are those of a lattice
+        in_place = group[0].vector.copy()
+        in_place[choice.plane] = vector[choice.plane]
+        starts.append(Alternative(np.nan, material, in_place))
+    return starts

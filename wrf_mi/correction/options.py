@@ -13,8 +13,7 @@ from ..core import InputError
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, SpecularOptions
 from ..tracing.paths.instrument_parameters import TX_PATTERN
-from ..tracing.paths.material_parameters import EXPONENT, PREFIX, QUANTITIES
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import EXPONENT, PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"

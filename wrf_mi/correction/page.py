@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,16 @@ from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
-from ..tracing.paths.material_parameters import QUANTITIES, SURFACE, name_of
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
 from .correct import Correction
-from .fit import LEAST_PATHS
-from .frame import rigid_motion, scene_entries
 from .options import FRAME, MATERIALS
+from .state import LEAST_PATHS, rigid_motion, scene_entries
 
 PAGE, PICTURE = "correction.md", "correction.png"
 SUPPORTED = 0.5
 """Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
+CONSTANTS = ("permittivity", "conductivity", "thickness_m", "conductivity_exponent")
+"""Constants of a material in ``correction.json``, each before and after."""
 AS_STATED, FITTED, ANOTHER, LEFT_OUT = "as stated", "constants fitted", "another material", "left out"
 CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OUT: "tab:red"}
 """Colours of the changes of materials."""
@@ -58,40 +59,38 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     Raises:
         InputError: a folder that exists or cannot be written, or no surface is left.
     """
-    facts = _facts(correction)
+    facts, state = _facts(correction), correction.state
     with atomic_folder(Path(folder), replace=replace) as part:
         write_corrected_scene(
             part,
             correction.misfit.sides[0].scene,
-            correction.fit.of_scene(correction.state),
+            state.scene_parameters(),
             grouping="surface",
             kinds=correction.kinds,
-            absent=correction.fit.absent(correction.state),
+            absent=state.absent(),
             replace=True,
         )
-        write_atomically(part / FILE, json.dumps(facts, indent=1, default=_plain) + "\n")
+        plain = json.dumps(facts, indent=1, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
+        write_atomically(part / FILE, plain + "\n")
         write_atomically(part / PAGE, _text(correction, facts))
         write_figure(part / PICTURE, _picture(correction, facts))
     return facts
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
 def _facts(correction: Correction) -> dict[str, Any]:
     """Everything that the page states."""
     misfit, task = correction.misfit, task_of(correction.misfit.record)
-    changed = np.zeros(len(correction.vector), bool)
-    changed[correction.fit.free(correction.kept)] = True
-    values, parameters = misfit.named(correction.vector), {}
-    for name, part in misfit.parts.items():
-        parameters[name] = {
+    changed = np.isin(np.arange(len(correction.vector)), correction.state.free)
+    values, sd_before = misfit.named(correction.vector), correction.state.posterior.prior_deviation
+    parameters = {
+        name: {
             "value": values[name].ravel().tolist(),
             "sd": correction.deviation[part].tolist(),
-            "sd_before": correction.fit.prior_deviation[part].tolist(),
+            "sd_before": sd_before[part].tolist(),
             "changed": changed[part].tolist(),
         }
+        for name, part in misfit.parts.items()
+    }
     scores = {
         _stage(stage): {"mean": float(np.nanmean(score)), "median": float(np.nanmedian(score))}
         for stage, score in correction.scores.items()
@@ -121,62 +120,56 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
     misfit, surfaces = correction.misfit, correction.misfit.sides[0].surfaces
     if SHIFT not in misfit.parts:
         return []
-    count, paths = len(misfit.planes), misfit.counts()[0]
-    faces = np.flatnonzero(np.isin(surfaces.plane, misfit.planes))
-    objects = [set[str]() for _ in range(count)]
-    for place, thing in zip(
-        np.searchsorted(misfit.planes, surfaces.plane[faces]), surfaces.object_of(faces), strict=True
-    ):
-        objects[place].add(surfaces.names[thing])
     shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
-    turned = correction.vector[tilt].reshape(count, 2)
-    turned_sd = correction.deviation[tilt].reshape(count, 2)
-    free = np.isin(np.arange(shift.start, shift.stop), correction.fit.free(correction.kept))
-    ratio = correction.deviation[shift] / correction.fit.prior_deviation[shift]
-    return [
-        {
-            "objects": sorted(objects[plane]),
-            "normal": surfaces.normal[misfit.planes[plane]].round(4).tolist(),
-            "paths": int(paths[plane]),
-            "shift_mm": 1e3 * float(correction.vector[shift][plane]),
-            "shift_sd_mm": 1e3 * float(correction.deviation[shift][plane]) if free[plane] else None,
-            "tilt_mrad": (1e3 * turned[plane]).tolist(),
-            "tilt_sd_mrad": (1e3 * turned_sd[plane]).tolist() if free[plane] else None,
-            "measured": bool(free[plane] and ratio[plane] <= SUPPORTED),
-        }
-        for plane in range(count)
-    ]
+    moved_mm, sd_mm = 1e3 * correction.vector[shift], 1e3 * correction.deviation[shift]
+    turned, turned_sd = (1e3 * values[tilt].reshape(-1, 2) for values in (correction.vector, correction.deviation))
+    # A quantity is measured where its standard deviation fell by half: the data then tell more than the prior.
+    free = np.isin(np.arange(shift.start, shift.stop), correction.state.free)
+    ratio = correction.deviation[shift] / correction.state.posterior.prior_deviation[shift]
+    planes = []
+    for place, (number, paths) in enumerate(zip(misfit.planes, misfit.counts()[0], strict=True)):
+        objects = np.unique(surfaces.object_of(np.flatnonzero(surfaces.plane == number)))
+        planes.append(
+            {
+                "objects": sorted(surfaces.names[thing] for thing in objects),
+                "normal": surfaces.normal[number].round(4).tolist(),
+                "paths": int(paths),
+                "shift_mm": float(moved_mm[place]),
+                "shift_sd_mm": float(sd_mm[place]) if free[place] else None,
+                "tilt_mrad": turned[place].tolist(),
+                "tilt_sd_mrad": turned_sd[place].tolist() if free[place] else None,
+                "measured": bool(free[place] and ratio[place] <= SUPPORTED),
+            }
+        )
+    return planes
 
 
 def _materials(correction: Correction) -> list[dict[str, Any]]:
     """Each surface that paths meet: paths, constants before and after, standard deviations of their logarithms."""
-    misfit, slabs = correction.misfit, correction.misfit.sides[0].slabs
-    paths = misfit.counts()[1]
+    misfit, slabs, state = correction.misfit, correction.misfit.sides[0].slabs, correction.state
     fitted = slabs.fitted(misfit.named(correction.vector)) if correction.kept else slabs
-    before, after = slabs.table, fitted.table
-    changed, absent = correction.fit.free(correction.kept), correction.fit.absent(correction.state)
+    # Constants, not their logarithms, which parameters are; their uncertainty is a factor.
+    before, after = (np.column_stack([part.table, part.exponent]).tolist() for part in (slabs, fitted))
+    changed, absent = state.free, state.absent()
     quantities = QUANTITIES if misfit.several_carriers else QUANTITIES[:3]
     parts = [misfit.parts.get(name_of(SURFACE, quantity)) for quantity in quantities]
-    found = []
-    for index, name in enumerate(slabs.names):
+    materials = []
+    for index, (name, paths) in enumerate(zip(slabs.names, misfit.counts()[1], strict=True)):
         places = [part.start + index for part in parts if part is not None]
-        free = bool(places) and places[0] in changed
-        sd = correction.deviation[places] if free else None
-        found.append(
+        sd = correction.deviation[places] if places and places[0] in changed else None
+        measured = None if sd is None else (sd / state.posterior.prior_deviation[places] <= SUPPORTED).tolist()
+        materials.append(
             {
                 "surface": name.partition("/")[0],
-                "paths": int(paths[index]),
-                "first_choice": correction.state.materials.get(name),
+                "paths": int(paths),
+                "first_choice": state.materials.get(name),
                 "absent": misfit.slabs[index] in absent,
-                "permittivity": [float(before[index, 0]), float(after[index, 0])],
-                "conductivity": [float(before[index, 1]), float(after[index, 1])],
-                "thickness_m": [float(before[index, 2]), float(after[index, 2])],
-                "conductivity_exponent": [float(slabs.exponent[index]), float(fitted.exponent[index])],
+                **dict(zip(CONSTANTS, map(list, zip(before[index], after[index], strict=True)), strict=True)),
                 "sd_log": None if sd is None else sd.tolist(),
-                "measured": None if sd is None else (sd / correction.fit.prior_deviation[places] <= SUPPORTED).tolist(),
+                "measured": measured,
             }
         )
-    return found
+    return materials
 
 
 def _frame(correction: Correction) -> dict[str, Any] | None:
@@ -186,83 +179,114 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
         return None
     surfaces, places = misfit.sides[0].surfaces, misfit.plane_entries
     change, precision = np.zeros((2, 3 * len(surfaces.normal)))
-    entries, free = (
-        scene_entries(misfit.planes, len(surfaces.normal)),
-        np.isin(places, correction.fit.free(correction.kept)),
-    )
+    entries, free = scene_entries(misfit.planes, len(surfaces.normal)), np.isin(places, correction.state.free)
+    # The motion nearest to all planes, each as certain as the fit knows it; planes that were not fitted do not count.
     change[entries] = correction.vector[places]
     precision[entries[free]] = 1 / np.square(correction.deviation[places[free]])
-    motion, sd = rigid_motion(surfaces, change, precision)
+    motion, sd = (1e3 * values for values in rigid_motion(surfaces, change, precision))
     return {
-        "translation_mm": (1e3 * motion[:3]).tolist(),
-        "translation_sd_mm": (1e3 * sd[:3]).tolist(),
-        "rotation_mrad": (1e3 * motion[3:]).tolist(),
-        "rotation_sd_mrad": (1e3 * sd[3:]).tolist(),
+        "translation_mm": motion[:3].tolist(),
+        "translation_sd_mm": sd[:3].tolist(),
+        "rotation_mrad": motion[3:].tolist(),
+        "rotation_sd_mrad": sd[3:].tolist(),
     }
 
 
 def _text(correction: Correction, facts: dict[str, Any]) -> str:
     """The page as Markdown."""
-    task = task_of(correction.misfit.record)
-    receivers = ", ".join(facts["held_out_receivers"])
-    held = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
+    return "\n".join(
+        [
+            *_scores_text(correction, facts),
+            *_frame_text(facts["frame"]),
+            *(_planes_text(facts["planes"]) if correction.kept else []),
+            *_materials_text(correction, facts["materials"]),
+            *_limits_text(facts),
+            "",
+        ]
+    )
+
+
+def _table(header: str, kinds: str, rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table, and a blank one: cells of ``header`` by "|", ``kinds`` l or r (numbers) of columns."""
+    rules = " | ".join("---:" if kind == "r" else "---" for kind in kinds)
+    return [f"| {header} |", f"| {rules} |", *(f"| {' | '.join(row)} |" for row in rows), ""]
+
+
+def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
+    task, receivers = task_of(correction.misfit.record), ", ".join(facts["held_out_receivers"])
+    place = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
+    scores = [
+        (stage, *(f"{score[kind]:.{task.digits}f}" for kind in ("median", "mean")))
+        for stage, score in facts["held_out_scores"].items()
+    ]
     lines = [
         "# A scene corrected by measurements",
         "",
         f"Data: {correction.misfit.record.name}, {facts['rows']} training rows, {facts['paths']} paths. "
         f"Kept: {facts['kept']}. Duration: {facts['seconds']:.0f} s.",
         "",
-        f"{task.label} of {facts['held_out']} training rows {held} while choosing:",
+        f"{task.label} of {facts['held_out']} training rows {place} while choosing:",
         "",
-        "| scene | median | mean |",
-        "| --- | ---: | ---: |",
+        *_table("scene | median | mean", "lrr", scores),
     ]
-    for stage, score in facts["held_out_scores"].items():
-        lines.append(f"| {stage} | {score['median']:.{task.digits}f} | {score['mean']:.{task.digits}f} |")
     if correction.data is not None:
         ratio = f"{correction.data.error_ratio:.2f}"
-        lines += ["", f"Errors at rows that the scene does not know are about {ratio} times those at the rows above."]
-    lines += ["", f"![surfaces and scores]({PICTURE})", ""]
-    if (frame := facts["frame"]) is not None:
-        lines += ["## Frame", "", "Common motion of all planes, about the mean of their centres.", ""]
-        lines += ["| | x | y | z |", "| --- | ---: | ---: | ---: |"]
-        for what, unit in (("translation", "mm"), ("rotation", "mrad")):
-            pairs = zip(frame[f"{what}_{unit}"], frame[f"{what}_sd_{unit}"], strict=True)
-            lines.append(f"| {what} ({unit}) | " + " | ".join(_with_sd(*pair) for pair in pairs) + " |")
-        lines.append("")
-    known = [plane for plane in facts["planes"] if plane["shift_sd_mm"] is not None]
-    if known and correction.kept:
-        lines += ["## Planes", "", "| objects | paths | shift (mm) | tilts (mrad) | measured |"]
-        lines.append("| --- | ---: | ---: | ---: | --- |")
-        for plane in sorted(known, key=lambda plane: -plane["paths"]):
-            tilts = ", ".join(_with_sd(*pair) for pair in zip(plane["tilt_mrad"], plane["tilt_sd_mrad"], strict=True))
-            shift = _with_sd(plane["shift_mm"], plane["shift_sd_mm"])
+        lines += [f"Errors at rows that the scene does not know are about {ratio} times those at the rows above.", ""]
+    return [*lines, f"![surfaces and scores]({PICTURE})", ""]
+
+
+def _frame_text(frame: dict[str, Any] | None) -> list[str]:
+    if frame is None:
+        return []
+    rows = [
+        (f"{what} ({unit})", *map(_with_sd, frame[f"{what}_{unit}"], frame[f"{what}_sd_{unit}"]))
+        for what, unit in (("translation", "mm"), ("rotation", "mrad"))
+    ]
+    table = _table("| x | y | z", "lrrr", rows)
+    return ["## Frame", "", "Common motion of all planes, about the mean of their centres.", "", *table]
+
+
+def _planes_text(planes: list[dict[str, Any]]) -> list[str]:
+    rows = []
+    for plane in sorted(planes, key=lambda plane: -plane["paths"]):
+        if plane["shift_sd_mm"] is not None:
             names = ", ".join(plane["objects"][:3]) + (" ..." if len(plane["objects"]) > 3 else "")
-            lines.append(f"| {names} | {plane['paths']} | {shift} | {tilts} | {'yes' if plane['measured'] else 'no'} |")
-        lines.append("")
-    fitted = [one for one in facts["materials"] if one["sd_log"] is not None]
-    if fitted:
-        several, hz = correction.misfit.several_carriers, correction.fit.frequency_hz
-        law = " At another carrier f it is multiplied by (f / f0)^d." if several else ""
-        text = f"Conductivities hold at the carrier f0 = {hz / 1e9:.6g} GHz.{law} A constant in parentheses is not"
-        lines += ["## Materials", "", f"{text} identified."]
-        more = " exponent d |" if several else ""
-        lines += ["", f"| surface | paths | chosen | permittivity | conductivity (S/m) | thickness (m) |{more}"]
-        lines.append("| --- | ---: | --- | ---: | ---: | ---: |" + " ---: |" * several)
-        for one in sorted(fitted, key=lambda one: -one["paths"]):
-            cells = []
-            keys = "permittivity", "conductivity", "thickness_m"
-            for key, sd, sure in zip(keys, one["sd_log"], one["measured"], strict=False):
-                value = f"{one[key][1]:.3g}" + (f" x/ {math.exp(sd):.2g}" if sure else "")
-                cells.append(value if sure else f"({value})")
-            if several:
-                exponent, sd = one["conductivity_exponent"][1], one["sd_log"][-1]
-                cells.append(f"{exponent:.2f} ± {sd:.2f}" if one["measured"][-1] else f"({exponent:.2f})")
-            taken = "absent, left out" if one["absent"] else one["first_choice"] or "as stated"
-            lines.append(f"| {one['surface']} | {one['paths']} | {taken} | " + " | ".join(cells) + " |")
-        lines.append("")
-    few = facts["surfaces"] - len(fitted)
-    lines += [
+            tilts = ", ".join(map(_with_sd, plane["tilt_mrad"], plane["tilt_sd_mrad"]))
+            shift, measured = _with_sd(plane["shift_mm"], plane["shift_sd_mm"]), "yes" if plane["measured"] else "no"
+            rows.append((names, str(plane["paths"]), shift, tilts, measured))
+    header = "objects | paths | shift (mm) | tilts (mrad) | measured"
+    return ["## Planes", "", *_table(header, "lrrrl", rows)] if rows else []
+
+
+def _materials_text(correction: Correction, materials: list[dict[str, Any]]) -> list[str]:
+    several, rows = correction.misfit.several_carriers, []
+    for material in sorted(materials, key=lambda material: -material["paths"]):
+        if material["sd_log"] is None:
+            continue
+        cells = []
+        for name, sd, measured in zip(CONSTANTS, material["sd_log"], material["measured"], strict=False):
+            value = material[name][1]
+            if name == CONSTANTS[-1]:  # the exponent is no logarithm
+                cells.append(f"{value:.2f} ± {sd:.2f}" if measured else f"({value:.2f})")
+            else:
+                cells.append(f"{value:.3g} x/ {math.exp(sd):.2g}" if measured else f"({value:.3g})")
+        choice = "absent, left out" if material["absent"] else material["first_choice"] or "as stated"
+        rows.append((material["surface"], str(material["paths"]), choice, *cells))
+    if not rows:
+        return []
+    law = " At another carrier f it is multiplied by (f / f0)^d." if several else ""
+    hz = correction.state.posterior.frequency_hz
+    text = (
+        f"Conductivities hold at the carrier f0 = {hz / 1e9:.6g} GHz.{law} A constant in parentheses is not identified."
+    )
+    header = "surface | paths | chosen | permittivity | conductivity (S/m) | thickness (m)"
+    table = _table(header + " | exponent d" * several, "lrlrrr" + "r" * several, rows)
+    return ["## Materials", "", text, "", *table]
+
+
+def _limits_text(facts: dict[str, Any]) -> list[str]:
+    few = facts["surfaces"] - sum(material["sd_log"] is not None for material in facts["materials"])
+    return [
         "## What the data do not tell",
         "",
         f"- {few} of {facts['surfaces']} surfaces are as stated: fewer than {LEAST_PATHS} paths meet them"
@@ -271,9 +295,7 @@ def _text(correction: Correction, facts: dict[str, Any]) -> str:
         "`x/ 1.2` is a factor of one standard deviation.",
         "- Standard deviations are those of the Fisher information and the prior, with the paths of the scene that "
         "was found. Of surfaces that the scan missed, only faces of boxes are tried (`hidden`).",
-        "",
     ]
-    return "\n".join(lines)
 
 
 def _with_sd(value: float, sd: float) -> str:
@@ -283,26 +305,27 @@ def _with_sd(value: float, sd: float) -> str:
 def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list[str]:
     """The change of the material of each face, a key of `CHANGES`."""
     of_slab = [AS_STATED] * facts["surfaces"]
-    for index, one in zip(correction.misfit.slabs, facts["materials"], strict=True):
-        if one["sd_log"] is not None:
-            of_slab[index] = LEFT_OUT if one["absent"] else ANOTHER if one["first_choice"] else FITTED
+    for index, material in zip(correction.misfit.slabs, facts["materials"], strict=True):
+        if material["sd_log"] is not None:
+            of_slab[index] = LEFT_OUT if material["absent"] else ANOTHER if material["first_choice"] else FITTED
     return [of_slab[slab] if slab >= 0 else AS_STATED for slab in correction.misfit.tables.slab_of_face]
 
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     """The scene coloured by the shifts of its planes, or where none moved by its materials, and the held-out scores."""
     surfaces = correction.misfit.sides[0].surfaces
-    parameters = correction.fit.of_scene(correction.state)
+    parameters = correction.state.scene_parameters()
     triangles = moved_triangles(surfaces, parameters)
     shift = np.zeros(len(surfaces.normal)) + 1e3 * parameters.get(SHIFT, 0.0)
     figure = Figure(figsize=(12, 5.2), layout=ConstrainedLayoutEngine(wspace=0.12))  # labels of z need room
     room: Any = figure.add_subplot(1, 2, 1, projection="3d")
+    # Ceilings would hide the room.
     above = [correction.kinds.get(name) == "ceiling" for name in surfaces.names]
     shown = ~np.array(above)[surfaces.object_of(np.arange(len(triangles)))]
     if not any(plane["shift_mm"] for plane in facts["planes"]):
         label, which = "materials of surfaces", _changes_of_materials(correction, facts)
-        colours = np.array([to_rgba(CHANGES[one], alpha=0.45) for one in which])[shown]
-        handles = [Patch(color=CHANGES[one], alpha=0.45, label=one) for one in CHANGES]
+        colours = np.array([to_rgba(CHANGES[change], alpha=0.45) for change in which])[shown]
+        handles = [Patch(color=colour, alpha=0.45, label=change) for change, colour in CHANGES.items()]
         # At a fixed place: the best one is searched for among all corners of all faces.
         room.legend(handles=handles, fontsize=8, loc="upper left")
     else:
@@ -320,6 +343,7 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     room.set_box_aspect(np.maximum(high - low, 0.1))
     room.set_title(label)
     axes = figure.add_subplot(1, 2, 2)
+    # Distributions over the held-out rows: a mean that gains may hide rows that lose.
     for stage, score in correction.scores.items():
         values: FloatArray = np.sort(score[np.isfinite(score)])
         share = np.arange(1, len(values) + 1) / max(len(values), 1)

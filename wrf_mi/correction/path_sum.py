@@ -11,10 +11,11 @@ a factor of its sums.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import pairwise
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +24,12 @@ from scipy.sparse import coo_array, csr_array
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..graph.combine import ArrayReceiver, PowerReceiver
 from ..parallel.threads import on_threads
+from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
+from ..receivers.receiver_models import ComplexArray as Complex
 from ..tasks import task_of
-from ..tracing.paths.material_parameters import PREFIX
-from ..tracing.paths.plane_parameters import SHIFT, TILT
+from ..tracing.paths.scene_parameters import PREFIX, SHIFT, TILT
 from ..tracing.search.images import mirrored
-from .signal_reports import Channels, Complex, Spectra, Strengths
 
 if TYPE_CHECKING:
     from .misfit import Misfit
@@ -47,21 +47,13 @@ centimetres resonate within a few per cent of their thickness."""
 
 @dataclass(frozen=True, eq=False)
 class _Touched:
-    """The n paths that meet one of some planes and surfaces, in the order of `wrf_mi.correction.misfit.PathTable`.
+    """The n paths that meet one of some planes and surfaces, in the order of `wrf_mi.correction.misfit.PathTable`."""
 
-    Attributes:
-        key: identifies the planes and surfaces.
-        paths: these paths [n].
-        rows: their rows, each once and in the order of the paths [k].
-        adding: sums over the paths of each row [k, n].
-        slope: derivatives of their lengths by shifts and tilts [n, 3 q].
-    """
-
-    key: bytes
-    paths: IntArray
-    rows: IntArray
-    adding: csr_array
-    slope: csr_array
+    key: bytes  # identifies the planes and surfaces
+    paths: IntArray  # numbers of the paths [n]
+    rows: IntArray  # their rows, each once and in the order of the paths [k]
+    adding: csr_array  # sums over the paths of each row [k, n]
+    slope: csr_array  # derivatives of their lengths by shifts and tilts [n, 3 q]
 
     def sums(self, waves: Complex) -> Complex:
         """Sums [k, ...] of waves [n, ...] over the paths of each row."""
@@ -80,35 +72,29 @@ class PathSum:
 
     def __init__(self, misfit: Misfit, vector: FloatArray) -> None:
         self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
-        self._paths, task, self._plane_places = misfit.paths, task_of(misfit.record), misfit.plane_entries
+        self._paths, self._plane_places = misfit.paths, misfit.plane_entries
+        self._coherent = not task_of(misfit.record).in_decibel
+        material = [np.arange(part.start, part.stop) for name, part in misfit.parts.items() if name.startswith(PREFIX)]
+        self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
+        self._factors = [
+            (misfit.parts[port.side.gain_name], port.places)
+            for port in misfit.ports
+            if port.side.gain_name in misfit.parts
+        ]
+        self._models, self._model_of = _distinct_models(misfit)
+        # What does not change with materials: lengths of paths, and the waves of gains of one.
         self._mirrors = np.where(self._paths.reflects, self._paths.plane, -1)
-        self._slope = csr_array((len(self._paths.row), 0))
+        self._slope, length = csr_array((len(self._paths.row), 0)), np.zeros(0)
         if len(self._plane_places):
             length, self._slope = _geometry(misfit, self._mirrors, vector)
-        self._unit: Complex | None = None
-        if task.in_decibel:
-            self._reports: Channels = Strengths(misfit)
-        elif task.image:
-            hz = np.array([side.frequency_hz for side in misfit.sides])
-            self._reports, self._k = Spectra(misfit), (2 * np.pi * hz / speed_of_light)[self._paths.side, None]
-            self._unit = misfit.unit_signals(self.at)
-        else:
-            assert misfit.record.frequencies_hz is not None
-            hz = np.asarray(misfit.record.frequencies_hz, float)
-            self._reports, self._k = Channels(), 2 * np.pi * hz[None] / speed_of_light
-            self._unit = np.exp(-1j * length[:, None] * self._k)
+        if self._coherent:
+            self._k, self._unit = _unit_waves(misfit, vector, length)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
         self._touched: dict[bytes, _Touched] = {}
         self._unit_of: tuple[bytes, Complex] = b"", np.zeros((0, 0), complex)
         self._tracing = Lock()  # recordings of Dr.Jit serve one thread at a time
-        material = [part for name, part in misfit.parts.items() if name.startswith(PREFIX)]
-        places = np.array([np.arange(part.start, part.stop) for part in material], np.int64)
-        self._material = places.reshape(len(material), len(misfit.sides[0].slabs.names))
-        self._factors = [
-            (misfit.parts[side.gain_name], places)
-            for side, places in zip(misfit.sides, misfit.places, strict=True)
-            if side.gain_name in misfit.parts
-        ]
+        # The present state, which trials differ from: gains, waves and sums over the paths of each row.
+        self._every = self._of_paths(b"every", np.arange(len(self._paths.row)))
         self._gain = self.misfit.gains(self.at, self._every.paths)
         self._waves = self._waves_of(self._every, self._gain[None], np.zeros((1, len(self._plane_places))))[:, 0]
         self._total = np.zeros((len(misfit.observed), self._waves.shape[1]), complex)
@@ -120,21 +106,23 @@ class PathSum:
         """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths by materials and
         gains.
         """
-        record, task, gains = misfit.record, task_of(misfit.record), {side.gain_name for side in misfit.sides}
-        carriers = len(misfit.sides) // len(misfit.receivers)
-        known = set() if task.in_decibel else {SHIFT, TILT}
-        others = {name for name in misfit.parts if not name.startswith((PREFIX, "receiver."))} - known
-        devices = {name for name in misfit.parts if name.startswith("receiver.") and not name.endswith(".gain")}
-        if others or devices or len(gains) * carriers < len(misfit.sides):
+        task, models = task_of(misfit.record), [port.model for port in misfit.ports]
+        gains = {port.side.gain_name for port in misfit.ports}
+        carriers = len(models) // len(misfit.receivers)
+        followed = set() if task.in_decibel else {SHIFT, TILT}
+        of_devices = {name for name in misfit.parts if name.startswith("receiver.")}
+        others = {name for name in misfit.parts if not name.startswith(PREFIX)} - of_devices - followed
+        moved = {name for name in of_devices if not name.endswith(".gain")}
+        # Receivers of one name share parameters: their sums would not be told apart.
+        if others or moved or len(gains) * carriers < len(models):
             return False
         if task.in_decibel:
-            powers = (isinstance(model, PowerReceiver) and not model.interference for model in misfit.models)
-            return all(powers)
+            return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
         if task.image:
-            arrays = [m for m in misfit.models if isinstance(m, ArrayReceiver) and m.instrument_scale]
+            arrays = [m for m in models if isinstance(m, ArrayReceiver) and m.instrument_scale]
             sizes, count = {len(m.elements_m) for m in arrays}, len(misfit.paths.row)
-            return len(arrays) == len(misfit.models) and len(sizes) == 1 and max(sizes) * count <= MOST_WAVES
-        channels = task.is_complex and record.observation.ndim == 3
+            return len(arrays) == len(models) and len(sizes) == 1 and max(sizes) * count <= MOST_WAVES
+        channels = task.is_complex and misfit.record.observation.ndim == 3
         return channels and SHIFT in misfit.parts and carriers == 1
 
     def residual(self, vector: FloatArray) -> FloatArray:
@@ -161,6 +149,7 @@ class PathSum:
     def _trials(self, vectors: FloatArray) -> tuple[IntArray, FloatArray]:
         """Rows [k] with a path or gain that a vector of [v, p] changes, and their residuals [k, v, values]."""
         touched, waves = self._changed(vectors)
+        # The sums of all paths less those that change, plus these as they are now: other paths are not evaluated.
         total = (self._total[touched.rows] - touched.sums(self._waves[touched.paths]))[:, None] + touched.sums(waves)
         factor, rows = np.stack([self._factor(vector) for vector in vectors], axis=1), touched.rows
         if (factor != self._factor(self.at)[:, None]).any():
@@ -172,7 +161,30 @@ class PathSum:
         return rows, residual.reshape(*total.shape[:2], residual.shape[1])
 
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
-        return self._reports.report(signal, rows) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+        reports = [self._models[number].signal_report(signal[run]) for number, run in self._runs(rows)]
+        return _joined(reports, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+
+    def _runs(self, rows: IntArray) -> list[tuple[int, slice]]:
+        """Numbers of receiver models and ranges of ``rows`` that they report."""
+        # Rows of paths lie side by side, so that there are few ranges, and slices need no copies.
+        number = self._model_of[rows]
+        bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(rows)]
+        return [(int(number[begin]), slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
+
+    def _slopes(self, signal: Complex, rows: IntArray) -> Slopes:
+        """Derivatives of the reports of the signals of some rows."""
+        parts: list[list[Complex]] = [[] for _ in self._models]
+        place = np.zeros(len(rows), np.int64)
+        for number, run in self._runs(rows):
+            place[run] = sum(map(len, parts[number])) + np.arange(run.stop - run.start)
+            parts[number].append(signal[run])
+        of_model = [model.signal_slopes(parts[number]) for number, model in enumerate(self._models)]
+
+        def slopes(change: Complex, which: IntArray) -> FloatArray:
+            runs = self._runs(rows[which])
+            return _joined([of_model[number](change[run], place[which[run]]) for number, run in runs], self.misfit)
+
+        return slopes
 
     def _keep(self, residual: FloatArray) -> None:
         self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
@@ -185,29 +197,21 @@ class PathSum:
         present, total = self._waves.copy(), self._total.copy()
         present[touched.paths] = waves[:, 0]
         total[touched.rows] += touched.sums(waves[:, 0] - self._waves[touched.paths])
-        receiver = {part.start + k: (k, places) for part, places in self._factors for k in range(2)}
-        changes = list[tuple[IntArray, Complex]]()
+        gain_columns = {part.start + k: (k == 1, rows) for part, rows in self._factors for k in range(2)}
+        changes = list[tuple[IntArray, Complex]]()  # rows that each column changes, and derivatives of their sums
         for column in columns:
-            if column in receiver:
-                imaginary, rows = receiver[column]
-                by_gain = (1j if imaginary else 1) if self._unit is not None else (0 if imaginary else 2)
-                changes.append((rows, by_gain * total[rows]))
-                continue
-            there = vector.copy()
-            there[column] += STEP
-            if column in self._plane_places:
-                moved = self._touched_by(self._differs(there[None], vector))
-                slope = moved.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()
-                change = present[moved.paths] * (-1j * slope * self._wavenumber(moved.paths))
+            if column in gain_columns:
+                of_phase, rows = gain_columns[column]
+                # Of exp(x + j y) for fields, and of exp(2 x) for powers.
+                changes.append(
+                    (rows, ((1j if of_phase else 1) if self._coherent else 2 * (not of_phase)) * total[rows])
+                )
             else:
-                moved, waves = self._changed(there[None])
-                # Parameters are rounded to single precision, gains are not.
-                step = float(np.float32(there[column])) - float(np.float32(vector[column]))
-                change = (waves[:, 0] - present[moved.paths]) / step
-            changes.append((moved.rows, moved.sums(change)))
+                moved, change = self._change_by(int(column), vector, present)
+                changes.append((moved.rows, moved.sums(change)))
         every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
         factor = self._factor(vector)
-        slopes = self._reports.slopes((total * factor)[every], every)
+        slopes = self._slopes((total * factor)[every], every)
         result = np.zeros((len(columns), *self.misfit.observed.shape), np.float32)
 
         def fill(number: int) -> None:
@@ -218,6 +222,19 @@ class PathSum:
         on_threads(fill, range(len(columns)))
         result[:, ~np.isfinite(self.misfit.observed).all(axis=1)] = 0
         return result
+
+    def _change_by(self, column: int, vector: FloatArray, present: Complex) -> tuple[_Touched, Complex]:
+        """Paths that an entry of a plane or material changes, and derivatives of their waves, ``present`` for all."""
+        beside = vector.copy()
+        beside[column] += STEP
+        if column in self._plane_places:
+            moved = self._touched_by(self._differs(beside[None], vector))
+            slope = moved.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()
+            return moved, present[moved.paths] * (-1j * slope * self._wavenumber(moved.paths))
+        moved, waves = self._changed(beside[None])
+        # Parameters are rounded to single precision, gains are not.
+        step = float(np.float32(beside[column])) - float(np.float32(vector[column]))
+        return moved, (waves[:, 0] - present[moved.paths]) / step
 
     def accept(self, vector: FloatArray) -> None:
         """Take a vector as the present one."""
@@ -234,12 +251,8 @@ class PathSum:
         factor = np.ones((len(self.misfit.observed), 1), complex)
         for part, places in self._factors:
             amplitude, phase = (vector - self._start)[part]
-            factor[places] = np.exp(2 * amplitude if self._unit is None else amplitude + 1j * phase)
+            factor[places] = np.exp(amplitude + 1j * phase if self._coherent else 2 * amplitude)
         return factor
-
-    @cached_property
-    def _every(self) -> _Touched:
-        return self._of_paths(b"every", np.arange(len(self._paths.row)))
 
     def _of_paths(self, key: bytes, paths: IntArray) -> _Touched:
         row, count = self._paths.row[paths], len(paths)
@@ -280,7 +293,7 @@ class PathSum:
 
     def _waves_of(self, touched: _Touched, gain: Complex, shifts: FloatArray) -> Complex:
         """Waves [n, v, frequencies or elements] for gains [v, n] and shifts [v, 3 q], or powers [n, v, 1]."""
-        if self._unit is None:
+        if not self._coherent:
             return (np.abs(gain.T[:, :, None]) ** 2).astype(complex)
         key, unit = self._unit_of
         if key != touched.key:  # kept for the next call
@@ -288,7 +301,7 @@ class PathSum:
             self._unit_of = touched.key, unit
         if not shifts.any():
             return gain.T[:, :, None] * unit[:, None]
-        # Alternatives of a material share their shifts.
+        # Alternatives of a material share their shifts: exponentials of the distinct ones serve all.
         number_of = dict[bytes, int]()
         which = [number_of.setdefault(row.tobytes(), len(number_of)) for row in shifts]
         distinct = shifts[np.unique(which, return_index=True)[1]]
@@ -300,13 +313,37 @@ class PathSum:
         materials = self._material.ravel()
         if not (vector != self.at)[materials].any():
             return self._gain[touched.paths]
-        there = self._start.copy()  # angles of all gains are those of the first vector
-        there[materials] = vector[materials]
-        key = touched.key, there[materials].tobytes()
+        with_materials = self._start.copy()  # angles of all gains are those of the first vector
+        with_materials[materials] = vector[materials]
+        key = touched.key, with_materials[materials].tobytes()
         with self._tracing:
             if key not in self._gains:
-                self._gains[key] = self.misfit.gains(there, touched.paths)
+                self._gains[key] = self.misfit.gains(with_materials, touched.paths)
         return self._gains[key]
+
+
+def _unit_waves(misfit: Misfit, vector: FloatArray, length_m: FloatArray) -> tuple[FloatArray, Complex]:
+    """Wavenumbers [paths or 1, frequencies or 1] and waves [paths, frequencies or elements] for gains of one."""
+    if task_of(misfit.record).image:
+        hz = np.array([port.side.frequency_hz for port in misfit.ports])
+        return (2 * np.pi * hz / speed_of_light)[misfit.paths.side, None], misfit.unit_signals(vector)
+    assert misfit.record.frequencies_hz is not None
+    k = 2 * np.pi * np.asarray(misfit.record.frequencies_hz, float)[None] / speed_of_light
+    return k, np.exp(-1j * length_m[:, None] * k)
+
+
+def _distinct_models(misfit: Misfit) -> tuple[list[Any], IntArray]:
+    """Receiver models with different reports of signals, and the number of that of each row."""
+    models, number = dict[Any, Any](), np.zeros(len(misfit.observed), np.int64)
+    for port in misfit.ports:
+        models.setdefault(port.model.signal_key, port.model)
+        number[port.places] = list(models).index(port.model.signal_key)
+    return list(models.values()), number
+
+
+def _joined(parts: Sequence[FloatArray], misfit: Misfit) -> FloatArray:
+    """Reports of consecutive rows [n, values]; without a copy of the only part."""
+    return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, misfit.observed.shape[1])), *parts])
 
 
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
@@ -315,10 +352,7 @@ def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
 
 
 def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[FloatArray, csr_array]:
-    """Lengths [n] of all paths, and their derivatives by shifts, then tilts, of the q planes [n, 3 q].
-
-    ``mirrors``: plane that reflects each path at each interaction [n, depth], -1 for none.
-    """
+    """Lengths [n] of paths that planes ``mirrors`` [n, depth] reflect (-1: none), and slopes by planes [n, 3 q]."""
     surfaces, chosen, count = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes)
     axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
     shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
@@ -327,10 +361,12 @@ def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[Fl
     first = np.cumsum([0, *map(len, sources[:-1])])
     point = np.concatenate(sources)[first[misfit.paths.side] + misfit.paths.entry]
     image = np.array([side.receiver.position_m for side in misfit.sides], float)[misfit.paths.side]
+    # Image method (Balanis 2012, section 7.4): the receiver mirrored in the planes, from its end of the chain.
     for at in mirrors.T[::-1]:
         row = np.flatnonzero(at >= 0)
         image[row] = mirrored(image[row], normal[at[row]], offset[at[row]])
     length = np.linalg.norm(image - point, axis=1)
+    # Along the path, point by point: a displacement e of the plane along its normal lengthens it by 2 e (u . n).
     way, none = (image - point) / length[:, None], np.zeros(0, np.int64)
     slopes = [(none, none, np.zeros(0))]  # sparse: a path meets few planes
     for at in mirrors.T:

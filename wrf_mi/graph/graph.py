@@ -35,14 +35,14 @@ from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import Plane
+from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
-from ..tracing.paths.traced_field import TracedField, TracedOptions, TracedPaths, traced_fields
+from ..tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
 from ..tracing.tracer import check_polarization
 from .evaluations import EVALUATIONS, Evaluation
-from .phase_errors import draws_of, for_draws, mean_of_draws, with_phase_errors
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
@@ -50,7 +50,7 @@ Field = WrfGs | WrfGsPlus | Factorised
 LEVEL = "level"
 """Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
 SHARE = 0.1
-"""Unit of the learned side as a share of the paths' amplitude: it begins as a correction."""
+"""Initial learned amplitude relative to the amplitude of the paths."""
 MATCHING = 3
 """Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
 MATCHED = 256
@@ -83,7 +83,7 @@ class Batch:
 
 
 Alone = Literal["traced", "learned"]
-"""One of both sides of a graph."""
+"""Component reported alone: traced or learned."""
 Report = Callable[[Mapping[str, Any], Batch], Any]
 """``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
 
@@ -120,6 +120,7 @@ class Graph:
         evaluation: str = SPLATTED,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
+        # Phases of an array need its elements and a wavelength; paths need a carrier in any case.
         array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
         unknown = form.frequencies_hz is None and form.carriers_hz is None
         carrier = unknown and (self.kind.needs_carrier or scene is not None)
@@ -217,7 +218,7 @@ class Graph:
         t = self.traced
         options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
         at = self.receivers[receiver], options, self._prepared
-        sides = traced_fields(self.scene, tx_pos_m, *at, tx_heading_rad, carriers_hz, params)
+        sides = traced_fields(tx_pos_m, *at, tx_heading_rad, carriers_hz, parameters=params)
         if self.surface:
             for side in sides:
                 side.attach(self.surface)
@@ -295,10 +296,8 @@ class Graph:
         kind = type(params[LEVEL].array)
         unit = dr.exp(dr.gather(kind, params[LEVEL].array, batch.receiver))
         if paths is not None:
-            re, im = paths.gain
-            power = kind(dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, paths.each))
             # A root of squares keeps both derivatives, where a maximum would leave ``level`` without one.
-            unit = dr.sqrt(SHARE**2 * power + unit * unit)
+            unit = dr.sqrt(SHARE**2 * kind(paths.power) + unit * unit)
         return unit if batch.weight is None else unit * batch.weight
 
     def report(
@@ -331,21 +330,20 @@ class Graph:
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
-            paths = None if side is None else side(params, batch.slots)
-            drawn = paths
+            # The traced component, then the learned one in the receiver's unit.
+            paths, signal = None if side is None else side(params, batch.slots), None
+            if self.field is not None and learned and alone != "traced":
+                signal = batch.signal or self.learned(number, params, batch, chunked)
+                if (unit := self.unit(params, batch, paths)) is not None:
+                    if (count := dr.width(unit)) > 1:
+                        unit = spread(unit, dr.width(signal[0]) // count)
+                    signal = signal[0] * unit, signal[1] * unit
+                if alone == "learned":
+                    return model(None, signal)
+            # Single components are compared with each other: they keep the phases that the paths have.
             if phase_error and side is not None and paths is not None and alone is None:
-                drawn = with_phase_errors(paths, side.bounces, batch.slots, phase_error)
-            if self.field is None or not learned or alone == "traced":
-                return mean_of_draws(model(drawn, None), paths, drawn)
-            signal = batch.signal or self.learned(number, params, batch, chunked)
-            if (unit := self.unit(params, batch, paths)) is not None:
-                if (count := dr.width(unit)) > 1:
-                    each = dr.width(signal[0]) // count
-                    unit = dr.gather(type(unit), unit, dr.arange(mi.UInt32, count * each) // each)
-                signal = signal[0] * unit, signal[1] * unit
-            if paths is not None and drawn is not None:
-                signal = for_draws(signal, paths.batch, drawn.batch)
-            return mean_of_draws(model(None if alone == "learned" else drawn, signal), paths, drawn)
+                return expected_report(model, paths, signal, phase_error * side.bounces_of(batch.slots))
+            return model(paths, signal)
 
         return report
 
@@ -353,7 +351,10 @@ class Graph:
         """Constants on the device that a report reads beside its arguments, inputs of a recording."""
         if side is None and self.form.receiver == "pixel":
             return []
-        return [self.models[number].arrays(mi.Float), [] if side is None else [side.arrays, draws_of(side.form[0])]]
+        return [
+            self.models[number].arrays(mi.Float),
+            [] if side is None else [side.arrays, draws_on_device(side.form[0])],
+        ]
 
     def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
         """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""
@@ -376,6 +377,7 @@ class Graph:
         # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
         rows = known[:: -(-len(known) // MATCHED)] if len(known) else known
         gain = np.zeros(2, np.float32)
+        # Reports are linear in the gain but for floors, which further passes leave behind.
         for _ in range(MATCHING if len(rows) else 0):
             with dr.suspend_grad():
                 report = unscaled(side({side.gain_name: mi.TensorXf(gain)}, to_uint(rows)), None).numpy()

@@ -1,8 +1,8 @@
 """Receiver models by name, and the form of observations that they need.
 
 A receiver model is a callable of two sides, the paths of a batch and the learned signal on directions, either of which
-may be None; it returns flat observations (see `wrf_mi.graph.combine`). Another package adds a model by an entry point
-of the group `ENTRY_POINTS` that names a `ReceiverKind`.
+may be None; it returns flat observations (see `wrf_mi.receivers.receiver_models`). Another package adds a model by an
+entry point of the group `ENTRY_POINTS` that names a `ReceiverKind`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from ..core import InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.carriers import middle_carrier
 from ..core.registry import Registry
+from ..receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from ..receivers.reports import LEAST_POWER
-from .combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 ENTRY_POINTS = "wrf_mi.receivers"
 """Group of entry points of receiver models."""

@@ -95,11 +95,8 @@ def bartlett_spectrum(h: ArrayLike, positions_m: ArrayLike, frequency_hz: float,
 
 
 def _lines(elements_m: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Two lines whose sums are the elements of a large planar grid, and the elements' order in the grid.
-
-    The first line of other arrays is the origin alone: one sum is faster for few elements, and tables of lines are
-    smaller for many.
-    """
+    """Two lines whose sums are the elements of a large planar grid, and the elements' order in the grid."""
+    # Of other arrays the origin alone and all elements: one sum is faster for few, and lines have smaller tables.
     ungrouped = np.zeros((1, 3)), elements_m, np.arange(len(elements_m))
     grain = ALIGNED * float(np.ptp(elements_m, axis=0).max())
     if len(elements_m) < LINES_FROM or np.ptp(elements_m[:, 2]) > grain:

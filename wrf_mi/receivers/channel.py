@@ -1,12 +1,14 @@
-"""Coherent sums of traced paths at antennas and subcarriers, and received power."""
+"""Coherent sums of traced paths at antennas and subcarriers, received power, and draws of uncertain phases."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
+from scipy.special import ndtri
 
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray
@@ -19,6 +21,10 @@ WAVES_PER_CHUNK = 1 << 20
 """Pairs of path and antenna in one chunk: 16 MiB for each complex array."""
 SPECULAR_KINDS = (0, 1, 4)
 """Kinds of interaction (`wrf_mi.core.Paths`) that keep a wave spherical: none, reflection, transmission."""
+CERTAIN_KINDS = (0, 4)
+"""Kinds of interaction that add no uncertain phase: none, transmission."""
+DRAWS = 16
+"""Draws of uncertain phases: their mean differs from that of 512 by 0.005 of grey in a furnished room."""
 
 
 def antenna_csi(
@@ -106,10 +112,7 @@ def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
 def _spherical_waves(
     paths: Paths, direction: FloatArray, radius_m: FloatArray, elements_m: FloatArray, frequencies_hz: ArrayLike
 ) -> ComplexArray:
-    """Sums [n_rx * n_tx, m, k] of spherical waves at elements [n_rx, m, 3], world axes, from the origin.
-
-    The source of each wave lies at ``radius_m`` [p] from the origin in ``direction`` [p, 3].
-    """
+    """Sums [n_rx * n_tx, m, k] at elements [n_rx, m, 3] of waves from sources at ``radius_m`` in ``direction``."""
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     channel = np.zeros((paths.n_rx * paths.n_tx, elements_m.shape[1], len(frequencies)), np.complex128)
     pair: IntArray = paths.rx * paths.n_tx + paths.tx
@@ -150,3 +153,30 @@ def received_power(paths: Paths) -> FloatArray:
 def rssi_dbm(paths: Paths) -> FloatArray:
     """Received signal strength in dBm for 0 dBm sent, shape [n_rx, n_tx], NaN where no path arrives."""
     return np.asarray(strength_db(received_power(paths)))
+
+
+def phase_draws(count: int) -> FloatArray:
+    """`DRAWS` quantiles of a standard normal variable for each of ``count`` paths [count, DRAWS], in random order.
+
+    Those of a path are the same for any number of others.
+    """
+    order = np.random.default_rng(0).random((count, DRAWS)).argsort(axis=1)
+    return np.asarray(ndtri((order + 0.5) / DRAWS), float)
+
+
+def with_phase_errors(paths: Paths, phase_error: float) -> list[Paths]:
+    """`DRAWS` copies of a receiver's paths, with phases to each reflection of which a normal error was added.
+
+    A mesh that is off by centimetres knows the powers of paths, but not how they interfere.
+
+    Args:
+        paths: paths to one receiver.
+        phase_error: standard deviation of the phase that each interaction but transmission adds, rad, independently.
+    """
+    # Draws by a path's number among those of its transmitter, so that they do not depend on other transmitters.
+    number = np.arange(len(paths)) - np.searchsorted(paths.tx, paths.tx)
+    draws = phase_draws(int(number.max(initial=0)) + 1)[number]
+    uncertain = (~np.isin(paths.interactions, CERTAIN_KINDS)).sum(axis=1)
+    # Independent errors of interactions add as squares.
+    phase = phase_error * np.sqrt(uncertain)[:, None] * draws
+    return [replace(paths, gain=paths.gain * np.exp(1j * angle)) for angle in phase.T]

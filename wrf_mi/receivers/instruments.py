@@ -1,30 +1,26 @@
-"""Instruments: spectra, signal strengths or channel coefficients of traced paths, in float64."""
+"""Instruments of a record: several receivers and their reports of traced paths, in float64.
+
+How a receiver reports is stated once, by its receiver model (`wrf_mi.receivers.receiver_models`), which is imported
+when paths are observed: a command that only reads data does without Dr.Jit.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from ..core import Antenna, Paths, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import IntArray
-from .array import bartlett_spectrum
-from .channel import antenna_csi, csi, rssi_dbm
-from .reports import minmax_scale
 
-CHUNK_SIZE = 64
-"""Transmitters whose spectra are computed together."""
-DRAWS = 16
-"""Draws of uncertain phases: their mean differs from that of 512 by 0.005 of grey in a furnished room."""
-TRANSMISSION = 4
-"""Kind of interaction (`wrf_mi.core.Paths`) that adds no uncertain phase."""
+if TYPE_CHECKING:
+    from .receiver_models import ArrayReceiver, CsiReceiver
 
 
 @dataclass(frozen=True)
@@ -47,8 +43,19 @@ class Instrument(ABC):
         return float(np.mean(self.frequencies_hz))
 
     @abstractmethod
+    def model(self, receiver: Receiver) -> ArrayReceiver | CsiReceiver:
+        """Receiver model of one of the receivers."""
+
     def observe(self, paths: Paths) -> NDArray[Any]:
         """Observations [n_rx, n_tx, ...] of traced paths, as in a record of the task."""
+        bounds = np.searchsorted(paths.rx, np.arange(paths.n_rx + 1))  # paths are sorted by receiver
+        reports = []
+        for receiver, begin, end in zip(self.receivers, bounds[:-1], bounds[1:], strict=True):
+            arriving = paths.select(np.arange(begin, end))
+            arriving = replace(arriving, rx=np.zeros_like(arriving.rx), n_rx=1)
+            reports.append(self.model(receiver).observed(arriving, receiver))
+        # Spectra of one receiver are not copied: those of all rows may take gigabytes.
+        return reports[0][None] if len(reports) == 1 else np.stack(reports)
 
     def observe_rows(self, paths: Paths, carriers_hz: FloatArray | None) -> NDArray[Any]:
         """`observe` with a carrier in Hz for each transmitter, ``carriers_hz`` [n_tx]; None: the instrument's."""
@@ -62,47 +69,35 @@ class Instrument(ABC):
 
         return by_carrier(carriers_hz, at_carrier, axis=1)
 
-    def by_receiver(self, paths: Paths) -> list[tuple[Receiver, Paths]]:
-        """Each receiver with its paths."""
-        parts = []
-        for index, receiver in enumerate(self.receivers):
-            arriving = paths if paths.n_rx == 1 else paths.select(paths.rx == index)
-            parts.append((receiver, replace(arriving, rx=np.zeros_like(arriving.rx), n_rx=1)))
-        return parts
-
 
 @dataclass(frozen=True)
 class PowerInstrument(Instrument):
     """Received power in dBm for 0 dBm sent, [n_rx, n_tx], NaN where no path arrives: powers of paths are added."""
 
-    def observe(self, paths: Paths) -> NDArray[Any]:
-        """Received power, see `wrf_mi.receivers.rssi_dbm`."""
-        return rssi_dbm(paths)
+    def model(self, receiver: Receiver) -> CsiReceiver:
+        """A single antenna that adds the powers of paths."""
+        from .receiver_models import PowerReceiver
+
+        return PowerReceiver(1, 1, (self.carrier_hz,), interference=False)
 
 
 @dataclass(frozen=True)
 class ChannelInstrument(Instrument):
     """Channel coefficients, [n_rx, n_tx, k], or [n_rx, n_tx, m, k] of receivers with m antennas: fields are added."""
 
-    def observe(self, paths: Paths) -> NDArray[Any]:
-        """Channel coefficients, see `wrf_mi.receivers.csi` and `wrf_mi.receivers.antenna_csi`."""
-        if all(receiver.array_m is None for receiver in self.receivers):
-            return csi(paths, self.frequencies_hz)
-        channels = [
-            antenna_csi(arriving, receiver, receiver.array_m, self.frequencies_hz)[0]
-            for receiver, arriving in self.by_receiver(paths)
-            if receiver.array_m is not None
-        ]
-        return np.stack(channels)
+    def model(self, receiver: Receiver) -> CsiReceiver:
+        """One or several antennas that report channel coefficients."""
+        from .receiver_models import CsiReceiver
+
+        return CsiReceiver(1, 1, tuple(map(float, self.frequencies_hz)), receiver.array_m)
 
 
 @dataclass(frozen=True)
 class SpectrumInstrument(Instrument):
     """Bartlett spectra [n_rx, n_tx, height, width], each scaled by its minimum and maximum as instruments do.
 
-    With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a mesh that is off by
-    centimetres knows the powers of paths, but not how they interfere, and a spectrum of wrong phases has maxima and
-    zeros at wrong places. Draws of a path are the same in every call.
+    With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a spectrum of wrong
+    phases has maxima and zeros at wrong places. Draws of a path are the same in every call.
 
     Attributes:
         size: height and width of a spectrum.
@@ -112,39 +107,9 @@ class SpectrumInstrument(Instrument):
     size: tuple[int, int] = (90, 360)
     phase_error: float = 0.0
 
-    def observe(self, paths: Paths) -> NDArray[np.float32]:
-        """Spectra in 0..1, see `wrf_mi.receivers.bartlett_spectrum`; all 0 where no path arrives."""
-        images = np.zeros((len(self.receivers), paths.n_tx, *self.size), np.float32)
-        for index, (receiver, arriving) in enumerate(self.by_receiver(paths)):
-            assert receiver.array_m is not None, "see the task's instrument"
-            draws = _with_phases(arriving, self.phase_error) if self.phase_error else [arriving]
-            for drawn in draws:
-                signals = antenna_csi(drawn, receiver, receiver.array_m, self.carrier_hz)[0, ..., 0]
-                # Float64 spectra of all would take several times the memory of the result.
-                for start in range(0, len(signals), CHUNK_SIZE):
-                    rows = slice(start, start + CHUNK_SIZE)
-                    spectra = bartlett_spectrum(signals[rows], receiver.array_m, self.carrier_hz, *self.size)
-                    images[index, rows] += minmax_scale(spectra) / len(draws)
-        return images
+    def model(self, receiver: Receiver) -> ArrayReceiver:
+        """An array that reports scaled spectra."""
+        from .receiver_models import ArrayReceiver
 
-
-def phase_draws(count: int) -> FloatArray:
-    """`DRAWS` quantiles of a standard normal variable for each of ``count`` paths [count, DRAWS], in random order.
-
-    Those of a path are the same for any number of others.
-    """
-    order = np.random.default_rng(0).random((count, DRAWS)).argsort(axis=1)
-    return np.asarray(ndtri((order + 0.5) / DRAWS), float)
-
-
-def _with_phases(paths: Paths, phase_error: float) -> list[Paths]:
-    """A receiver's paths with `DRAWS` draws of their uncertain phases.
-
-    The draws of a path are quantiles in random order, by its number among the paths of its transmitter, so that spectra
-    do not depend on others.
-    """
-    number = np.arange(len(paths)) - np.searchsorted(paths.tx, paths.tx)
-    drawn = phase_draws(int(number.max(initial=0)) + 1)[number]
-    interactions = ((paths.interactions != 0) & (paths.interactions != TRANSMISSION)).sum(axis=1)
-    phase = phase_error * np.sqrt(interactions)[:, None] * drawn
-    return [replace(paths, gain=paths.gain * np.exp(1j * angle)) for angle in phase.T]
+        assert receiver.array_m is not None, "see the task's instrument"
+        return ArrayReceiver(*self.size, receiver.array_m, self.carrier_hz, "coherent", True, self.phase_error)

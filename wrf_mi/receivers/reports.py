@@ -1,14 +1,7 @@
-"""Reports of instruments, for NumPy and Dr.Jit arrays alike.
+"""Scaling of spectra and powers in dB, for NumPy and Dr.Jit arrays alike.
 
-| instrument | reports | of path gains g, lengths d and, at element or antenna m, distances d_m from the image source |
-| --- | --- | --- |
-| array | spectrum | magnitude of the Bartlett sum of h_m in each direction, scaled to 0..1; in a fit at least 1e-4 |
-| power | strength | sum of the powers of paths, in dB, or a floor |
-| antennas | channel | h_m = sum over paths of g (d / d_m) exp(-j k d_m), on each subcarrier |
-
-Sums over paths depend on the layout of their arrays: `wrf_mi.receivers.channel` has those of traced instruments
-(`wrf_mi.receivers.instruments`, NumPy), `wrf_mi.graph.ports` those of a fit's receiver models (`wrf_mi.graph.combine`,
-Dr.Jit). Dr.Jit is imported on request: a command that only reads data does without it.
+`wrf_mi.receivers.receiver_models` has what instruments report. Dr.Jit is imported on request: a command that only reads
+data does without it.
 """
 
 from __future__ import annotations

@@ -160,34 +160,32 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
 
 
 def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Levenberg-Marquardt from n starts [n, 2 m]: real and imaginary parts of the signals, and norms of residuals [n].
-
-    All starts take their steps together, each with a damping of its own: a step of one takes less time than its calls.
-    """
+    """Levenberg-Marquardt from n starts [n, 2 m] of real and imaginary parts: signals, and norms of residuals [n]."""
+    # All starts take their steps together, each with its damping: the calls of a single step take longer than its sums.
     flat = form.reshape(len(form), -1)
 
     def evaluated(x: FloatArray, of: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         half_slope = (x @ flat).reshape(len(x), len(form), -1)  # of the coordinates x^T F x by x
-        rest = np.matmul(x[:, None], half_slope)[:, 0] - target[of]
-        return half_slope, rest, np.square(rest).sum(axis=1)
+        residual = np.matmul(x[:, None], half_slope)[:, 0] - target[of]
+        return half_slope, residual, np.square(residual).sum(axis=1)
 
     x, damping, active = start.copy(), np.full(len(start), FIRST_DAMPING), np.arange(len(start))
-    half_slope, rest, cost = evaluated(x, active)
+    half_slope, residual, cost = evaluated(x, active)
     best = cost.copy()
     for _ in range(STEPS):
         matrix = 4 * half_slope @ half_slope.transpose(0, 2, 1)
         diagonal = np.einsum("nii->ni", matrix)
         diagonal *= 1 + damping[active, None]  # a view: Marquardt's scaling
-        step = np.linalg.solve(matrix, -2 * half_slope @ rest[:, :, None])[:, :, 0]
+        step = np.linalg.solve(matrix, -2 * half_slope @ residual[:, :, None])[:, :, 0]
         tried = evaluated(x[active] + step, active)
         lower = tried[2] < cost
         damping[active] = np.where(lower, np.maximum(damping[active] / SOFTER, LEAST_DAMPING), damping[active] * HARDER)
         x[active[lower]] += step[lower]
         # Steps that decrease the cost no more end a descent, and so do ever smaller ones.
         goes_on = np.where(lower, cost - tried[2] > CONVERGED * cost, damping[active] < MOST_DAMPING)
-        half_slope, rest, cost = (
+        half_slope, residual, cost = (
             np.where(lower.reshape(-1, *[1] * (new.ndim - 1)), new, old)[goes_on]
-            for new, old in zip(tried, (half_slope, rest, cost), strict=True)
+            for new, old in zip(tried, (half_slope, residual, cost), strict=True)
         )
         best[active[lower]] = tried[2][lower]
         active = active[goes_on]

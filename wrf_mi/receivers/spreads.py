@@ -15,7 +15,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 
 SURE = 1e-12
-"""Concentration of azimuths above one less this is one path: rounding of float64."""
+"""Concentrations of azimuths above 1 - SURE count as 1: rounding of float64."""
 
 
 @dataclass(frozen=True)

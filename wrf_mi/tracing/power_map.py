@@ -29,7 +29,7 @@ from ..core.types import IntArray
 from ..datasets import user_cache
 from ..receivers import rssi_dbm
 from .options import TraceOptions
-from .paths.material_parameters import slabs_of_faces
+from .paths.scene_parameters import slabs_of_faces
 from .paths.solve import Prepared, trace_paths
 from .search.devices import solid_around
 

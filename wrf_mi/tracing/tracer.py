@@ -88,7 +88,7 @@ class RayTracer:
             progress,
             self._prepared,
             first_row,
-            instrument.tx_antenna,
+            tx_antenna=instrument.tx_antenna,
         )
         if carriers_hz is None:
             return traced

@@ -2,7 +2,7 @@
 
 Stages 1 to 5 (`wrf_mi.models.hybrid.paths`) predict from the scene, the last one interpolates: their residuals and the
 observations themselves, weighted by the distance to the nearest training row. One hold-out
-(`wrf_mi.models.held_out.hold_out`) chooses stages, weights and standard deviations (`wrf_mi.models.intervals`).
+(`wrf_mi.training.selection.hold_out`) chooses stages, weights and standard deviations.
 
 parts/  in the run folder: files of the parts
 """

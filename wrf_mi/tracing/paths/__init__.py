@@ -2,7 +2,7 @@
 
 - `solve`: from antennas to paths with gains (`trace_paths`); `result`: the paths, their file, gains anew;
 - `field_calculator`: the image method and polarised fields in Dr.Jit, differentiable;
-- `material_parameters`, `plane_parameters`, `instrument_parameters`, `surface_gaussians`: what is trained;
+- `scene_parameters`, `instrument_parameters`, `surface_gaussians`: what is trained;
 - `traced_field`: paths of one receiver that follow these parameters, at one or several carriers;
 - `corrected_scene`: a scene with trained planes and materials, as a folder or for another search.
 """

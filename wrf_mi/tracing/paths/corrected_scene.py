@@ -1,6 +1,6 @@
 """Scenes with planes and materials as training has changed them: as a folder, and for the search of paths.
 
-Planes that move take paths with them (`wrf_mi.tracing.paths.plane_parameters`), but edges that move uncover some paths
+Planes that move take paths with them (`wrf_mi.tracing.paths.scene_parameters`), but edges that move uncover some paths
 and hide others. Faces, planes and materials of a scene in which paths are searched anew have the numbers of the stated
 one, so that paths found there are paths of the stated scene with these parameters.
 """
@@ -29,8 +29,7 @@ from ...scene.materials import EXPONENT as LAW
 from ...scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
 from ..search.surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
 from ..sionna.materials import absorbs, in_itu_range
-from .material_parameters import QUANTITIES, MaterialGrouping, read_materials, slabs_of_faces
-from .plane_parameters import SHIFT, TILT
+from .scene_parameters import QUANTITIES, SHIFT, TILT, MaterialGrouping, read_materials, slabs_of_faces
 from .solve import Prepared
 
 FLAT = 0.2
@@ -60,6 +59,7 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     Raises:
         ValueError: parameters of a scene with another number of planes.
     """
+    # Corners that faces share, and the planes that meet at each.
     normal, offset = planes_at(surfaces, parameters)
     corners = surfaces.triangles.reshape(-1, 3)
     _, first, same = np.unique(np.round(corners / SAME_CORNER_M), axis=0, return_index=True, return_inverse=True)
@@ -67,6 +67,7 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     pairs = np.unique(np.stack([same, np.repeat(surfaces.plane, 3)], axis=1), axis=0)
     area = np.bincount(surfaces.plane, trimesh.triangles.area(surfaces.triangles), len(normal)).astype(float)
     planes, count = _determining(pairs, len(first), area, normal)
+    # The shortest displacement u with N u = off, of one, two or three planes: u = N^T (N N^T)^-1 off.
     way = np.zeros((len(first), 3))
     for size in range(1, 4):
         corner = np.flatnonzero(count == size)
@@ -74,7 +75,7 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
         # Relative to the corner: the distance of faces from their planes within the tolerance stays.
         change = np.einsum("cpx,cx->cp", (normal - surfaces.normal)[plane], corners[first[corner]])
         off = offset[plane] - surfaces.offset[plane] - change
-        # The shortest way: a combination of the normals, which are far from parallel.
+        # N N^T is far from singular: `_determining` leaves out normals that are almost parallel.
         across = normal[plane]
         share = np.linalg.solve(across @ across.swapaxes(1, 2), off[..., None])
         way[corner] = (across.swapaxes(1, 2) @ share)[..., 0]
@@ -96,9 +97,8 @@ def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tup
 
 
 def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArray) -> tuple[IntArray, IntArray]:
-    """Planes [count, 3] at each corner, the largest first, that are not parallel to what larger ones span, and their
-    numbers [count]; of ``pairs`` of corner and plane [n, 2], and areas [q] and normals [q, 3] of the planes.
-    """
+    """Planes [count, 3] at each corner that are not parallel to what larger ones span, and their numbers [count]."""
+    # Gram-Schmidt of the normals at all corners at once, one rank of area after another.
     corner, plane = pairs[np.lexsort((pairs[:, 1], -area[pairs[:, 1]], pairs[:, 0]))].T
     first = np.searchsorted(corner, np.arange(count + 1))
     planes, basis, number = np.zeros((count, 3), np.int64), np.zeros((count, 3, 3)), np.zeros(count, np.int64)
@@ -108,7 +108,7 @@ def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArr
         along = np.einsum("cbx,cx->cb", basis[row], normal[candidate])
         across = normal[candidate] - np.einsum("cb,cbx->cx", along, basis[row])
         size = np.linalg.norm(across, axis=1)
-        new = size > FLAT
+        new = size > FLAT  # the sine of the angle to what larger planes span
         row, place = row[new], number[row[new]]
         planes[row, place], basis[row, place] = candidate[new], across[new] / size[new, None]
         number[row] += 1
@@ -148,7 +148,7 @@ def write_corrected_scene(
         folder: the new folder.
         scene: a ``sionna.rt.Scene`` as it was trained with.
         parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
-            `wrf_mi.tracing.paths.material_parameters`); others are ignored.
+            `wrf_mi.tracing.paths.scene_parameters`); others are ignored.
         grouping: grouping of the parameters of materials.
         kinds: kinds of objects by name; by default ``other``.
         absent: slabs, in the order of their parameters, whose surfaces are left out.
@@ -162,6 +162,7 @@ def write_corrected_scene(
             cannot be written.
         ValueError: see `moved_triangles`.
     """
+    # Which materials have changed, and which surfaces stay together.
     check_materials(scene)
     surfaces = scene_surfaces(scene)
     triangles = moved_triangles(surfaces, parameters)
@@ -179,6 +180,7 @@ def write_corrected_scene(
     fitted_names = dict[str, str]()
     together = ~changed & _facets(surfaces, slab_of_face, len(slabs.names))
     together[list(absent)] = False
+    # Each object in pieces of one material each, which become objects of their own.
     for index, name in enumerate(surfaces.names):
         faces = np.arange(surfaces.first_face[index], surfaces.first_face[index + 1])
         slab_of_part = slab_of_face[faces]
@@ -193,6 +195,7 @@ def write_corrected_scene(
             corners = triangles[piece].reshape(-1, 3)
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
+            # Its material: absorbing, fitted, by constants where ITU-R P.2040 has none at the carrier, or by name.
             material = scene.objects[name].radio_material.name
             if slab < 0:
                 material = ABSORBER
@@ -221,9 +224,8 @@ def write_corrected_scene(
 
 
 def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[np.bool_]:
-    """Mask of ``count`` surfaces that are facets of curved or small things: small, or with a neighbour in the same
-    object that bends little.
-    """
+    """Mask of ``count`` surfaces that are facets: small, or with a neighbour in their object that bends little."""
+    # Curved things have many faces that bend little towards each other, which a cabinet's sides do not.
     known, area = slab_of_face >= 0, trimesh.triangles.area(surfaces.triangles)
     facets: NDArray[np.bool_] = np.bincount(slab_of_face[known], area[known], count) < FACET_M2
     corners = np.round(surfaces.triangles.reshape(-1, 3) / SAME_CORNER_M)
@@ -277,6 +279,7 @@ def moved_search(
     left_out = np.isin(slabs_of_faces(copy, stated, "surface")[1], list(absent))
     triangles[left_out] = triangles[left_out][:, :1]  # no ray meets a point
     _move(copy, stated, triangles)
+    # The outline of each plane in its stated axes, and a face of it that stands for it; not one that is left out.
     normal, offset = planes_at(stated, parameters)
     flat = np.einsum("fcx,fax->fca", triangles, stated.axes[stated.plane])
     low, high = plane_bounds(stated.plane, flat, len(normal))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
 from ...backend.device import columns_on_device
-from ...backend.vectors import Pose, cross, dot, tangent_basis
+from ...backend.vectors import Complex, Float64, Pose, Vector, cross, dot, tangent_basis, times
 from ...core import Antenna
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
@@ -32,9 +32,6 @@ from ..search.surfaces import Surfaces
 ALONG = 1e-12
 """Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
 
-Float64: Any = dr.float64_array_t(mi.Float)
-Vector = list[Any]
-Complex = tuple[Any, Any]
 Tables = tuple[Any, Any, Any, Any]
 """Permittivity, conductivity, thickness and reflected share [n] of materials, as `SlabMaterials.constants`."""
 
@@ -125,6 +122,7 @@ def evaluate_paths(
     Source: image method and polarised reflection, Balanis, "Advanced Engineering Electromagnetics" (2012), sections 7.4
     and 5.3; slabs as `slab`.
     """
+    # Image method: the transmitter mirrored in all planes, in order, sends a straight wave to the receiver.
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
         image = _mirrored(image, level, level.offset_m)
@@ -132,21 +130,25 @@ def evaluate_paths(
     length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 
+    # Directions of travel, backwards: before a reflection that of after it, mirrored.
     directions = [[-x for x in arrival]]  # of travel, from the transmitter on: [depth + 1] vectors
     for level in reversed(chains.levels):
         directions.insert(0, _mirrored(directions[0], level, 0))
 
     float_type = type(length)
     zero, one = float_type(0), float_type(1)
+    # What the transmitter's antenna sends, in its frame that is turned by the heading about z.
     cosine, sine = chains.heading
     x, y, z = directions[0]
     departure = [cosine * x + sine * y, cosine * y - sine * x, z]
     sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, one]]
     real = antenna_field(tx_antenna, directions[0], sent)
     imaginary = [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
+    # The field after each interaction, as real and imaginary vectors.
     for level, before, after in zip(chains.levels, directions[:-1], directions[1:], strict=True):
         real, imaginary = _interact(level, before, after, (real, imaginary), tables, frequency_hz)
 
+    # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity.
     world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
     turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
@@ -181,20 +183,12 @@ def _interact(
     across = [dr.select(oblique, c * scale, a) for c, a in zip(across, tangent_basis(before)[0], strict=True)]
     along_before, along_after = cross(across, before), cross(across, after)
     (s_re, p_re), (s_im, p_im) = ((dot(part, across), dot(part, along_before)) for part in field)
-    s = te.real * s_re - te.imag * s_im, te.real * s_im + te.imag * s_re
-    p = tm.real * p_re - tm.imag * p_im, tm.real * p_im + tm.imag * p_re
+    s, p = times((te.real, te.imag), (s_re, s_im)), times((tm.real, tm.imag), (p_re, p_im))
     out = []
     for old, s_part, p_part in zip(field, s, p, strict=True):
         new = [s_part * a + p_part * b for a, b in zip(across, along_after, strict=True)]
         out.append([dr.select(met, n, o) for n, o in zip(new, old, strict=True)])
     return out[0], out[1]
-
-
-def complex_exponential(logarithm: Any, phase: Any) -> Complex:
-    """Complex numbers of a logarithmic amplitude and a phase in rad."""
-    sine, cosine = dr.sincos(phase)
-    amplitude = dr.exp(logarithm)
-    return amplitude * cosine, amplitude * sine
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:

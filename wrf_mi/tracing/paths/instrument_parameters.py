@@ -23,10 +23,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.vectors import Pose, principal_axes, times
+from ...backend.vectors import Complex, Float64, Pose, Vector, complex_exponential, principal_axes, times
 from ...core import Receiver
 from ...core.angles import FloatArray
-from .field_calculator import Complex, Vector, complex_exponential
 
 TX_PATTERN = "pattern.transmitter"
 """Name of the parameter [2, c] of the transmitters' pattern."""
@@ -69,6 +68,7 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
             return [float_type(0)] * 3
         return [float_type(component(parameters[name], i)) for i in range(3)]
 
+    # p = p0 + t, and the columns of R0 E(r): E's axes in the stated frame.
     moved, turned = (correction(name) for name in pose_names(receiver))
     position = [float(x) + t for x, t in zip(receiver.position_m, moved, strict=True)]
     columns = principal_axes([*(0.5 * r for r in turned), float_type(1)])
@@ -132,7 +132,8 @@ def pattern_factor(coefficients: Any, direction: Vector) -> Complex:
     """
     float_type = type(direction[0])
     count, paths = coefficients.shape[1], dr.width(direction[0])
-    vector_type: Any = dr.float64_array_t(mi.Vector3f) if float_type == dr.float64_array_t(mi.Float) else mi.Vector3f
+    vector_type: Any = dr.float64_array_t(mi.Vector3f) if float_type == Float64 else mi.Vector3f
+    # Without the constant, degree 0, which the instrument's gain is.
     harmonics = dr.sh_eval(vector_type(*direction), int(np.sqrt(count + 1)) - 1)[1:]
     tensor_type: Any = dr.tensor_t(float_type)
     # A matrix product: the reverse pass of a sum would have a kernel for each coefficient.

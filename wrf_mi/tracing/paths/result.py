@@ -76,6 +76,7 @@ class TraceResult:
         pair = paths.n_tx * paths.rx + paths.tx  # ascending, so that the paths of a pair are a range
         wanted = (paths.n_tx * np.arange(paths.n_rx)[:, None] + which).ravel()
         first, end = (np.searchsorted(pair, wanted, side) for side in ("left", "right"))
+        # The paths of all wanted pairs, range after range: a path's number is its range's first plus its place in it.
         count = end - first
         row = np.repeat(np.arange(len(wanted)), count)
         selected = self.select(np.arange(len(row)) + (end - np.cumsum(count))[row])
@@ -104,6 +105,7 @@ class TraceResult:
                 raise InputError(f"scene: no object {name!r}, which the saved paths meet; open the scene they are of")
             number = surfaces.names.index(name)
             first[index] = surfaces.first_face[number]
+            # A triangle that the object does not have: a scene of the same names, but another one.
             if self.primitives[met].max() >= surfaces.first_face[number + 1] - first[index]:
                 raise InputError(f"scene: object {name!r} is not the one that the saved paths meet; trace them anew")
         face = np.where(paths.objects >= 0, first[paths.objects] + self.primitives, -1)
@@ -216,6 +218,7 @@ def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[
 
     That bounds the error of a sum of the paths, whatever their phases.
     """
+    # Cumulative sums of ascending amplitudes, transmitter by transmitter.
     order = np.lexsort((amplitude, tx))
     ordered, upto = tx[order], np.cumsum(amplitude[order])
     first = np.searchsorted(ordered, ordered)

@@ -26,8 +26,7 @@ from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scatte
 from .result import TraceResult, device_ends
 
 if TYPE_CHECKING:
-    from .material_parameters import MaterialGrouping
-    from .plane_parameters import SceneTables
+    from .scene_parameters import MaterialGrouping, SceneTables
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +83,7 @@ class Prepared:
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:
         """Materials and planes as traced fields read them, those of the first call."""
-        from .plane_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
+        from .scene_parameters import SceneTables  # Dr.Jit is imported where paths have derivatives
 
         if grouping not in self._tables:
             self._tables[grouping] = SceneTables.of(self.scene, self.surfaces, grouping)
@@ -124,6 +123,7 @@ def trace_paths(
     progress: bool = False,
     prepared: Prepared | None = None,
     first_row: int = 0,
+    *,
     tx_antenna: Antenna = ANTENNA,
     check: bool = True,
     gains: bool = True,
@@ -166,6 +166,7 @@ def trace_paths(
     positions = np.atleast_2d(np.asarray(tx_pos_m, float))
     if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
         raise ValueError(f"trace_paths: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [n, 3]")
+    # Devices, checked and placed before the surfaces that they are on.
     devices = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
     if not len(positions) or not devices:
         raise InputError(f"trace_paths: {len(positions)} transmitters and {len(devices)} receivers; give one at least")
@@ -173,15 +174,18 @@ def trace_paths(
     if check:
         shared.check(positions, devices, first_row)
     positions, devices = shared.placed(positions, devices)
+    # Rays leave the receivers, as each takes a second; a heuristic of diffraction is not reciprocal.
     swap = search_from == "receivers" and not options.diffraction
     transmitters, rx_devices = device_ends(positions, devices, tx_antenna)
     ends = (rx_devices, transmitters) if swap else (transmitters, rx_devices)
     sources, targets = ends[0].position_m, ends[1].position_m
     rays = shared.rays(sources, targets, options)
+    # Paths, then their gains by Sionna RT's field calculator, which knows diffraction and scattering.
     with scattering_materials(scene, options):
         legs = _search(scene, shared, sources, targets, options, rays, progress)
         unknown = np.full(len(legs), np.nan, np.complex128)
         gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
+    # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
     paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
     primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)
     hz, arrays = float(scene.frequency[0]), (primitives, legs.probability, legs.wedge)
@@ -226,6 +230,7 @@ def _search(
         task = bar.add_task("tracing paths", total=len(sources) * len(targets))
         for first in range(0, len(sources), SOURCES_TOGETHER):
             group = sources[first : first + SOURCES_TOGETHER]
+            # Chunks of targets bound the memory of candidates; chains of a group are shot once.
             chains, step = shared.chains(group, options, rays), max(1, PAIRS_TOGETHER // len(group))
             for start in range(0, len(targets), step):
                 batch = targets[start : start + step]
@@ -261,7 +266,7 @@ def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArra
         legs = specular_paths(shared.surfaces, chains, sources, targets, plain)
         count_and_power = np.array([len(legs), (_lengths(legs, sources, targets) ** -2).sum()])
         calm = calm + 1 if (count_and_power <= best * (1 + GROWTH)).all() else 0
-        best = np.maximum(best, count_and_power)
+        best = np.maximum(best, count_and_power)  # other rays may lose what a smaller number found
         logger.info("%d rays: %d paths on a sample of positions", rays, len(legs))
         if calm == 2:
             return rays // 4
@@ -278,6 +283,7 @@ def spread(count: int, most: int) -> IntArray:
 
 def _lengths(legs: Legs, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
     """Unfolded lengths [p] in float64."""
+    # From point to point: beyond the last interaction the point stays, which adds nothing.
     point, length = sources_m[legs.source], np.zeros(len(legs))
     for level in range(legs.interactions.shape[1]):
         following = np.where(legs.interactions[:, level, None] != 0, legs.vertices_m[:, level], point)
@@ -291,6 +297,7 @@ def _paths(
 ) -> tuple[Paths, Legs]:
     """Paths sorted by receiver, transmitter and length, and the legs (from transmitters to receivers) in that order."""
     length = _lengths(legs, tx_pos_m, rx_pos_m)
+    # Faces in order decide between equal lengths, as in mirrored rooms: the order is that of every run.
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
     legs, gain, length = legs.select(order), gain[order], length[order]
     tx, rx, vertices = tx_pos_m[legs.source], rx_pos_m[legs.target], legs.vertices_m

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...backend.device import on_device
+from ...backend.vectors import Complex, Float64, complex_exponential
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..options import DISC, FACTOR
-from .field_calculator import Complex, Float64, complex_exponential
 
 NEAREST = 6
 """Gaussians that change one interaction."""
@@ -82,6 +82,7 @@ class SurfaceGaussians:
     @classmethod
     def covering(cls, met: Interactions, spacing_m: float) -> SurfaceGaussians:
         """Gaussians where interactions lie: at their mean in each cell of a lattice of ``spacing_m`` in each plane."""
+        # A cell: a square of the plane, and within tolerances its offset and normal.
         offset = (met.position_m * met.normal).sum(axis=1)
         cell = np.round((met.position_m - offset[:, None] * met.normal) / spacing_m)
         rows = np.column_stack([cell, np.round(offset / SAME_PLANE_M), np.round(met.normal / (1 - SAME_PLANE_COS))])
@@ -106,6 +107,7 @@ class SurfaceGaussians:
         exists = neighbour < len(self)  # SciPy fills up with the number of points
         neighbour = np.where(exists, neighbour, 0)
         normal = self.discs[3:].T[neighbour]
+        # Only Gaussians of the interaction's plane count, which scans may have twice.
         away = np.abs(((met.position_m[:, None] - self.discs[:3].T[neighbour]) * normal).sum(axis=-1))
         turned = np.abs((met.normal[:, None] * normal).sum(axis=-1))
         same = exists & (away < SAME_PLANE_M) & (turned > SAME_PLANE_COS)
@@ -143,7 +145,7 @@ class PathWeights:
     def of(cls, gaussians: SurfaceGaussians, met: Interactions, path: IntArray, count: int) -> PathWeights:
         """Weights of ``count`` paths, of which ``path`` [m] have the interactions, in ascending order."""
         index, weight = gaussians.near(met)
-        place = np.arange(len(path)) - np.searchsorted(path, path)
+        place = np.arange(len(path)) - np.searchsorted(path, path)  # number of an interaction along its path
         depth = int(place.max(initial=0)) + 1
         indices, weights = np.zeros((count, depth, NEAREST), np.int64), np.zeros((count, depth, NEAREST))
         indices[path, place], weights[path, place] = index, weight

@@ -2,14 +2,12 @@
 
 The search for the surfaces that a wave meets (`wrf_mi.tracing.trace_paths`) has no derivative; its result is kept. The
 image method and the field along each path are evaluated in each call (`wrf_mi.tracing.paths.field_calculator`) with the
-present parameters: materials, the scene's planes, the instrument's gain, antenna patterns and the receiver's pose.
-
-Everything is float64 over planes in float64, so that phases k d are exact to 1e-12 rad for the scene as stated (the
-float32 corners of its files are exact to 5e-7 m at 10 m).
+present parameters, in float64: phases k d are exact to 1e-12 rad for the scene as stated (the float32 corners of its
+files are exact to 5e-7 m at 10 m).
 
 Paths appear and vanish as a receiver moves, without a derivative: the set of paths is kept until the receiver is
-further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then
-searches again. Planes that move keep their paths (see `wrf_mi.tracing.paths.plane_parameters`).
+further than a quarter of a wavelength from the position of the search; `TracedField.refresh` then searches again.
+Planes that move keep their paths (`wrf_mi.tracing.paths.scene_parameters`).
 """
 
 from __future__ import annotations
@@ -26,18 +24,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
 from ...backend.device import columns_on_device, on_device
-from ...backend.vectors import times
+from ...backend.vectors import Float64, times
 from ...core import Antenna, InputError, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import rows_by_carrier
 from ...core.types import IntArray
+from ...receivers.device_paths import TracedPaths
 from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions
 from ..search.legs import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
-from .field_calculator import Chains, Complex, EvaluatedPaths, Float64, Level, Vector, chains_of, evaluate_paths
+from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths
 from .instrument_parameters import (
     gain_name,
     instrument_parameters,
@@ -46,9 +45,8 @@ from .instrument_parameters import (
     spread_pose,
     with_antennas,
 )
-from .material_parameters import TRAINED, MaterialGrouping
-from .plane_parameters import SceneTables, renumbered
 from .result import TraceResult, without_faint
+from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
 from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 
@@ -62,15 +60,13 @@ class TracedOptions:
 
     Attributes:
         trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
-        pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none (see
-            `wrf_mi.tracing.paths.instrument_parameters`).
+        pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none.
         tx_antenna: antenna of the transmitters, which turns with their heading.
-        materials: whether each named material has a permittivity and a conductivity, or each surface, the faces of an
-            object in a plane, started from its named material.
-        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.plane_parameters`).
+        materials: whether each named material has parameters, or each surface, started from its named material.
+        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`).
         faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
             add up to less than this share of the amplitudes of all; 0: none.
-        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.material_parameters.QUANTITIES`.
+        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.scene_parameters.QUANTITIES`.
     """
 
     trace: TraceOptions = field(default_factory=TraceOptions)
@@ -89,27 +85,6 @@ class TracedOptions:
         """
         if self.trace.diffraction or self.trace.scattering:
             raise InputError("traced side: diffraction and scattering have no derivative here; switch both off")
-
-
-@dataclass
-class TracedPaths:
-    """Paths to a receiver as differentiable Dr.Jit arrays: ``each`` for every transmitter of the batch.
-
-    Arrays are float64, with the transmitter as the slowest index; place holders of gain zero fill missing paths.
-
-    Attributes:
-        gain: complex gain of free-space loss, interactions, antennas and instrument, without exp(-j k length).
-        length_m: unfolded length, metres.
-        arrival: unit vectors towards the incoming wave, receiver's frame.
-        batch: number of transmitters.
-        each: number of paths of each transmitter, place holders included.
-    """
-
-    gain: Complex  # two float arrays [batch * each]
-    length_m: Any  # float [batch * each]
-    arrival: Vector  # three float arrays [batch * each]
-    batch: int
-    each: int
 
 
 class TracedField:
@@ -150,6 +125,7 @@ class TracedField:
         receiver: Receiver,
         options: TracedOptions = TracedOptions(),
         tx_heading_rad: ArrayLike | None = None,
+        *,
         traced: TraceResult | None = None,
         prepared: Prepared | None = None,
         frequency_hz: float | None = None,
@@ -196,15 +172,14 @@ class TracedField:
 
     @property
     def gain_name(self) -> str:
-        """See `wrf_mi.tracing.paths.instrument_parameters.gain_name`."""
+        """Name of the parameter of the instrument's gain."""
         return gain_name(self.receiver)
 
     def parameters(self) -> dict[str, NDArray[np.float32]]:
         """Initial values by name: the scene's materials, the stated pose, antenna patterns of factor one.
 
-        ``material.<name>.permittivity`` and ``.conductivity`` [1] (see `wrf_mi.tracing.paths.material_parameters`), or
-        of n surfaces ``material.surface.permittivity`` and ``.conductivity`` [n]; with planes ``plane.shift`` [q] in m
-        and ``plane.tilt`` [q, 2] in rad (see `wrf_mi.tracing.paths.plane_parameters`);
+        ``material.<name>.permittivity`` and ``.conductivity`` [1], or of n surfaces ``material.surface.*`` [n]; with
+        planes ``plane.shift`` [q] in m and ``plane.tilt`` [q, 2] in rad (`wrf_mi.tracing.paths.scene_parameters`);
         ``receiver.<name>.gain`` [2], ``.position`` [3] in m, ``.turn`` [3] in rad; with a degree of patterns,
         ``receiver.<name>.pattern`` and ``pattern.transmitter`` [2, c].
         """
@@ -233,12 +208,10 @@ class TracedField:
             entries: paths of the batch by their places in `exists`, an unsigned integer array, in place of ``rows``:
                 each counts as a transmitter's only path. None: all paths of ``rows``.
         """
+        # Which paths: those of the rows of a batch, single ones, or all.
         chains, batch, each, chosen = self.chains, len(self), self._each, entries
         if rows is not None:
-            batch = dr.width(rows)
-            slot = dr.arange(mi.UInt32, batch * each)
-            row = dr.gather(mi.UInt32, rows, slot // each)
-            chosen = row * each + slot % each
+            batch, chosen = dr.width(rows), self._entries_of(rows)
         if entries is not None:
             batch, each = dr.width(entries), 1
         if chosen is not None:
@@ -247,10 +220,20 @@ class TracedField:
         # Evaluated here so that the kernels of the reverse pass do not recompute it.
         dr.eval(paths)
         gain, length_m, departure, arrival = paths
+        # Factors of the gain that no geometry depends on: instrument, patterns, Gaussians on surfaces.
         gain = with_antennas(gain, self.receiver, parameters, arrival, departure)
         if self._weights is not None and FACTOR in parameters:
             gain = times(gain, self._weights.factor(parameters[FACTOR], chosen))
         return TracedPaths(gain, length_m, arrival, batch, each)
+
+    def _entries_of(self, rows: Any) -> Any:
+        """Places of the paths of some transmitters, place holders included, [rows * each]."""
+        slot = dr.arange(mi.UInt32, dr.width(rows) * self._each)
+        return dr.gather(mi.UInt32, rows, slot // self._each) * self._each + slot % self._each
+
+    def bounces_of(self, rows: Any | None) -> Any:
+        """Square roots of the numbers of reflections of paths of some transmitters, or with None of all."""
+        return self.bounces if rows is None else dr.gather(Float64, self.bounces, self._entries_of(rows))
 
     def _evaluated(self, chains: Chains, parameters: Mapping[str, Any]) -> EvaluatedPaths:
         """Paths with the given parameters but those of antennas and gain."""
@@ -293,7 +276,7 @@ class TracedField:
     def search(self, position_m: FloatArray) -> None:
         """Search for paths with the receiver at a position [3], world frame, metres."""
         receiver = replace(self.receiver, position_m=position_m)
-        traced = _search(self.scene, self.tx_pos_m, receiver, self.options, self._shared, self._checks)
+        traced = _search(self.tx_pos_m, receiver, self.options, self._shared, self._checks)
         self._set_paths(traced, position_m)
         self.searches += 1
 
@@ -301,14 +284,16 @@ class TracedField:
         """Lay out paths on the device, with as many entries for each transmitter as the largest number of paths."""
         surfaces, types, tx = self.surfaces, traced.paths.interactions, traced.paths.tx
         legs = traced.legs(surfaces)
-        face = (legs.reverse() if traced.from_receivers else legs).face  # from the transmitter
+        face = (legs.reverse() if traced.from_receivers else legs).face  # in the order from the transmitter
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         chains = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
+        # Weak paths cost as much as strong ones: those that hardly count are dropped before they are laid out.
         share, strong = self.options.faint, np.arange(len(tx))
         if share:
             strong = np.flatnonzero(without_faint(tx, self._amplitudes(chains), share))
         tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
+        # A rectangle of transmitters by paths, filled up with place holders: sums are then reductions of equal blocks.
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         if len(self) == 1:
             each = -(-each // SINGLE) * SINGLE
@@ -316,6 +301,7 @@ class TracedField:
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
         place[entry], present[entry] = strong, True
         self._each, self.searched_at_m = each, np.array(position_m, float)
+        # Points of interaction, which Gaussians on surfaces are near to; in the order of the entries.
         met = types != 0
         normal = surfaces.normal[np.append(surfaces.plane, 0)[face[met]]]
         self.interactions = Interactions(vertices_m[met], normal)
@@ -324,6 +310,7 @@ class TracedField:
             self.attach(self._gaussians)
         # Place holders have a transmitter, too: lengths of zero have no direction.
         sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
+        # Uncertain phases of n reflections add as squares: their root is a factor (`TracedField.bounces_of`).
         bounces = np.zeros(len(place))
         bounces[entry] = np.sqrt((types == SPECULAR).sum(axis=1))
         self.bounces = on_device(bounces, Float64)
@@ -353,7 +340,7 @@ class TracedField:
 
     def _slab(self, face: IntArray) -> IntArray:
         """Index of the material at each interaction, 0 for none (face -1)."""
-        number = np.append(self._slab_of_face, 0)[face]
+        number = np.append(self._slab_of_face, 0)[face]  # the last one stands for face -1
         if (number < 0).any():
             index = self.surfaces.object_of(face[number < 0][:1])[0]
             name = self.surfaces.names[index]
@@ -363,11 +350,11 @@ class TracedField:
 
 
 def _search(
-    scene: Any, tx_pos_m: FloatArray, receiver: Receiver, options: TracedOptions, prepared: Prepared, check: bool
+    tx_pos_m: FloatArray, receiver: Receiver, options: TracedOptions, prepared: Prepared, check: bool
 ) -> TraceResult:
     """Paths without gains, which follow from the parameters."""
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": options.tx_antenna, "check": check, "gains": False}
-    return trace_paths(scene, tx_pos_m, receiver, options.trace, **how)
+    return trace_paths(prepared.scene, tx_pos_m, receiver, options.trace, **how)
 
 
 def _needs_search(position_m: FloatArray, searched_at_m: FloatArray, frequency_hz: float) -> bool:
@@ -376,13 +363,13 @@ def _needs_search(position_m: FloatArray, searched_at_m: FloatArray, frequency_h
 
 
 def traced_fields(
-    scene: Any,
     tx_pos_m: ArrayLike,
     receiver: Receiver,
     options: TracedOptions,
     prepared: Prepared,
     tx_heading_rad: ArrayLike | None = None,
     carriers_hz: FloatArray | None = None,
+    *,
     parameters: Mapping[str, Any] | None = None,
     searched: MovedSearch | None = None,
 ) -> list[TracedField]:
@@ -403,12 +390,13 @@ def traced_fields(
     traces, fields = dict[bool, TraceResult](), list[TracedField]()
     for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
         # The stated position serves the carriers for which the receiver has not moved by a quarter of a wavelength.
-        moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(scene.frequency[0]))
+        moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(prepared.scene.frequency[0]))
         position_m = moved_to_m if moved else stated_m
         if moved not in traces:
             at = replace(receiver, position_m=position_m)
-            traces[moved] = _search(place.scene, distinct, at, options, place, check=False)
+            traces[moved] = _search(distinct, at, options, place, check=False)
         traced, yaw = traces[moved].of_transmitters(number[rows]), None if heading is None else heading[rows]
-        of_carrier = positions[rows], receiver, options, yaw, traced
-        fields.append(TracedField(scene, *of_carrier, prepared, carrier_hz, position_m, present))
+        of_carrier = prepared.scene, positions[rows], receiver, options, yaw
+        how: dict[str, Any] = {"traced": traced, "prepared": prepared, "frequency_hz": carrier_hz}
+        fields.append(TracedField(*of_carrier, **how, searched_at_m=position_m, present=present))
     return fields

@@ -153,7 +153,7 @@ class Surfaces:
         """Normals [k, 3] and offsets [k], metres, of planes (by default all) that are shifted and tilted.
 
         Shifts [k] are along the normals, metres; tilts [k, 2], rad, are about the centres towards both axes
-        (`wrf_mi.tracing.paths.plane_parameters`).
+        (`wrf_mi.tracing.paths.scene_parameters`).
         """
         # A tilt is a rotation to first order; the normal is scaled to unit length again.
         normal = self.normal[planes] + np.einsum("qa,qad->qd", tilt, self.axes[planes])

@@ -10,23 +10,23 @@ from box_room import FREQUENCY_HZ
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
-from wrf_mi.graph.combine import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.graph.evaluations import learned_field
-from wrf_mi.tracing.paths.traced_field import TracedPaths
+from wrf_mi.receivers.device_paths import TracedPaths
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
 # isort: split
 import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.backend.vectors import Pose
-from wrf_mi.core import pixel_directions, unit_vectors
+from wrf_mi.core import Paths, Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.graph.combine import magnitude, power
-from wrf_mi.graph.ports import Ports, path_sum
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
+from wrf_mi.receivers.device_paths import Ports, path_sum
+from wrf_mi.receivers.receiver_models import magnitude, power
 from wrf_mi.receivers.reports import minmax_scale, scaled
 
 Float64 = dr.float64_array_t(mi.Float)
@@ -73,6 +73,62 @@ def learned(batch: int, count: int, float_type: Any = Float64, seed: int = 3) ->
 
 def image(h: np.ndarray) -> np.ndarray:
     return h @ array_response(ELEMENTS_M, DIRECTIONS, FREQUENCY_HZ).conj().T
+
+
+TONES_HZ = (FREQUENCY_HZ, 1.02 * FREQUENCY_HZ)
+INSTRUMENTS = {
+    "spectrum": ArrayReceiver(**MODEL, instrument_scale=True),
+    "channel": CsiReceiver(6, 8, TONES_HZ),
+    "strength": PowerReceiver(6, 8, (FREQUENCY_HZ,), interference=False),
+}
+
+
+def summed(name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Sums over paths that an instrument reports: element signals, channels, or powers."""
+    if name == "spectrum":
+        return signals(arrays, ELEMENTS_M)
+    if name == "channel":
+        return np.concatenate([signals(arrays, np.zeros((1, 3)), K * hz / FREQUENCY_HZ) for hz in TONES_HZ], axis=1)
+    return (np.abs(arrays["gain"]) ** 2).sum(axis=1, keepdims=True).astype(complex)
+
+
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_an_instrument_reports_alike_of_paths_in_numpy_in_drjit_and_of_sums(name: str) -> None:
+    model, (traced, arrays) = INSTRUMENTS[name], paths()
+    size = arrays["gain"].size
+    none = np.zeros((size, 0))
+    stored = Paths(
+        tx=np.repeat([0, 1], size // 2),
+        rx=np.zeros(size, np.int64),
+        gain=arrays["gain"].ravel(),
+        length_m=arrays["length"].ravel(),
+        departure=-arrays["arrival"].reshape(-1, 3),
+        arrival=arrays["arrival"].reshape(-1, 3),
+        interactions=none.astype(np.uint8),
+        vertices_m=np.zeros((size, 0, 3)),
+        objects=none.astype(np.int32),
+        object_names=(),
+        n_tx=2,
+        n_rx=1,
+    )
+    observed = model.observed(stored, Receiver("rx", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
+    expected = np.ascontiguousarray(observed).view(float) if np.iscomplexobj(observed) else observed
+    for report in (model(traced, None).numpy(), model.signal_report(summed(name, arrays))):
+        np.testing.assert_allclose(report.reshape(2, -1), expected.reshape(2, -1), atol=ROOT)
+
+
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_slopes_of_reports_are_finite_differences(name: str) -> None:
+    """Of the second row alone, in two parts; the reports of spectra are of single precision."""
+    model, signal, step = INSTRUMENTS[name], summed(name, paths()[1]), 1e-3
+    rng = np.random.default_rng(7)
+    change = rng.normal(size=(1, signal.shape[1])) + 1j * rng.normal(size=(1, signal.shape[1]))
+    if name == "strength":
+        change = change.real.astype(complex)
+    above, below = (model.signal_report(signal[1:] + side * step * change) for side in (1, -1))
+    expected = (above - below) / (2 * step)
+    slopes = model.signal_slopes([signal[:1], signal[1:]])(change, np.array([1]))
+    np.testing.assert_allclose(slopes, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_path_sum_matches_spherical_waves() -> None:

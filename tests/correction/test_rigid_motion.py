@@ -9,7 +9,7 @@ import pytest
 from correction_rooms import CARRIER_HZ, stated_scene
 from scipy.spatial.transform import Rotation
 
-from wrf_mi.correction.frame import rigid_motion, rigid_motions
+from wrf_mi.correction.state import rigid_motion, rigid_motions
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.search.surfaces import Surfaces, scene_surfaces
 

@@ -1,4 +1,4 @@
-"""Receiver models: the combination of the traced and the learned field, and the report of the receiver.
+"""Receiver models: how a receiver combines the traced and the learned field, and what it reports.
 
 The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each side is summed
 coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
@@ -12,13 +12,18 @@ coherently; the two, T and L, then add as complex numbers (``how="coherent"``: a
 | csi | h at each antenna, on each subcarrier | the same sum, or several: coefficients of a basis | T + L |
 
 with h_m = sum over paths of g (d / d_m) exp(-j k d_m), d_m from the path's image source to element m, and w(u) the
-solid angle of a pixel. Everything is a Dr.Jit array of one float type, that of the learned side, with derivatives;
-complex numbers are pairs (re, im).
+solid angle of a pixel. A model reports in three ways:
+
+- the call, in Dr.Jit and of the float type of the learned side, with derivatives (complex numbers are pairs re, im);
+- `observed`, in NumPy and float64, of `wrf_mi.core.Paths`: the reference, and the observation of a synthetic record;
+- `signal_report` and `signal_slopes`, in NumPy, of signals that a caller has summed over paths already: trials of
+  `wrf_mi.correction.path_sum`, thousands of them with few paths changed, where a recorded call costs too much.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -29,13 +34,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.vectors import Complex
+from ..core import Paths, Receiver
 from ..core.angles import FloatArray, pixel_directions
-from ..receivers.array import steering_matrix
-from ..receivers.reports import LEAST_POWER, SQUARED_MAGNITUDE_EPS, arrives, scaled, strength_db
-from ..tracing.paths.traced_field import TracedPaths
-from .ports import ComplexMatrix, Ports, direction_weights, path_sum, weighted
+from ..core.types import IntArray
+from .array import bartlett_spectrum, steering_matrix
+from .channel import antenna_csi, csi, rssi_dbm, with_phase_errors
+from .device_paths import ComplexMatrix, Ports, TracedPaths, direction_weights, path_sum, weighted
+from .reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS, arrives, minmax_scale, scaled, strength_db
 
 How = Literal["coherent", "power"]
+ComplexArray = NDArray[np.complex128]
+Slopes = Callable[[ComplexArray, IntArray], FloatArray]
+"""Derivatives of the reports of rows ``which`` [k] by changes of their signals [k, values]."""
+CHUNK_SIZE = 64
+"""Transmitters whose spectra are observed together: float64 spectra of all would take several times the result."""
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
@@ -127,9 +139,12 @@ class ArrayReceiver(PixelReceiver):
 
     Attributes:
         instrument_scale: scale each spectrum to its own minimum and maximum, as measured ones are.
+        phase_error: standard deviation of the phase that each interaction but transmission adds, rad; spectra that are
+            `observed` are then expectations.
     """
 
     instrument_scale: bool = False
+    phase_error: float = 0.0
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Spectra [batch * height * width] of the two sides; either may be None."""
@@ -146,6 +161,50 @@ class ArrayReceiver(PixelReceiver):
         spectrum = magnitude(images[0], images[1], self.how)
         return scaled(spectrum, self.height * self.width) if self.instrument_scale else spectrum
 
+    def observed(self, paths: Paths, receiver: Receiver) -> NDArray[np.float32]:
+        """Scaled spectra [n_tx, height, width] of the paths to a receiver, 0 where no path arrives."""
+        images = np.zeros((paths.n_tx, self.height, self.width), np.float32)
+        draws = with_phase_errors(paths, self.phase_error) if self.phase_error else [paths]
+        for drawn in draws:
+            signals = antenna_csi(drawn, receiver, self.elements_m, self.frequency_hz)[0, ..., 0]
+            for start in range(0, len(signals), CHUNK_SIZE):
+                rows = slice(start, start + CHUNK_SIZE)
+                spectra = bartlett_spectrum(signals[rows], self.elements_m, self.frequency_hz, self.height, self.width)
+                images[rows] += minmax_scale(spectra) / len(draws)
+        return images
+
+    @cached_property
+    def signal_key(self) -> tuple[bytes, float]:
+        """Equal for receivers whose `signal_report` is the same function."""
+        return self.elements_m.tobytes(), float(self.frequency_hz)
+
+    def signal_report(self, signal: ComplexArray) -> FloatArray:
+        """Scaled spectra [n, pixels] of element signals [n, m], in single precision as those of the call."""
+        return np.asarray(_scaled_rows(_magnitudes(self._images(signal)))[0], float)
+
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
+        """Derivative of `signal_report` at parts of element signals [n, m], pixels that set the scale included."""
+        image = np.concatenate([np.zeros((0, self.height * self.width), np.complex64), *map(self._images, parts)])
+        spectrum = _magnitudes(image)
+        share, low, high, inverse = _scaled_rows(spectrum)
+        weight = image.conj() / spectrum  # d|z| = Re(conj(z) dz) / |z|
+
+        def slopes(change: ComplexArray, which: IntArray) -> FloatArray:
+            by_pixel = (weight[which] * self._images(change)).real
+            least, most = (np.take_along_axis(by_pixel, end[which], axis=1) for end in (low, high))
+            # Of (s - min) / (max - min), the quotient rule with share = s_scaled.
+            return np.asarray((by_pixel - least - share[which] * (most - least)) * inverse[which], float)
+
+        return slopes
+
+    @cached_property
+    def _single_steering(self) -> NDArray[np.complex64]:
+        return self._steering.values.astype(np.complex64)
+
+    def _images(self, signal: ComplexArray) -> NDArray[np.complex64]:
+        """Bartlett sums [n, pixels] of element signals [n, m] in all directions."""
+        return np.asarray(signal.astype(np.complex64) @ self._single_steering)
+
     @property
     def unscaled(self) -> ArrayReceiver:
         """The receiver without the instrument's scaling."""
@@ -156,6 +215,19 @@ class ArrayReceiver(PixelReceiver):
         if not self.instrument_scale:
             return super().missing_gain(report, observed)
         return float(-np.log(np.asarray(report).reshape(len(observed), -1).max(axis=1).mean()))
+
+
+def _magnitudes(image: NDArray[np.complex64]) -> NDArray[np.float32]:
+    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))
+
+
+def _scaled_rows(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
+    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
+    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
+    least = np.take_along_axis(spectrum, low, axis=1)
+    span = np.take_along_axis(spectrum, high, axis=1) - least
+    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+    return (spectrum - least) * inverse, low, high, inverse
 
 
 @dataclass(frozen=True)
@@ -236,6 +308,25 @@ class CsiReceiver:
         # Real and imaginary parts in turn, as a record's complex numbers are in memory.
         return dr.ravel(pair(re, im))
 
+    def observed(self, paths: Paths, receiver: Receiver) -> NDArray[Any]:
+        """Channel coefficients [n_tx, k] or [n_tx, m, k] of the paths to a receiver, 0 where no path arrives."""
+        if self.elements_m is None:
+            return np.asarray(csi(paths, self.frequencies_hz)[0])
+        return np.asarray(antenna_csi(paths, receiver, self.elements_m, self.frequencies_hz)[0])
+
+    @property
+    def signal_key(self) -> object:
+        """Equal for receivers whose `signal_report` is the same function."""
+        return CsiReceiver
+
+    def signal_report(self, signal: ComplexArray) -> FloatArray:
+        """Channels [n, 2 values] of signals [n, values], real and imaginary part in turn."""
+        return np.ascontiguousarray(signal).view(float)
+
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
+        """Derivative of `signal_report`, which is linear."""
+        return lambda change, which: np.ascontiguousarray(change).view(float)
+
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by root mean squares."""
         # Half the logarithm of a ratio of powers is that of amplitudes.
@@ -270,11 +361,30 @@ class PowerReceiver(CsiReceiver):
         of_paths, of_gaussians = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
             # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
-            power_of_paths = dr.block_reduce(dr.ReduceOp.Add, sum(part * part for part in traced.gain), traced.each)
-            mean = dr.repeat(_float_type(learned)(dr.sqrt(power_of_paths + LEAST_POWER)), count)
+            mean = dr.repeat(_float_type(learned)(dr.sqrt(traced.power + LEAST_POWER)), count)
             of_paths = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count
         return strength_db(received, self.floor, LEAST_POWER)
+
+    def observed(self, paths: Paths, receiver: Receiver) -> NDArray[Any]:
+        """Sums of the powers of paths to a receiver [n_tx], dB, NaN where no path arrives."""
+        return np.asarray(rssi_dbm(paths)[0])
+
+    @property
+    def signal_key(self) -> object:
+        """Equal for receivers whose `signal_report` is the same function."""
+        return self.floor
+
+    def signal_report(self, signal: ComplexArray) -> FloatArray:
+        """Powers in dB of sums of powers [n, 1] (complex numbers without imaginary part)."""
+        # The call adds the constant twice: under the root of the paths' power and under the logarithm.
+        return np.asarray(strength_db(signal.real + LEAST_POWER, self.floor, LEAST_POWER), float)
+
+    def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
+        """Derivative of `signal_report` at parts of sums of powers [n, 1]; 0 where the floor is reported."""
+        power = np.concatenate([np.zeros((0, 1)), *(part.real for part in parts)]) + LEAST_POWER
+        weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
+        return lambda change, which: weight[which] * change.real
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of a report, by mean powers in dB."""
