@@ -39,12 +39,9 @@ class BenchFailed(RuntimeError):
     exit_status = 1
 
 
-REFUSED = 2
-"""Exit status of bad input."""
-ENTRY_POINTS = "wrf_mi.benchmarks"
-"""Group of entry points by which other packages add checks."""
-MEASURED, STORED_CHECK = "bench.json", "check.json"
-"""Files in the folder of a finished case, and of a finished check."""
+REFUSED = 2  # exit status of bad input
+ENTRY_POINTS = "wrf_mi.benchmarks"  # group of entry points by which other packages add checks
+MEASURED, STORED_CHECK = "bench.json", "check.json"  # files in the folder of a finished case, and of a finished check
 
 
 class CheckRefused(InputError):
@@ -141,8 +138,7 @@ _OWN: Mapping[str, Check] = {
     ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
-CHECKS: Mapping[str, Check] = _CHECKS
-"""All checks by name."""
+CHECKS: Mapping[str, Check] = _CHECKS  # all checks by name
 
 
 def register(name: str, check: Check) -> None:

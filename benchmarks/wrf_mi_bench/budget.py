@@ -21,10 +21,8 @@ from wrf_mi.training.config import TrainConfig
 
 from .comparison import Row, line
 
-BEST = "WRF-GS+"
-"""Reference: the paper's network with default settings."""
-SCHEDULE = ("steps=15000",)
-"""Settings of every fit; small fields improve beyond 9,000 steps."""
+BEST = "WRF-GS+"  # reference: the paper's network with default settings
+SCHEDULE = ("steps=15000",)  # settings of every fit; small fields improve beyond 9,000 steps
 REPEATS = 100
 MOST_LOSS, LEAST_FASTER, LEAST_SMALLER = 0.01, 5.0, 10.0
 """Bounds of a small field: loss of median SSIM, and factors of speed and size."""

@@ -8,8 +8,7 @@ from pathlib import Path
 from wrf_mi.cli.output import show
 from wrf_mi.core import InputError
 
-TABLES = "tables"
-"""Name of the tables of all methods, which are neither a case nor a check."""
+TABLES = "tables"  # name of the tables of all methods, which are neither a case nor a check
 
 
 def bench_command(a: argparse.Namespace) -> int:

@@ -14,10 +14,8 @@ from wrf_mi.datasets.registry import locate
 from .bench import modules_of, provenance
 
 Row = dict[str, str]
-STORED = Path("benchmarks/results")
-"""Stored results, in a checkout."""
-MEASURED = "measured"
-"""Machine, versions and date of a stored part."""
+STORED = Path("benchmarks/results")  # stored results, in a checkout
+MEASURED = "measured"  # machine, versions and date of a stored part
 
 
 def line(what: str, value: str, asked: str = "") -> Row:

@@ -33,10 +33,8 @@ from .bench import FLAT
 from .comparison import line
 from .fault_commands import FIELD, HOME, SPECTRA, Tables, differing, prepare_data, small_plan
 
-PREDICTIONS, OPENED = 10_000, 1000
-"""Predictions of a run, and runs that are opened, in one process."""
-WARM = 10
-"""One call in so many precedes the first measurement, for kernels, caches and arenas of the allocator."""
+PREDICTIONS, OPENED = 10_000, 1000  # predictions of a run, and runs that are opened, in one process
+WARM = 10  # one call in so many precedes the first measurement, for kernels, caches and arenas of the allocator
 AT_ONCE, GROWTH_MB = 16, 3.0
 """Positions of a prediction, and growth of the resident memory. 300 results of 16 spectra of 9 x 36 are 6 MB, and an
 opened run keeps more than 100 kB; the allocator alone moves the memory by less than 1 MB."""

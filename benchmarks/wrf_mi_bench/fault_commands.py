@@ -35,14 +35,12 @@ SETTINGS: Mapping[str, tuple[str, ...]] = {
     "wrf-gs+ joint": (*FIELD, "traced.depth=1", "traced.reflections=1", "traced.rays=256"),
 }
 """Settings of short trainings by model and, after a space, ``joint`` in a scene."""
-TIMES = ("train_seconds", "trace_seconds", "ms_per_sample", "peak_memory_mb")
-"""Metrics that differ from run to run."""
+TIMES = ("train_seconds", "trace_seconds", "ms_per_sample", "peak_memory_mb")  # metrics that differ from run to run
 WHEN = (*TIMES, "date", "wall_seconds", "worker_threads")
 """Entries of a row of the tables that state when and how it was measured."""
 SPECTRA, HOME, ROOM = "spectra", "home", "room"
 """Folders of the data: spectra, signal strengths as a known data set, and a closed room around both."""
-STRENGTHS, SIDES_M = 24, (-1.0, 5.0)
-"""Number of signal strengths, and extent of the room along each axis."""
+STRENGTHS, SIDES_M = 24, (-1.0, 5.0)  # number of signal strengths, and extent of the room along each axis
 
 
 class Command(ABC):

@@ -14,8 +14,7 @@ from wrf_mi.core.digest import content_digest, files_below
 from wrf_mi.runs.folder import versions
 
 PACKAGES, COMPILED = ("wrf_mi", "wrf_mi_plugins", "wrf_mi_scenes"), "__pycache__"
-DIGITS = 16
-"""Hexadecimal digits of a key: two of a million fits share a key with a probability of 3e-8."""
+DIGITS = 16  # hexadecimal digits of a key: two of a million fits share a key with a probability of 3e-8
 
 
 def fit_key(*determining: Any) -> str:

@@ -15,8 +15,7 @@ from wrf_mi.backend import init
 STEPS_OF = {"wrf-gs": "WRF-GS", "wrf-gs+": "WRF-GS+"}
 STEP_SIZES = (270, 3000, 10_000, 30_000)
 ROWS = 32
-MOST_S, CALL_S = 3.0, 20.0
-"""Seconds of calls of a size, and expected seconds of a call beyond which a size is left out."""
+MOST_S, CALL_S = 3.0, 20.0  # seconds of calls of a size, and expected seconds of a call beyond which a size is left out
 SIZES = {
     "gaussians-splat": (1000, 10_000, 100_000, 1_000_000),
     "gaussians-integrator": (1000, 10_000, 100_000),

@@ -27,14 +27,11 @@ from unittest import mock
 from wrf_mi.core import InputError
 from wrf_mi.core.files import append_line, one_line, write_atomically
 
-HANG_S = 10.0
-"""Time after which an input counts as a hang."""
-START_S = 180.0
-"""Time for a child to start and to compile its first kernels."""
+HANG_S = 10.0  # time after which an input counts as a hang
+START_S = 180.0  # time for a child to start and to compile its first kernels
 MEMORY_BYTES = 3 << 30
 """Address space that readers may take beyond that of the process: Python raises `MemoryError` past it."""
-LARGEST_TEXT = 300
-"""Characters of a message."""
+LARGEST_TEXT = 300  # characters of a message
 STATE, RESULTS, SAMPLES = "state", "results.jsonl", "samples"
 NUMBERS = (0, -1, 1, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1)
 TEXTS = (

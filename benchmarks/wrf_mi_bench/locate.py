@@ -35,10 +35,8 @@ from .table_plan import PARTS
 from .tables import scene_of
 
 RUNS = Path("runs/bench/locate")
-STRETCH = 20
-"""Consecutive test rows that are resampled together: the robot moves 3 m in them."""
-INSIDE = (0.85, 0.95)
-"""Limits of the share of true positions inside the 90 % regions."""
+STRETCH = 20  # consecutive test rows that are resampled together: the robot moves 3 m in them
+INSIDE = (0.85, 0.95)  # limits of the share of true positions inside the 90 % regions
 ROWS = 64
 
 

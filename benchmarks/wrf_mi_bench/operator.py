@@ -30,10 +30,8 @@ from .timing import Call, interleaved, memory_mb, ratio
 from .workloads import HEIGHT, WIDTH, parameters
 
 GAUSSIANS, BATCH = 10_000, 64
-SIZE_DEG = 3.0
-"""Angular standard deviation of each Gaussian: 115 weights a pixel."""
-SMALL = 270
-"""Gaussians of the default fit."""
+SIZE_DEG = 3.0  # angular standard deviation of each Gaussian: 115 weights a pixel
+SMALL = 270  # Gaussians of the default fit
 REPEATS = 15
 
 

@@ -21,8 +21,7 @@ STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.pn
 """Stored rows, and the picture, which is written only in a checkout of the project."""
 COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("training", "s")}
 """Key, title and unit of each cost."""
-LEAST = 1e-3
-"""Smallest cost on the logarithmic axes."""
+LEAST = 1e-3  # smallest cost on the logarithmic axes
 
 Points = Mapping[str, Mapping[str, float]]
 """Score and costs of each method by name."""

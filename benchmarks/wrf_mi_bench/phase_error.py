@@ -31,15 +31,11 @@ SEEDS = range(101, 105)
 CARRIERS_HZ = 0.92e9, 2.4e9, 5.0e9
 PHASE_ERRORS_RAD = 0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.5
 RUNS = Path("runs/bench/phase-error")
-SURVEY = Survey(train=40, test=5)
-"""Rows are positions of transmitters here; no model is fitted."""
-SIZE = 45, 180
-"""Elevations and azimuths of a spectrum."""
-ELEMENTS = 4
-"""Elements along each side of the square array, half a wavelength apart."""
+SURVEY = Survey(train=40, test=5)  # rows are positions of transmitters here; no model is fitted
+SIZE = 45, 180  # elevations and azimuths of a spectrum
+ELEMENTS = 4  # elements along each side of the square array, half a wavelength apart
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
-CEILING_M = 1.8
-"""Height above which an array looks down, metres; one below looks up."""
+CEILING_M = 1.8  # height above which an array looks down, metres; one below looks up
 TRUTH = TraceOptions(transmission=True, diffraction=True, scattering=True, max_depth=3, rays=1 << 13)
 """Search for the true paths, with diffuse reflection and diffraction."""
 PREDICTION = TraceOptions(transmission=True, max_depth=3, rays=1 << 16)

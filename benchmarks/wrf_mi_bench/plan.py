@@ -18,13 +18,11 @@ from wrf_mi.scene.register import best_scale, register_walls, sample_walls
 
 from .comparison import data_folder, line
 
-NEAR_M = 0.2
-"""Distance within which walls agree: the blur of the robot's poses."""
+NEAR_M = 0.2  # distance within which walls agree: the blur of the robot's poses
 GRID_RESOLUTION_M = 0.04
 """Resolution of the SLAM map: ``size = 20, res = 0.04``, so 500 cells, in the notebook of its author
 (github.com/marckolak/graphSLAM, examples/Mapping.ipynb); registration to the layout finds the same."""
-GRID_ROW_0: Row0 = "top"
-"""Side of the map's first row; registration to the layout refuses the mirror image."""
+GRID_ROW_0: Row0 = "top"  # side of the map's first row; registration to the layout refuses the mirror image
 ASKED = "0.85 and 0.85"
 
 

@@ -47,16 +47,13 @@ from .timing import Call, Within, interleaved, ratio
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"
-WORSE = 2.0
-"""Allowed ratio of a measured to a stored ratio; machines and their load change ratios by less."""
-REPEATS, MOST_S = 15, 5.0
-"""Rounds of a pair, and seconds after which no further round begins."""
+WORSE = 2.0  # allowed ratio of a measured to a stored ratio; machines and their load change ratios by less
+REPEATS, MOST_S = 15, 5.0  # rounds of a pair, and seconds after which no further round begins
 OPTIONS = TraceOptions(rays=1 << 14)
 ONLY_STEPS = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
 """Settings of a fit of nothing but steps."""
 
-STEPS = 25
-"""Steps of a call, where the end of a run of one step would count."""
+STEPS = 25  # steps of a call, where the end of a run of one step would count
 
 
 @dataclass(frozen=True)

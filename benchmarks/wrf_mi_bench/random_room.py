@@ -31,19 +31,14 @@ from wrf_mi.tracing.tracer import RayTracer
 
 CARRIER_HZ = 2.44e9
 SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
-OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 18, seed=1)
-"""Paths of the true channels."""
+OPTIONS = TraceOptions(transmission=True, max_depth=3, rays=1 << 18, seed=1)  # paths of the true channels
 
 
-LOW_M, HIGH_M = 0.5, 2.0
-"""Bounds of the transmitters' height."""
-CLEAR_M, FROM_STATION_M = 0.1, 0.5
-"""Least distances of transmitters from surfaces and from the access point."""
+LOW_M, HIGH_M = 0.5, 2.0  # bounds of the transmitters' height
+CLEAR_M, FROM_STATION_M = 0.1, 0.5  # least distances of transmitters from surfaces and from the access point
 SNR_DB = 30.0
-POSES = 4
-"""Number of the LiDAR's positions."""
-FRAME_M, FRAME_RAD = 0.055, 0.009
-"""Length of the scan's displacement and angle of its rotation, in random directions."""
+POSES = 4  # number of the LiDAR's positions
+FRAME_M, FRAME_RAD = 0.055, 0.009  # length of the scan's displacement and angle of its rotation, in random directions
 POSE_M, POSE_RAD = 0.01, 0.001
 """Standard deviations, along and about each axis, of the errors of each position of the LiDAR."""
 
@@ -58,8 +53,7 @@ class Survey:
 
 
 DEFAULT = Survey()
-SCANNER_CLEAR_M = 0.35
-"""Least distance of the LiDAR from surfaces, metres."""
+SCANNER_CLEAR_M = 0.35  # least distance of the LiDAR from surfaces, metres
 
 
 def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) -> tuple[Record, Path, Path]:

@@ -17,8 +17,7 @@ from .fit_key import fit_key, source_files
 from .hostile_files import run_readers
 from .hostile_samples import READERS
 
-INPUTS, QUICK_INPUTS = 2000, 50
-"""Inputs of each reader."""
+INPUTS, QUICK_INPUTS = 2000, 50  # inputs of each reader
 QUICK_KILLS, TOGETHER = 3, 8
 """Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")

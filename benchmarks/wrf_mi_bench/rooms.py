@@ -41,8 +41,7 @@ MODELS: Mapping[str, tuple[str, str]] = {
 }
 """Model, and the scene that it is given or "", by the column of the table."""
 COLUMNS = (SCAN, CORRECTED, *MODELS)
-ASKED_DB = 3.0
-"""Least median gain of the corrected scene."""
+ASKED_DB = 3.0  # least median gain of the corrected scene
 
 
 def clipped_cea_db(prediction: NDArray[Any], truth: NDArray[Any], record: Record) -> float:

@@ -38,8 +38,7 @@ STEPS = 3000
 RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
 PATHS, IDW = "paths alone", "IDW"
 CURVES = (RANDOM, MESH, JOINT, PATHS)
-CALIBRATION = ("calibration=gain,materials", "transmission=true")
-"""Settings of the paths alone."""
+CALIBRATION = ("calibration=gain,materials", "transmission=true")  # settings of the paths alone
 
 
 def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:

@@ -37,14 +37,10 @@ logger = logging.getLogger(__name__)
 
 REPEATS, MOST_S = 7, 8.0
 """Timed calls of each size, and seconds after which no further call begins; three are timed in any case."""
-CALL_S = 100.0
-"""Expected seconds of a call, at growth as n^1.1, beyond which a size is skipped."""
-SLOW_MS, FEW = 4000.0, 2
-"""Milliseconds of a slow call, and timed calls of a slow one, without warm-up."""
-GAUSSIANS, ELEMENTS = 1000, 16
-"""Numbers where another size grows."""
-SMALL = 90
-"""Gaussians of the field that predicts for thousands of transmitters."""
+CALL_S = 100.0  # expected seconds of a call, at growth as n^1.1, beyond which a size is skipped
+SLOW_MS, FEW = 4000.0, 2  # milliseconds of a slow call, and timed calls of a slow one, without warm-up
+GAUSSIANS, ELEMENTS = 1000, 16  # numbers where another size grows
+SMALL = 90  # Gaussians of the field that predicts for thousands of transmitters
 OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
 
 

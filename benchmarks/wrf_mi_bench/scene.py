@@ -26,16 +26,12 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 from .comparison import line, room_file
 from .trace import ROOMS, assign
 
-SAME_DIRECTION_RAD = np.radians(3.0)
-SAME_LENGTH_M = 0.05
-"""Tolerances of equal paths: directions at both ends, and length."""
-CLEAR_M = 0.06
-"""Least distance of positions from surfaces, as a noisy wall may lie on the other side of nearer ones."""
-SCANNER_CLEAR_M = 0.4
-SCANNER_HEIGHTS_M = (1.2, 1.8)
-"""Least distance of a scanner from surfaces, and range of its height above the floor."""
-POSES = 6
-"""Number of a scan's poses."""
+SAME_DIRECTION_RAD = np.radians(3.0)  # largest difference of directions of equal paths, at both ends
+SAME_LENGTH_M = 0.05  # and of their lengths
+CLEAR_M = 0.06  # least distance of positions from surfaces, as a noisy wall may lie on the other side of nearer ones
+SCANNER_CLEAR_M = 0.4  # least distance of a scanner from surfaces
+SCANNER_HEIGHTS_M = (1.2, 1.8)  # range of its height above the floor
+POSES = 6  # number of a scan's poses
 
 
 def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, seed: int = 1) -> dict[str, Any]:

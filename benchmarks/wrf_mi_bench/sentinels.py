@@ -45,8 +45,7 @@ TABLE_ROWS = (
 )
 """Rows of the tables with all training rows and seed 0, of at most five minutes each."""
 CONFIDENCE = 0.95
-FIELDS = 5
-"""Random fields of the integrator's comparison with splatting, of the 20 that are stored."""
+FIELDS = 5  # random fields of the integrator's comparison with splatting, of the 20 that are stored
 EQUAL, BETTER, WORSE, FAILED, ABSENT = "equal", "better", "worse", "failed", "not on this machine"
 
 

@@ -20,10 +20,8 @@ from .table_plan import CORRECTED, NAMED
 
 PACKAGES = {"wrf_mi": "", "wrf_mi_bench": "benchmarks", "wrf_mi_plugins": "plugins", "wrf_mi_scenes": "scenes"}
 """Packages of this project, and their folders in a checkout."""
-SOURCE = "source"
-"""Key of the digests in a stored result."""
-DIGITS = 12
-"""Hexadecimal digits of a digest."""
+SOURCE = "source"  # key of the digests in a stored result
+DIGITS = 12  # hexadecimal digits of a digest
 COMMANDS = {
     "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
     "train": ("wrf_mi.cli.train",),
@@ -31,8 +29,7 @@ COMMANDS = {
     CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.correct"),
 }
 """Modules behind words of commands that benchmarks run in subprocesses."""
-RUNNER = f"{__package__}.bench"
-"""Lists, runs and stores benchmarks; makes no figure."""
+RUNNER = f"{__package__}.bench"  # lists, runs and stores benchmarks; makes no figure
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 

@@ -35,8 +35,7 @@ from .tables import meshed_scan, scene_of
 
 RUNS = Path("runs/bench/stages")
 LAB, CHANNELS = "laboratory", "random-room"
-CHANNELS_SEED = 12
-"""Seed of the room of `CHANNELS`: none of `wrf_mi_bench.rooms`."""
+CHANNELS_SEED = 12  # seed of the room of `CHANNELS`: none of `wrf_mi_bench.rooms`
 ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
     (RFID, "official"): (5, 15, 48, None),
     (RFID, "blocked"): (None,),
@@ -49,13 +48,10 @@ ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
 """Numbers of training rows by data set and split; None: all."""
 LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
 """Largest loss against a part that is allowed, in the unit of the score."""
-WORSE_SHARE = 0.02
-"""Largest share of comparisons in which the hybrid may be clearly worse."""
-INSIDE = (0.85, 0.95)
-"""Limits of the share of test values inside the 90 % intervals."""
+WORSE_SHARE = 0.02  # largest share of comparisons in which the hybrid may be clearly worse
+INSIDE = (0.85, 0.95)  # limits of the share of test values inside the 90 % intervals
 HYBRID, JOINT, CALIBRATED = "hybrid", "wrf-gs+", "ray-tracing, calibrated"
-TRANSMISSION = ("transmission=true",)
-"""Waves pass the slabs of a scene, furniture among them."""
+TRANSMISSION = ("transmission=true",)  # waves pass the slabs of a scene, furniture among them
 
 
 @dataclass(frozen=True)

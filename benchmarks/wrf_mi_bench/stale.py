@@ -25,10 +25,8 @@ from .quick import FILE as QUICK
 from .sources import PACKAGES, SOURCE, by_folder, modules_of_benchmark, modules_of_command, needed_files, source_digests
 from .tables import FOLDER
 
-UNKNOWN = "unknown"
-"""Source of a result that states none, outside a git repository."""
-SHOWN = 4
-"""Changed folders in a line; ``--json`` has all."""
+UNKNOWN = "unknown"  # source of a result that states none, outside a git repository
+SHOWN = 4  # changed folders in a line; ``--json`` has all
 
 
 def stale(out: Path) -> tuple[list[dict[str, Any]], int]:

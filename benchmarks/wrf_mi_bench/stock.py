@@ -26,8 +26,7 @@ from wrf_mi.gaussians.parameters import Gaussians
 
 Floats = NDArray[np.float32]
 
-DEGREE_0 = 0.28209479177387814
-"""The spherical harmonic of degree 0: a colour is this times its coefficient, plus 1/2."""
+DEGREE_0 = 0.28209479177387814  # the spherical harmonic of degree 0: a colour is this times its coefficient, plus 1/2
 
 
 @contextmanager

@@ -30,8 +30,7 @@ from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
 from .stress_traced import phases
 
-PICTURE = Path("docs/images/numerics.png")
-"""Picture of the error curves, written only in a checkout of the project."""
+PICTURE = Path("docs/images/numerics.png")  # picture of the error curves, written only in a checkout of the project
 SHORT = (
     *("steps=25", "log_every=25", "validate_every=25", "checkpoint_every=6"),
     *("initial.gaussians=12", "density.every=0", "optimiser.warm_up=0"),

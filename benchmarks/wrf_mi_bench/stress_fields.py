@@ -36,8 +36,7 @@ Family = Callable[[Rng], "Field"]
 RECEIVER = Receiver(
     "receiver", np.array([5.0, 0.25, 0.125]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
-SIZE, SMALL = (30, 60), (8, 16)
-"""Rows and columns of an image; of one with tens of thousands of layers."""
+SIZE, SMALL = (30, 60), (8, 16)  # rows and columns of an image; of one with tens of thousands of layers
 ON_THE_EDGE = 1e-3
 """Relative distance to a footprint's edge, where it jumps by 0.011, within which pixels are not compared."""
 

@@ -39,8 +39,7 @@ from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst
 from .stress_traced import box_sheets
 
 HZ = 920e6
-ROOM = (6.0, 5.0, 3.0)
-"""Size of the room in metres."""
+ROOM = (6.0, 5.0, 3.0)  # size of the room in metres
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
 ELEMENTS_M = planar_array(3, 3, 0.16)
@@ -53,12 +52,9 @@ MODELS: Mapping[str, Any] = {
 ORACLE = ReportOracle(SIZE, ELEMENTS_M, HZ)
 KINDS = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_metal")
 THICKNESS_M = {"itu_concrete": 0.3, "itu_metal": 0.1, **dict.fromkeys(KINDS[1:5], 0.02), "itu_chipboard": 0.02}
-GRAZING_M = 1e-3
-"""Height of both antennas above the floor: 4e-4 rad at 5 m."""
-LEFT = 0.01
-"""Remaining share of the traced side where the learned side cancels it."""
-MANY = 160
-"""Transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths."""
+GRAZING_M = 1e-3  # height of both antennas above the floor: 4e-4 rad at 5 m
+LEFT = 0.01  # remaining share of the traced side where the learned side cancels it
+MANY = 160  # transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths
 STEP = 1e-5
 """Step of differences of the paths in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away."""
 PLACE = Receiver(
@@ -68,8 +64,7 @@ PLACE = Receiver(
     Antenna(frame="array"),
 )
 """Receiver whose antenna turns with its array, so that reports depend on the rotation."""
-NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
-"""Two transmitters."""
+NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])  # two transmitters
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 

@@ -20,8 +20,7 @@ from .stress_rows import DOUBLE, EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, 
 UNFELT_SLOPE = UNFELT / np.sqrt(SIZE[0] * SIZE[1])
 """Floor of a derivative's norm: a thousandth of the mean absolute error's."""
 Pair = tuple[FloatArray, FloatArray]
-LARGEST = 1e15
-"""Largest pixel whose fourth power does not overflow float32."""
+LARGEST = 1e15  # largest pixel whose fourth power does not overflow float32
 
 
 def _around(rng: Rng, contrast: float, shift: float = 0.0) -> Pair:

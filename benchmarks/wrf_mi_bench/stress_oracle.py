@@ -32,8 +32,7 @@ ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
 Planes = tuple[FloatArray, FloatArray]
 """Unit normals [q, 3] and offsets [q] of planes."""
-ACROSS = 1e-6
-"""Sine of the angle to a wall's normal below which the polarisation basis is arbitrary."""
+ACROSS = 1e-6  # sine of the angle to a wall's normal below which the polarisation basis is arbitrary
 
 
 @dataclass(frozen=True)

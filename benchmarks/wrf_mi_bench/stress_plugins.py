@@ -47,8 +47,7 @@ from .stress_fields import (
 from .stress_rows import Row, Worst
 from .traced import scene_of
 
-FORWARD = 1e-3
-"""Bound on the relative difference of forward from reverse mode."""
+FORWARD = 1e-3  # bound on the relative difference of forward from reverse mode
 
 
 def plugin_images(random: int, of_each: int, many: int = 1) -> list[Row]:

@@ -20,20 +20,13 @@ import mitsuba as mi  # noqa: E402
 Row = dict[str, str]
 DOUBLE: Any = dr.float64_array_t(mi.Float)
 
-IMAGE = 1e-4
-"""Bound on the relative L2 error of float32 images and reports."""
-GRADIENT = 1e-3
-"""Bound on the relative error, in norm, of a derivative in float32."""
-EXACT = 1e-5
-"""Bound on the median relative error of a derivative in float64 against central differences."""
-PHASE = 1e-3
-"""Bound on the error of a phase, rad."""
-UNFELT = 1e-3
-"""Floor of the norm of a group's derivatives times parameters, as a share of the largest group's."""
-PLAIN = 1e-3
-"""Share of a group's largest derivative above which signs are compared."""
-NEITHER = "0 neither"
-"""Bound of the row on fits: no fit with values that are not finite and no message."""
+IMAGE = 1e-4  # bound on the relative L2 error of float32 images and reports
+GRADIENT = 1e-3  # bound on the relative error, in norm, of a derivative in float32
+EXACT = 1e-5  # bound on the median relative error of a derivative in float64 against central differences
+PHASE = 1e-3  # bound on the error of a phase, rad
+UNFELT = 1e-3  # floor of the norm of a group's derivatives times parameters, as a share of the largest group's
+PLAIN = 1e-3  # share of a group's largest derivative above which signs are compared
+NEITHER = "0 neither"  # bound of the row on fits: no fit with values that are not finite and no message
 FITS = "fits with random bad"
 
 STAGES = (

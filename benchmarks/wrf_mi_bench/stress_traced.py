@@ -19,8 +19,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from .stress_fields import RECEIVER
 from .stress_rows import PHASE, Row, Worst, row
 
-DELAY = 1e-6
-"""Bound on the relative error of Sionna RT's delays: 17 roundings of float32."""
+DELAY = 1e-6  # bound on the relative error of Sionna RT's delays: 17 roundings of float32
 HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
     (28e9, (100.0, 60.0, 12.0)),
     (915e6, (10_000.0, 4_000.0, 300.0)),

@@ -61,8 +61,7 @@ OVERVIEWS = {
     "uplink": "downlink channels from the uplink",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
-IN_README = ("spectrum", "rssi", "uplink")
-"""Overviews that the project's README shows."""
+IN_README = ("spectrum", "rssi", "uplink")  # overviews that the project's README shows
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
     "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "
@@ -76,8 +75,7 @@ NOTE = (
     "with as many threads as `worker_threads` says there, or else all: read ratios. Rows with † are of a data set of "
     "this package as an earlier recipe made it; `wrf-mi bench tables` measures them anew."
 )
-FORMER = "†"
-"""Mark of rows that were measured on other data than the newest rows of their part."""
+FORMER = "†"  # mark of rows that were measured on other data than the newest rows of their part
 
 
 Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]

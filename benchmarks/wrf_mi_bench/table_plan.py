@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from wrf_mi.datasets.registry import locate
 
-MADE_HERE = "traced-"
-"""Names of data sets that this package makes begin with it."""
+MADE_HERE = "traced-"  # names of data sets that this package makes begin with it
 SEEDS = (0, 1, 2)
 ONE = SEEDS[:1]
 SHARES = (1.0, 0.3, 0.1)
@@ -47,16 +46,13 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
 NAMED, CORRECTED = "{scene}", "{corrected}"
 """Arguments that are replaced by the arguments of a scene, as stated and corrected by the row's training rows."""
 THROUGH_WALLS = ("--paths", "line-of-sight,reflection,transmission")
-IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")
-"""Transmission through walls of two surfaces each."""
-CALIBRATED = ("--calibrate", "gain,patterns")
-"""Calibration of uncalibrated strengths."""
+IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")  # transmission through walls of two surfaces each
+CALIBRATED = ("--calibrate", "gain,patterns")  # calibration of uncalibrated strengths
 ON_A_FLOOR = (*THROUGH_WALLS, "--depth", "5", "--reflections", "3")
 """Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
 """Schedules of the small version: networks, and networks with slow steps."""
-SHORT = _set("steps=400", "validate_every=200")
-"""Schedule of fields of Gaussians in the small version."""
+SHORT = _set("steps=400", "validate_every=200")  # schedule of fields of Gaussians in the small version
 SPECTRUM: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
@@ -149,8 +145,7 @@ NEW_RECEIVERS: Mapping[str, Entry] = {
 }
 CHEAP = ("ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
-FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")
-"""Methods measured with fewer rows too."""
+FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")  # methods measured with fewer rows too
 
 
 @dataclass(frozen=True)

@@ -43,14 +43,10 @@ from .sources import modules_of_command, source_digests
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
 
-FOLDER = "tables"
-"""Folder of the rows; ``tables-quick`` for the small version."""
-QUANTILES = 101
-"""Number of equally spaced quantiles of a row's scores."""
-FLAT_HEIGHT_M = 2.7
-"""Height of the ceiling of the flat, which its layout lacks."""
-FAR_M, PLATE_M = 100.0, 0.01
-"""Distance and size of the only surface of the open scene; Sionna RT needs one."""
+FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
+QUANTILES = 101  # number of equally spaced quantiles of a row's scores
+FLAT_HEIGHT_M = 2.7  # height of the ceiling of the flat, which its layout lacks
+FAR_M, PLATE_M = 100.0, 0.01  # distance and size of the only surface of the open scene; Sionna RT needs one
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 

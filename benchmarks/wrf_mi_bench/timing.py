@@ -34,8 +34,7 @@ import drjit as dr  # noqa: E402
 
 Call = Callable[[], Any]
 
-REPEATS, WARM_UP = 15, 2
-"""Timed calls, and calls before them: the first compiles, the second still fills caches."""
+REPEATS, WARM_UP = 15, 2  # timed calls, and calls before them: the first compiles, the second still fills caches
 RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 LOOK_EVERY_S = 1e-3
 

@@ -28,15 +28,11 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 from .comparison import line, room_file
 
 ROOMS = ("conference", "office")
-SAME_LENGTH_M = 1e-3
-SAME_POINT_M = 1e-2
-"""Tolerances of equal paths: length, and last interaction point."""
-ON_SURFACE_M = 1e-4
-"""Distance from a path's points within which a crossing is the reflection itself."""
-MIRRORED = 1e-5
-"""Tolerance of the cosine between bisector and normal of a reflection."""
-SHORTEST_M = 1e-2
-"""Least length of a segment in Sionna RT."""
+SAME_LENGTH_M = 1e-3  # largest difference of the lengths of equal paths
+SAME_POINT_M = 1e-2  # and of their last interaction points
+ON_SURFACE_M = 1e-4  # distance from a path's points within which a crossing is the reflection itself
+MIRRORED = 1e-5  # tolerance of the cosine between bisector and normal of a reflection
+SHORTEST_M = 1e-2  # least length of a segment in Sionna RT
 
 
 def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, Any]:

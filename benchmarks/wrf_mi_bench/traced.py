@@ -30,8 +30,7 @@ LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02
 """Bounds for small Gaussians: SSIM of magnitudes, relative L2 error of complex values."""
 DISTANCE_M = (2.0, 8.0)
 
-SMALL_DEG = 2.0
-"""Largest angular standard deviation of Gaussians whose projection is close to exact."""
+SMALL_DEG = 2.0  # largest angular standard deviation of Gaussians whose projection is close to exact
 
 Image = NDArray[np.complex128]
 

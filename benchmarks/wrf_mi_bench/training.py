@@ -37,20 +37,16 @@ from .timing import interleaved, seconds
 
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "kriging": "kriging"}
-ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Bounds on time and memory of kriging and of WRF-GS+, on two cores."""
+ASKED_S, ASKED_MB = 180, 2 * 1024  # bounds on time and memory of kriging and of WRF-GS+, on two cores
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
-STEPS, ROUNDS = 10, 9
-"""Steps of one timed call, and calls."""
+STEPS, ROUNDS = 10, 9  # steps of one timed call, and calls
 PRODUCT_SIZE = 1536
-STREAM_FLOATS = 1 << 26
-"""An array of 256 MB, which no cache holds."""
+STREAM_FLOATS = 1 << 26  # an array of 256 MB, which no cache holds
 FORWARD, BACKWARD = 28, 63
 """Operations of a pixel and a Gaussian on its tile's list, counted in `wrf_mi.gaussians.blend` (alpha blending): a
 multiply-add is two, a root, an exponential or a reciprocal one."""
-SHARED_FORWARD, SHARED_BACKWARD = 4, 8
-"""Operations of a further transmitter with the same geometry."""
+SHARED_FORWARD, SHARED_BACKWARD = 4, 8  # operations of a further transmitter with the same geometry
 QUIET = ("density.every=0", "log_every=1000000", "validate_every=1000000", "checkpoint_every=1000000")
 
 

@@ -36,13 +36,11 @@ from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
 
 RUNS = Path("runs/bench/unmeasured")
-LEFT = (0, 5, 20, 100)
-"""Numbers of rows at each receiver that is held out."""
+LEFT = (0, 5, 20, 100)  # numbers of rows at each receiver that is held out
 HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected scene"
 KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
 OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
-SCORE_DIGITS = 4
-"""Decimals of stored scores: finer than any difference that is reported."""
+SCORE_DIGITS = 4  # decimals of stored scores: finer than any difference that is reported
 PAIRS = "pairs"
 FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 """What is known of a measurement beside the scores of the methods."""

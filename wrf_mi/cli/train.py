@@ -27,8 +27,7 @@ from .output import Watch, show, show_metrics
 HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
-BESIDE_RESUME = ("resume", "json", "help_settings", "call")
-"""Arguments that ``--resume`` does not refuse."""
+BESIDE_RESUME = ("resume", "json", "help_settings", "call")  # arguments that ``--resume`` does not refuse
 
 
 def add_parser(commands: Any) -> None:

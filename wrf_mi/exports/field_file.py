@@ -17,11 +17,9 @@ from .format import ExportOptions
 from .gaussians import field_of
 from .source import Source
 
-FORMAT = 1
-"""Version of the file."""
+FORMAT = 1  # version of the file
 VERSION, SPLIT_ARRAYS, FITTED_ARRAYS = "export/format", "split/", "run/"
-TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}
-"""Keys of the texts of a run folder's files."""
+TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}  # keys of the texts of a run folder's files
 
 
 def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:

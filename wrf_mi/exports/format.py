@@ -10,8 +10,7 @@ from typing import Any
 from ..core import InputError
 from ..core.angles import FloatArray
 
-RUN, SCENE, DATASET = "run", "scene", "data set"
-"""Kinds of sources."""
+RUN, SCENE, DATASET = "run", "scene", "data set"  # kinds of sources
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ logger = logging.getLogger(__name__)
 LETTERS = {1: "R", 2: "S", 4: "T", 8: "D"}
 """Letters of the kinds of interaction: reflection, scattering, transmission, diffraction."""
 ANGLES = ("azimuth", "elevation")
-SEPARATOR = ";"
-"""Between the interactions, vertices and objects of a path."""
+SEPARATOR = ";"  # between the interactions, vertices and objects of a path
 
 
 def path_columns(traced: TraceResult) -> dict[str, Any]:

@@ -17,12 +17,9 @@ from ..core.angles import FloatArray
 from ..runs.results import read_run
 from ..tasks import TASKS
 
-BINS = 10
-"""Number of bins of the predicted probability."""
-QUANTILES = np.linspace(0.1, 0.9, 9)
-"""Quantiles of the measured levels that are thresholds where none is stated."""
-FEWEST = 20
-"""Least number of pairs in a bin that is drawn."""
+BINS = 10  # number of bins of the predicted probability
+QUANTILES = np.linspace(0.1, 0.9, 9)  # quantiles of the measured levels that are thresholds where none is stated
+FEWEST = 20  # least number of pairs in a bin that is drawn
 
 
 def coverage_probability(level_db: ArrayLike, std_db: ArrayLike, threshold_db: float) -> FloatArray:

@@ -33,8 +33,7 @@ VARIABLES = {
 """Variables of each receiver and position, in the order of a file: unit in the notation of UDUNITS, but for powers in
 decibels, which name theirs as CF does, and description. A map has those that its model states.
 """
-LEVELS = (POWER, "traced_share", "learned_share")
-"""Variables in the unit of the task's level."""
+LEVELS = (POWER, "traced_share", "learned_share")  # variables in the unit of the task's level
 NETCDF, ZARR, CSV = ".nc", ".zarr", ".csv"
 # h5netcdf is imported without the h5py that it needs to open a file.
 PACKAGES = {NETCDF: ("xarray", "h5netcdf", "h5py"), ZARR: ("xarray", "zarr"), CSV: ("xarray", "pandas")}

@@ -23,17 +23,12 @@ from ..scene.mesh.files import mesh_parts
 
 logger = logging.getLogger(__name__)
 
-LARGEST = 10_000_000
-"""Largest number of positions of a grid: 240 MB of coordinates."""
-MARGIN_M = 0.5
-"""Margin around transmitter positions where no scene states the area."""
-ROUNDS = 20
-"""Largest number of times that an edge is halved: a kilometre into millimetres."""
-MOUNTED_M = 0.02
-"""Distance from a surface up to which a receiver is taken to lie before it."""
+LARGEST = 10_000_000  # largest number of positions of a grid: 240 MB of coordinates
+MARGIN_M = 0.5  # margin around transmitter positions where no scene states the area
+ROUNDS = 20  # largest number of times that an edge is halved: a kilometre into millimetres
+MOUNTED_M = 0.02  # distance from a surface up to which a receiver is taken to lie before it
 
-CANDIDATE_STEP_M = 0.25
-"""Least distance of neighbouring candidates by default."""
+CANDIDATE_STEP_M = 0.25  # least distance of neighbouring candidates by default
 USUAL_CANDIDATES, MOST_CANDIDATES = 4000, 10_000
 """Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between
 all of them take 0.8 GB.

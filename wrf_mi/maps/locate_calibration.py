@@ -43,16 +43,11 @@ logger = logging.getLogger(__name__)
 
 DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
 """Forms of the likelihood to choose from."""
-WIDE = 0.95
-"""Probability of the quantile by which the widths of distributions are compared."""
-MOST_ROWS = 300
-"""Most held-out rows that are located."""
-LEVEL = 0.9
-"""Probability of a region by default, and of those whose held-out coverage is stated."""
-FOLDS = 3
-"""Hold-outs with other seeds: one alone has few positions, near each other."""
-FOLDER, FILE = "locate", "locate.json"
-"""Folder of finished folds in the run folder, and file of the choice."""
+WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
+MOST_ROWS = 300  # most held-out rows that are located
+LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
+FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
+FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,8 @@ from .locate import Positions
 from .locate_file import posterior_arrays
 from .picture import scene_cuts
 
-SHOWN, COLUMNS = 6, 3
-"""Number of rows that are drawn, and panels side by side."""
-MARGIN_M = 0.5
-"""Margin of a panel around the candidates."""
+SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
+MARGIN_M = 0.5  # margin of a panel around the candidates
 REGION, ESTIMATE, NEIGHBOURS, TRUTH = "tab:orange", "tab:red", "tab:purple", "black"
 
 

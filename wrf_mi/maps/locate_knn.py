@@ -15,8 +15,7 @@ from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 
-COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
-"""Numbers of neighbours to choose from."""
+COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)  # numbers of neighbours to choose from
 METRICS = ("euclidean", "nan_euclidean")
 """Distances: a receiver without a value has its weakest training value, or is left out and the others are scaled up."""
 

@@ -21,8 +21,7 @@ from scipy.special import gammaln, log_expit, logsumexp
 
 from ..core.angles import FloatArray
 
-OFFSET_NODES = 7
-"""Nodes of the quadrature over the common offset."""
+OFFSET_NODES = 7  # nodes of the quadrature over the common offset
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,8 @@ from .grid import outside_solids
 
 CHUNK_SIZE = 10_000
 """Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
-CHUNK_BYTES = 1 << 28
-"""Bytes of a chunk's observations, with the copies that models make of them."""
-VALUE_BYTES = 32
-"""Of each value of an observation: mean and standard deviation in float64, and a copy of each."""
+CHUNK_BYTES = 1 << 28  # bytes of a chunk's observations, with the copies that models make of them
+VALUE_BYTES = 32  # of each value of an observation: mean and standard deviation in float64, and a copy of each
 HEADINGS = 8
 """Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
 

@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from .worker import given_up, worker_threads
 
 POLL_S = 0.5
-GRACE_S = 30.0
-"""Time for a child that is stopped to finish its step and write a checkpoint."""
+GRACE_S = 30.0  # time for a child that is stopped to finish its step and write a checkpoint
 
 
 def run_module(

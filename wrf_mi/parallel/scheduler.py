@@ -18,13 +18,10 @@ from ..core.files import one_line
 from .threads import processors
 from .worker import run_part, worker_environment
 
-CONNECT_S = 10.0
-"""Time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds."""
+CONNECT_S = 10.0  # time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds
 POLL_S = 1.0
-PARTS_EACH = 8
-"""Parts for each worker: a slow or late worker leaves the others at most an eighth of its share."""
-LINES = 10
-"""Lines of progress in all where standard error is a file."""
+PARTS_EACH = 8  # parts for each worker: a slow or late worker leaves the others at most an eighth of its share
+LINES = 10  # lines of progress in all where standard error is a file
 
 
 class SchedulerFailed(RuntimeError):

@@ -16,8 +16,7 @@ from ..backend import choose, init
 from ..backend.probe import installed_version
 from ..core import InputError
 
-VARIABLES = "WRF_MI_"
-"""Environment variables with this beginning are set in workers as they are in the client."""
+VARIABLES = "WRF_MI_"  # environment variables with this beginning are set in workers as they are in the client
 THREADS = "OMP_NUM_THREADS"
 """Number of threads of Dr.Jit in a worker. Dask sets it to 1 unless it is set where the worker is started."""
 PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")

@@ -32,10 +32,8 @@ from .repeat import changed_settings, command, known_config, model_words, stored
 from .results import Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
-CONSTANT = ("dataset", "metric")
-"""Columns that are equal in a section, whose heading states them."""
-FIRST = ("run", "median", "mean", "common_mean")
-"""Columns that narrow screens show without scrolling."""
+CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
+FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
 
 
 @dataclass(frozen=True)

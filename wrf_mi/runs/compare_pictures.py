@@ -18,8 +18,7 @@ from .folder import FITTED
 from .results import Results
 from .scene_view import scene_view
 
-QUANTILES = (0.1, 0.5, 0.9)
-"""Quantiles of the first run's score at which spectra of test rows are shown."""
+QUANTILES = (0.1, 0.5, 0.9)  # quantiles of the first run's score at which spectra of test rows are shown
 
 Picture = tuple[str, str, Figure]
 """File name, heading, figure."""

@@ -47,8 +47,7 @@ DIFFERENCES = {
 }
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
-FEWEST = 2
-"""Least number of common rows of a difference with an interval."""
+FEWEST = 2  # least number of common rows of a difference with an interval
 
 
 @dataclass(frozen=True)

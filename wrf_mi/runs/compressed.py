@@ -26,12 +26,9 @@ from .api import evaluate_run, open_run
 from .evaluate import stored_metrics
 from .folder import FITTED, SPLIT, check_new, load_rows, read_fitted, write_config, write_fitted
 
-COMPRESSION = "compression.json"
-"""File of settings, source and results of a compression."""
-REPEATS = 60
-"""Number of interleaved pairs of spectra that are timed."""
-WARM_UP = 2
-"""Pairs before them: the first call compiles, the second still fills caches."""
+COMPRESSION = "compression.json"  # file of settings, source and results of a compression
+REPEATS = 60  # number of interleaved pairs of spectra that are timed
+WARM_UP = 2  # pairs before them: the first call compiles, the second still fills caches
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:

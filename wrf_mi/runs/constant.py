@@ -12,8 +12,7 @@ from ..core.angles import FloatArray
 from ..tasks import TASKS, Task
 from ..tasks.scores import summary
 
-CONSTANT = "constant"
-"""Key of the block in ``metrics.json``."""
+CONSTANT = "constant"  # key of the block in ``metrics.json``
 SCORES = "constant_score"
 """Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
 

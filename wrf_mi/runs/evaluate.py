@@ -41,14 +41,10 @@ NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
-SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
-"""Arrays of ``predictions.npz`` without an axis of receivers."""
-REPEATS = 20
-"""Largest number of single predictions that are timed."""
-MOST_OF_STAGES = 400
-"""Test rows by which the stages of a fit are scored."""
-TIMED_S = 2.0
-"""Time after which no further single prediction is begun: some models optimise for each sample."""
+SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")  # arrays of ``predictions.npz`` without an axis of receivers
+REPEATS = 20  # largest number of single predictions that are timed
+MOST_OF_STAGES = 400  # test rows by which the stages of a fit are scored
+TIMED_S = 2.0  # time after which no further single prediction is begun: some models optimise for each sample
 
 
 class Part(NamedTuple):

@@ -22,16 +22,11 @@ from ..models.hybrid.scene_side import STAGES
 if TYPE_CHECKING:
     from ..gaussians.footprint import Footprints
 
-PANEL_IN = 2.3
-"""Side of a polar plot in inches."""
-OUTLINE_POINTS = 64
-"""Corners of the polygon of a footprint's outline."""
-COLOURS = 10
-"""Number of colours in Matplotlib's cycle."""
-POINTS_AREA = 4000.0
-"""Area of all points of a map together, points squared: few positions are drawn larger."""
-MARKERS = "os^D"
-"""Markers of points, where colours repeat."""
+PANEL_IN = 2.3  # side of a polar plot in inches
+OUTLINE_POINTS = 64  # corners of the polygon of a footprint's outline
+COLOURS = 10  # number of colours in Matplotlib's cycle
+POINTS_AREA = 4000.0  # area of all points of a map together, points squared: few positions are drawn larger
+MARKERS = "os^D"  # markers of points, where colours repeat
 TAIL = 0.01
 """Fraction of each curve that may lie beyond either end of the axis, so that outliers do not compress the rest."""
 

@@ -44,11 +44,9 @@ from ..tasks import TASKS
 from ..training.fit_plan import check_rows
 from ..version import __version__
 
-FORMAT = 4
-"""Version of ``config.yaml`` and ``model.npz``."""
+FORMAT = 4  # version of ``config.yaml`` and ``model.npz``
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
-VERSION, SECONDS = "run/format", "run/train_seconds"
-"""Keys of ``model.npz`` beside the model's arrays."""
+VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,9 @@ from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
 
 NPZ, CSV = ".npz", ".csv"
-HEADING = "heading_rad"
-"""Column or array of headings."""
-POSITIONS, UPLINK = "tx_pos", "uplink"
-"""Arrays of positions and of uplink channels."""
-SPOOLED_BYTES = 1 << 26
-"""Size from which predictions are collected on the disk."""
+HEADING = "heading_rad"  # column or array of headings
+POSITIONS, UPLINK = "tx_pos", "uplink"  # arrays of positions and of uplink channels
+SPOOLED_BYTES = 1 << 26  # size from which predictions are collected on the disk
 
 
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:

@@ -35,8 +35,7 @@ WORDS = {
     "optml": "paths fitted to the uplink, started by a network",
 }
 """Models for readers of a page; others, of installed packages, are named by their source."""
-GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")
-"""Settings that are options of ``train``."""
+GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # settings that are options of ``train``
 
 
 def known_config(folder: Path) -> RunConfig | None:

@@ -29,8 +29,7 @@ from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, spooled, write_prediction_file
 
-PREDICTED_PER_CHUNK = 256
-"""Positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver."""
+PREDICTED_PER_CHUNK = 256  # positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver
 MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
 """Largest number of positions of small observations at a time, and bytes of their observations."""
 

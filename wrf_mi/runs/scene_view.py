@@ -18,10 +18,8 @@ from ..tracing import load_trace
 from ..tracing.search.surfaces import scene_surfaces
 from .api import open_run
 
-SHOWN_GAUSSIANS = 40
-"""Number of Gaussians shown, the strongest."""
-WEAKEST = 1e-6
-"""Lower limit of drawn signals: -120 dB."""
+SHOWN_GAUSSIANS = 40  # number of Gaussians shown, the strongest
+WEAKEST = 1e-6  # lower limit of drawn signals: -120 dB
 
 
 def scene_view(traced: str | Path, row: int, field: str | Path | None = None) -> Figure:

@@ -18,14 +18,11 @@ from ..parallel import run_module
 from .content import MapContent
 
 NETCDF, ZARR = (".nc", ".nc4", ".netcdf"), ".zarr"
-MAP_NUMBERS = 900_000
-"""Values of all maps of a page, at most: 2.4 MB."""
-RECEIVER, POINT = "receiver", "point"
-"""Dimensions of receivers and of the points of a surface."""
+MAP_NUMBERS = 900_000  # values of all maps of a page, at most: 2.4 MB
+RECEIVER, POINT = "receiver", "point"  # dimensions of receivers and of the points of a surface
 FACTS, VALUES = "facts", "value/"
 """Key of all but the arrays of a map that a child process has read, and prefix of the keys of its values."""
-MOST_S = 600.0
-"""Time of that process, which limits its processor time by the size of the file."""
+MOST_S = 600.0  # time of the child process, which limits its processor time by the size of the file
 
 
 def is_map(path: Path) -> bool:

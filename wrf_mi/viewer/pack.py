@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-LARGEST = 65534
-"""Number of steps of a range."""
-MISSING = 65535
-"""Code of a value that is not finite."""
+LARGEST = 65534  # number of steps of a range
+MISSING = 65535  # code of a value that is not finite
 SMALLEST_RANGE = 1e-300
 """Range below which numbers are packed as equal: the steps of a smaller one have few digits or underflow."""
 

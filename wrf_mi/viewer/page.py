@@ -20,10 +20,8 @@ from ..scene.preview import ENDS, SPAN_DB
 from .content import MapContent, ViewContent
 from .pack import plain
 
-SCALES = {"strength": "viridis", "gain": "plasma", "error": "YlOrRd", "map": "turbo"}
-"""Colour map of each quantity."""
-STOPS = 12
-"""Colours of a scale, between which the page interpolates."""
+SCALES = {"strength": "viridis", "gain": "plasma", "error": "YlOrRd", "map": "turbo"}  # colour map of each quantity
+STOPS = 12  # colours of a scale, between which the page interpolates
 MATERIALS = {
     "concrete": "#9aa0a6",
     "brick": "#b5603f",

@@ -25,12 +25,9 @@ from ..tracing import TraceOptions, TraceResult, load_trace, open_scene, trace_p
 from .content import GaussiansContent, PathsContent, RowsContent, ViewOptions
 from .pack import packed
 
-IMAGE_BYTES = 4_000_000
-"""Bytes of a page for observations that are images, at most."""
-PATH_NUMBERS = 1_000_000
-"""Coordinates of all paths of a page, at most: 2.7 MB."""
-WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9
-"""Limits before logarithms."""
+IMAGE_BYTES = 4_000_000  # bytes of a page for observations that are images, at most
+PATH_NUMBERS = 1_000_000  # coordinates of all paths of a page, at most: 2.7 MB
+WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9  # limits before logarithms
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
 OnStage = Callable[[str, float], None]

@@ -17,13 +17,11 @@ from ..tracing import open_scene
 from ..tracing.sionna.scenes import MESHES
 from .content import MaterialMesh, SceneContent
 
-MOST_TRIANGLES = 100_000
-"""Triangles of a page, the largest: 2.4 MB."""
+MOST_TRIANGLES = 100_000  # triangles of a page, the largest: 2.4 MB
 MOST_EDGES = 20_000
 OPENED_HZ = 3.5e9
 """Carrier at which a scene without data is opened; materials are shown by name, so that it has no influence."""
-NO_MATERIAL, ANY_MATERIAL = "no material", "concrete"
-"""Label of a bare mesh, and the material that it is opened with."""
+NO_MATERIAL, ANY_MATERIAL = "no material", "concrete"  # label of a bare mesh, and the material that it is opened with
 
 
 def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:

@@ -29,10 +29,8 @@ from .scene_layer import read_scene, scene_content, surfaces_in
 Source = str | Path | Run | Any
 """A run, its folder, a scene by name, folder or file, a ``sionna.rt.Scene``, a map file or an ``xarray.Dataset``."""
 
-LARGEST_BYTES = 15_000_000
-"""Largest size of a page."""
-FRAME_HEIGHT_PX = 640
-"""Height of a view in a notebook."""
+LARGEST_BYTES = 15_000_000  # largest size of a page
+FRAME_HEIGHT_PX = 640  # height of a view in a notebook
 
 
 @dataclass(frozen=True)
