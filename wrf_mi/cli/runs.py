@@ -74,16 +74,14 @@ def _add_predict(commands: Any) -> None:
 def predict_command(a: Arguments) -> int:
     """Write predictions to a file."""
     from ..parallel import open_scheduler
-    from ..runs.api import predict_to_file
     from ..runs.prediction_file import read_inputs
+    from ..runs.run import open_run
 
     check_operator(a)
     inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
-        positions = (inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
-        workers = scheduler if a.scheduler else None
-        given: dict[str, Any] = {"uplink": inputs.uplink, "carriers_hz": inputs.carriers_hz}
-        shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
+        run = open_run(a.run, operator=not a.no_operator)
+        shapes = run.predict_to_file(inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
     return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
 

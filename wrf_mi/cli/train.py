@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..backend import init
 from ..core import AntennaOptions, InputError
@@ -23,6 +23,9 @@ from .options import (
     add_training,
 )
 from .output import Watch, show, show_metrics
+
+if TYPE_CHECKING:
+    from ..runs.folder import RunRequest
 
 HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
@@ -63,12 +66,12 @@ def train_command(a: Arguments) -> int:
 
 def run_training(a: Arguments, **more: Any) -> int:
     """Call `wrf_mi.train` with the arguments of the command line and ``more``, and print the scores."""
-    arguments = training_arguments(a)
+    request = training_request(a)
     from ..runs.api import train
 
     with Watch(resumable=True) as watch:
-        progress: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop}
-        run = train(a.dataset, a.out, **arguments, **progress, **more, progress=sys.stderr.isatty())
+        session: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop, **more}
+        run = train(a.dataset, a.out, **vars(request), **session, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
 
@@ -90,12 +93,14 @@ def _is_deterministic(folder: Path) -> bool:
         return False  # `read_config` reports the error
 
 
-def training_arguments(a: Arguments) -> dict[str, Any]:
-    """Arguments of `wrf_mi.train` except data set and folder.
+def training_request(a: Arguments) -> RunRequest:
+    """What the arguments of the command line ask to fit.
 
     Raises:
         InputError: options that do not belong together.
     """
+    from ..runs.folder import RunRequest
+
     model = a.model or HYBRID
     settings = [*a.set]
     if getattr(a, "stages", None) is not None or getattr(a, "fast", False):  # trace has neither
@@ -108,16 +113,15 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
         )
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
-    return {
-        **{name: getattr(a, name) for name in ("scene", "material", "receiver", "evaluation", "n_train")},
-        "model": model,
-        "settings": settings,
-        "deterministic": a.deterministic,
-        "intervals": a.intervals,
-        "antennas": AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
-        "split": "official" if a.split is None else a.split,
-        "seed": a.seed or 0,
-    }
+    names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
+    return RunRequest(
+        model,
+        settings=settings,
+        antennas=AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
+        split="official" if a.split is None else a.split,
+        seed=a.seed or 0,
+        **{name: getattr(a, name) for name in names},
+    )
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
@@ -205,7 +209,7 @@ def trace_command(a: Arguments) -> int:
     """Predict by ray tracing alone."""
     from ..parallel import open_scheduler
 
-    training_arguments(a)  # refused before workers start
+    training_request(a)  # refused before workers start
     if a.calibrate is not None and a.scheduler is not None:
         raise InputError("trace: --calibrate trains in one process; omit --scheduler")
     if a.deepmimo is not None:
@@ -262,7 +266,7 @@ def sweep_command(a: Arguments) -> int:
         single = parser.parse_args([*run.arguments, "--out", str(run.folder)])
         if not single.dataset:
             raise InputError("sweep needs DATASET")
-        check_run(single.dataset, training_arguments(single))
+        check_run(single.dataset, training_request(single))
     with open_scheduler(a.scheduler) as scheduler:
         rows = run_sweep(sweep, scheduler)
     show(a.json, rows, f"{sweep_table(rows, sweep.varied)}\nresults: {a.out}")

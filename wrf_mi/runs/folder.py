@@ -17,7 +17,7 @@ import importlib.metadata
 import json
 import platform
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -29,6 +29,7 @@ import yaml
 
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
+from ..core.antenna import AS_STATED
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import LEFTOVER, readable, write_atomically
 from ..core.locks import LOCK, locked_folder
@@ -47,6 +48,29 @@ from ..version import __version__
 FORMAT = 4  # version of ``config.yaml`` and ``model.npz``
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
+
+
+Settings = Iterable[str] | object
+"""``key=value`` of the model's settings, or all settings as its dataclass."""
+GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # arguments of `train` that may be settings, too
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What is fitted to a data set: arguments of `wrf_mi.train`, which describes them."""
+
+    model: str = "hybrid"
+    scene: str | Path | None = None
+    material: str | None = None
+    antennas: AntennaOptions = AS_STATED
+    receiver: str | None = None
+    evaluation: str | None = None
+    split: str | Split = "official"
+    n_train: int | float | None = None
+    seed: int = 0
+    settings: Settings = ()
+    deterministic: bool = False
+    intervals: bool = False
 
 
 @dataclass(frozen=True)

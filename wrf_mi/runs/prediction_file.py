@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError
-from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_csv
@@ -136,31 +136,38 @@ def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArra
         return np.memmap(file, kind, "w+", shape=shape)
 
 
-def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: FloatArray | None) -> dict[str, Any]:
+def write_prediction_file(
+    out: Path, inputs: Inputs, receivers: Sequence[str], observations: dict[str, NDArray[Any]]
+) -> dict[str, Any]:
     """Write predictions in the format of the suffix.
 
     Args:
         out: ``.npz``: as `wrf_mi.runs.evaluate.write_predictions`. ``.csv``: one row for each position with columns
             ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each
             receiver and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
-        arrays: ``row``, ``tx_pos``, ``receiver_name`` and optionally ``frequency_hz``; ``prediction`` and optionally
-            ``std``, with a first axis of the receivers.
-        tx_heading_rad: yaw of each transmitter, [m], or None.
+        inputs: what was predicted from.
+        receivers: names of the receivers.
+        observations: ``prediction`` and optionally ``std``, with a first axis of the receivers.
 
     Returns:
         The arrays as an ``.npz`` file has them.
     """
+    arrays: dict[str, Any] = {
+        "row": np.arange(len(inputs)),
+        "tx_pos": inputs.tx_pos_m,
+        "receiver_name": np.asarray(receivers),
+    }
+    if inputs.carriers_hz is not None:
+        arrays[FREQUENCY] = inputs.carriers_hz
     if out.suffix.lower() == NPZ:
-        return write_predictions(out, arrays)
+        return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
-    columns: list[tuple[str, Any]] = list(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True))
-    for name, values in ((HEADING, tx_heading_rad), (FREQUENCY, arrays.get(FREQUENCY))):
-        if values is not None:
-            columns.append((name, np.asarray(values, float)))
+    columns: list[tuple[str, Any]] = list(zip("xyz", inputs.tx_pos_m.T, strict=True))
+    for name, values in ((HEADING, inputs.tx_heading_rad), (FREQUENCY, inputs.carriers_hz)):
+        columns += [] if values is None else [(name, values)]
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
-        if key in arrays:
-            columns += [(f"{name}_{suffix}", v) for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)]
-    names, values = zip(*columns, strict=True)
-    write_csv(out, names, zip(*values, strict=True))
-    single = len(arrays["receiver_name"]) == 1
-    return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}
+        if key in observations:
+            columns += [(f"{name}_{suffix}", v) for name, v in zip(receivers, observations[key], strict=True)]
+    write_csv(out, [name for name, _ in columns], zip(*(values for _, values in columns), strict=True))
+    single = len(receivers) == 1
+    return arrays | {key: values[0] if single else values for key, values in observations.items()}

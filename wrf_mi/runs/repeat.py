@@ -14,7 +14,7 @@ from ..core import AntennaOptions, InputError
 from ..core.settings import flat
 from ..models.model import Model, default_settings
 from .compressed import COMPRESSION
-from .folder import CONFIG, RunConfig, read_config
+from .folder import CONFIG, GIVEN, RunConfig, read_config
 
 WORDS = {
     "wrf-gs": "3D Gaussians with complex attenuation, signals by networks",
@@ -35,7 +35,6 @@ WORDS = {
     "optml": "paths fitted to the uplink, started by a network",
 }
 """Models for readers of a page; others, of installed packages, are named by their source."""
-GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # settings that are options of ``train``
 
 
 def known_config(folder: Path) -> RunConfig | None:

@@ -34,7 +34,7 @@ from ..synthetic import load_record
 from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
-from .folder import CONFIG, METRICS, is_finished, package_versions
+from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed"),
@@ -145,9 +145,9 @@ def plan_sweep(
     return Sweep(Path(out), shared, tuple(runs.values()))
 
 
-def check_run(dataset: str, arguments: Mapping[str, Any]) -> None:
-    """Refuse a run that ``wrf-mi train`` would refuse; ``arguments`` are those of `wrf_mi.runs.api.plan_run`."""
-    plan_run(_record(dataset), **arguments)
+def check_run(dataset: str, request: RunRequest) -> None:
+    """Refuse a run that ``wrf-mi train`` would refuse."""
+    plan_run(_record(dataset), request)
 
 
 _record = lru_cache(maxsize=4)(load_record)
