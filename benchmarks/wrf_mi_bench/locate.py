@@ -22,7 +22,7 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_file import test_observations
-from wrf_mi.maps.locate_knn import COUNTS, METRICS, Neighbours
+from wrf_mi.maps.locate_likelihood import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows

@@ -24,10 +24,10 @@ from wrf_mi.core import Record
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.runs.compare_page import changed_settings, command
 from wrf_mi.runs.compare_tables import best_run, common, common_means, differences
 from wrf_mi.runs.compressed import compress_run
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
-from wrf_mi.runs.repeat import changed_settings, command
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
 from wrf_mi.training.compress import Compression

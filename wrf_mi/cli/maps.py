@@ -99,15 +99,8 @@ def locate_command(a: Arguments) -> int:
     """Write positions to a file, and a picture beside it."""
     from ..core.array_files import write_arrays
     from ..core.files import write_figure
+    from ..maps import locate_file as files
     from ..maps.locate import locate, located_run
-    from ..maps.locate_figure import draw_positions
-    from ..maps.locate_file import (
-        figures_of,
-        posterior_arrays,
-        read_observations,
-        test_observations,
-        write_positions_file,
-    )
 
     out = Path(a.out)
     if out.suffix.lower() != ".csv":
@@ -116,17 +109,19 @@ def locate_command(a: Arguments) -> int:
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
     strengths_dbm, true_m = (
-        test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
+        files.test_observations(run)
+        if a.input is None
+        else files.read_observations(a.input, run.receivers, run.config.left_out)
     )
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
         found = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
     picture = out.with_suffix(".png")
-    write_positions_file(out, found, true_m)
-    write_figure(picture, draw_positions(run, found, true_m))
+    files.write_positions_file(out, found, true_m)
+    write_figure(picture, files.draw_positions(run, found, true_m))
     if a.posterior is not None:
-        write_arrays(Path(a.posterior), posterior_arrays(found), compressed=True)
-    figures = figures_of(found, true_m)
+        write_arrays(Path(a.posterior), files.posterior_arrays(found), compressed=True)
+    figures = files.figures_of(found, true_m)
     text = f"{_summary(figures)}\n{len(found)} positions: {out}\npicture: {picture}"
     return show(a.json, {"out": str(out), "picture": str(picture), **figures}, text)
 

@@ -38,14 +38,8 @@ class ExportOptions:
     progress: bool = False
 
 
-NAMES = {
-    "tx_pos_m": "--tx",
-    "rx_pos_m": "--rx",
-    "frequency_hz": "--frequency",
-    "material": "--material",
-    "kinds": "--paths",
-    "depth": "--depth",
-}
+NAMES = {"tx_pos_m": "--tx", "rx_pos_m": "--rx", "frequency_hz": "--frequency"}
+NAMES |= {"material": "--material", "kinds": "--paths", "depth": "--depth"}
 """Options that belong to some formats, as the command has them."""
 
 

@@ -28,6 +28,9 @@ MARGIN_M = 0.5  # margin around transmitter positions where no scene states the 
 ROUNDS = 20  # largest number of times that an edge is halved: a kilometre into millimetres
 MOUNTED_M = 0.02  # distance from a surface up to which a receiver is taken to lie before it
 
+HEADINGS = 8
+"""Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
+
 CANDIDATE_STEP_M = 0.25  # least distance of neighbouring candidates by default
 USUAL_CANDIDATES, MOST_CANDIDATES = 4000, 10_000
 """Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between

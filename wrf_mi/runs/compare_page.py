@@ -1,14 +1,15 @@
-"""Page of a comparison: one HTML file that needs no network, for laptops and telephones."""
+"""Page of a comparison, one HTML file that needs no network, for laptops and telephones; commands that repeat runs."""
 
 from __future__ import annotations
 
 import base64
 import html
+import json
 import os
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
@@ -16,24 +17,39 @@ from typing import Any
 
 from PIL import Image
 
+from ..core import AntennaOptions
+from ..core.settings import flat
 from ..datasets.registry import KNOWN
+from ..models.model import default_settings
 from ..tasks import TASKS
-from .compare_tables import (
-    BETTER,
-    COLUMNS,
-    DIFFERENCES,
-    WORSE,
-    Difference,
-    best_run,
-    common,
-    difference_rows,
-)
-from .repeat import changed_settings, command, known_config, model_words, stored_versions
+from .compare_tables import BETTER, COLUMNS, DIFFERENCES, WORSE, Difference, best_run, common, difference_rows
+from .compressed import COMPRESSION
+from .folder import GIVEN, RunConfig, known_config, stored_versions
 from .results import Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
 FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
+
+WORDS = {
+    "wrf-gs": "3D Gaussians with complex attenuation, signals by networks",
+    "wrf-gs+": "3D Gaussians with static attributes and a deformation network",
+    "factorised": "static 3D Gaussians, signals are mixtures of a few functions of the transmitter",
+    "ray-tracing": "Sionna RT in the scene",
+    "hybrid": "one fit in stages: paths of a scene, its correction, Gaussians, interpolation of the rest",
+    "idw": "inverse-distance weighting",
+    "kriging": "kriging (Gaussian process)",
+    "trees": "extremely randomised trees",
+    "mri": "log-distance path loss of each receiver, interpolated residuals",
+    "vae": "variational autoencoder",
+    "dcgan": "generative adversarial network",
+    "nerf2": "neural field of voxels, marched along rays",
+    "linear": "linear map from uplink to downlink",
+    "fire": "variational autoencoder from uplink to downlink",
+    "r2f2": "paths fitted to the uplink",
+    "optml": "paths fitted to the uplink, started by a network",
+}
+"""Models for readers of a page; others, of installed packages, are named by their source."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +166,11 @@ def _facts(runs: Sequence[Results]) -> str:
     scenes = dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene"))
     if scenes:
         facts["scene"] = "; ".join(scenes)
-    return "<dl>" + "".join(f"<dt>{key}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+    return _definitions(facts)
+
+
+def _definitions(facts: Mapping[str, str]) -> str:
+    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
 
 
 def _models(runs: Sequence[Results]) -> str:
@@ -180,21 +200,21 @@ def _versions(runs: Sequence[Results]) -> str:
     """Versions with which the runs were made, grouped, and the machine of this page."""
     groups: dict[str, list[str]] = {}
     for run in runs:
-        found = ", ".join(f"{name} {value}" for name, value in stored_versions(run.path).items())
-        groups.setdefault(found or "not stored", []).append(run.name)
-    here = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    facts = {", ".join(names): words for words, names in groups.items()} | {"this page": here}
-    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+        versions = ", ".join(f"{name} {value}" for name, value in stored_versions(run.path).items())
+        groups.setdefault(versions or "not stored", []).append(run.name)
+    machine = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    facts = {", ".join(names): words for words, names in groups.items()} | {"this page": machine}
+    return _definitions(facts)
 
 
 def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
     """Table that sorts by a click on a heading; columns without a value are left out."""
-    kept = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
+    filled = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
     head = "".join(
         f'<th scope="col"{_class(key, numeric)}><button type="button">{_text(title)}</button></th>'
-        for key, title in kept.items()
+        for key, title in filled.items()
     )
-    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in kept) + "</tr>" for row in rows)
+    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in filled) + "</tr>" for row in rows)
     return (
         f'<div class="scroll"><table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
     )
@@ -228,3 +248,51 @@ def _image(path: Path, title: str) -> str:
 
 def _text(value: Any) -> str:
     return html.escape(str(value))
+
+
+def model_words(config: RunConfig) -> str:
+    """The model in words, with its scene."""
+    words = WORDS.get(config.model, config.entry.source)
+    if config.scene is not None and config.model not in ("ray-tracing", "hybrid"):
+        words += ", trained jointly with the paths of the scene"
+    return words
+
+
+def changed_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings, by dotted name, that differ from the model's defaults for these data; not those of `GIVEN`."""
+    entry = config.entry
+    given = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
+    standard = dict(flat(asdict(default_settings(entry, (), given))))
+    stated = flat(asdict(config.settings))
+    return {
+        name: value for name, value in stated if value != standard[name] and not (name in GIVEN and name in entry.given)
+    }
+
+
+def command(config: RunConfig, folder: Path) -> str:
+    """The line that repeats a run; data sets passed as objects are named by their folder, rows by their split."""
+    if (folder / COMPRESSION).exists():
+        stored = json.loads((folder / COMPRESSION).read_text())
+        words = ["wrf-mi", "compress", stored["run"]]
+        for name, value in stored["how"].items():
+            words += [f"--{name.replace('_', '-')}", str(value)]
+        return shlex.join([*words, "--out", str(folder)])
+    entry, settings = config.entry, config.settings
+    options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
+    options |= {field.name: getattr(config.antennas, field.name) for field in fields(AntennaOptions)}
+    for name in ("receiver", "evaluation"):
+        value = getattr(settings, name) if name in entry.given else None
+        if value is not None and value != getattr(default_settings(entry, (), {}), name):
+            options[name] = value
+    changed = changed_settings(config)
+    if config.seed:
+        options["seed"] = config.seed
+        if "seed" not in entry.given and hasattr(settings, "seed"):
+            changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
+    words = ["wrf-mi", "train", config.dataset, "--model", config.model, "--split", config.split]
+    for name, value in options.items():
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    words += [f"--{name}" for name in ("deterministic", "intervals") if getattr(config, name)]
+    for name, value in changed.items():
+        words += ["--set", f"{name}={json.dumps(value)}"]
+    return shlex.join([*words, "--out", str(folder)])

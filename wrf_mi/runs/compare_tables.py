@@ -12,7 +12,7 @@ import numpy as np
 from ..core.angles import FloatArray
 from ..tasks import TASKS
 from ..tasks.scores import bootstrap
-from .repeat import known_config
+from .folder import known_config
 from .results import Results
 
 COLUMNS = {

@@ -80,9 +80,9 @@ def compress_run(
     source, folder = Path(run), Path(out)
     check_new(folder)
     opened = open_run(source, record)
-    asked, field = opened.config, opened.field
-    if asked.scene is not None:
-        raise InputError(f"{source}: trained together with the paths of {asked.scene}; compress a run without a scene")
+    config, field = opened.config, opened.field
+    if config.scene is not None:
+        raise InputError(f"{source}: trained together with the paths of {config.scene}; compress a run without a scene")
     if field.config.evaluation == TRACED:
         raise InputError(f"{source}: evaluated by tracing; compress a run with evaluation=splatted")
     data = opened.problem.record
@@ -98,10 +98,11 @@ def compress_run(
     seconds = time.perf_counter() - start
     folder.mkdir(parents=True, exist_ok=True)
     save_split(folder / SPLIT, split)
-    write_config(folder, replace(asked, model=settings.model, settings=settings))
-    size = write_fitted(folder, field.packed(params, how.precision), read_fitted(source, asked.entry)[1]).stat().st_size
-    known = stored_metrics(source)
-    ssim_before = (known or evaluate_run(source))["ssim"]["median"]
+    write_config(folder, replace(config, model=settings.model, settings=settings))
+    size = (
+        write_fitted(folder, field.packed(params, how.precision), read_fitted(source, config.entry)[1]).stat().st_size
+    )
+    ssim_before = (stored_metrics(source) or evaluate_run(source))["ssim"]["median"]
     ssim_after = evaluate_run(folder)["ssim"]["median"]
     both = {"before": opened.predictor(), "after": open_run(folder, record).predictor()}
     times = spectrum_times(both, data.tx_pos_m[split.all_train])
@@ -119,15 +120,15 @@ def compress_run(
     return result
 
 
-def render(found: Mapping[str, Any]) -> str:
+def render(result: Mapping[str, Any]) -> str:
     """Table of the result of `compress_run`."""
     lines = [f"{'':<8}{'Gaussians':>10}{'kB':>9}{'ms':>8}{'SSIM':>8}"]
     for name in ("before", "after"):
-        row = found[name]
+        row = result[name]
         lines.append(f"{name:<8}{row['gaussians']:>10}{row['bytes'] / 1e3:>9.1f}{row['ms']:>8.2f}{row['ssim']:>8.3f}")
-    value, low, high = found["after"]["times_faster"]
+    value, low, high = result["after"]["times_faster"]
     lines.append(
-        f"{found['times_smaller']:.1f} times smaller, {value:.1f} times as fast ({low:.1f} to {high:.1f}), "
-        f"median SSIM {found['ssim_change']:+.3f}, made in {found['seconds']:.0f} s"
+        f"{result['times_smaller']:.1f} times smaller, {value:.1f} times as fast ({low:.1f} to {high:.1f}), "
+        f"median SSIM {result['ssim_change']:+.3f}, made in {result['seconds']:.0f} s"
     )
     return "\n".join(lines)

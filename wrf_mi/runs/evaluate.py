@@ -20,7 +20,7 @@ from ..core.memory import peak_memory_mb
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
-from ..models import Fitted, Problem, Session
+from ..models import Fitted, Inputs, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
@@ -96,10 +96,10 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     truth[trained] = np.nan
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    given = [predict(rows, receiver) for receiver in scored]
-    found = [one if isinstance(one, Prediction) else Prediction(one) for one in given]
-    prediction = np.full((len(truth), *found[0].mean.shape), np.nan, truth.dtype)
-    prediction[list(scored)] = [one.mean for one in found]
+    predicted = [predict(rows, receiver) for receiver in scored]
+    stated = [p if isinstance(p, Prediction) else Prediction(p) for p in predicted]
+    prediction = np.full((len(truth), *stated[0].mean.shape), np.nan, truth.dtype)
+    prediction[list(scored)] = [p.mean for p in stated]
     arrays = {
         "row": rows,
         "prediction": prediction,
@@ -110,9 +110,9 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         SCORES: constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
-    if found[0].std is not None:
+    if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
-        arrays["std"][list(scored)] = [one.stated_std for one in found]
+        arrays["std"][list(scored)] = [p.stated_std for p in stated]
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
         "n_train": len(split.all_train),
@@ -215,28 +215,28 @@ def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: d
     They are the mean score of test rows and the milliseconds of a prediction by the stages up to each; of many test
     rows `MOST_OF_STAGES`, evenly spaced, are scored.
     """
-    reports = [dict(one) for one in part.fitted.facts().get("stages", [])]
-    kept = [one for one in reports if one["kept"]]
-    if not kept:
+    reports = [dict(report) for report in part.fitted.facts().get("stages", [])]
+    used = [report for report in reports if report["kept"]]
+    if not used:
         return {}
     predictions = part.fitted.by_stage(part.split)
     task, rows = TASKS[record.task], arrays["row"]
-    some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
-    truth = arrays["truth"][:, some]
-    for one in kept:
-        if one["stage"] in predictions:
-            predict = predictions[one["stage"]]
-            found = np.asarray(predict(inputs_of(record, rows[some])))
+    spaced = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
+    truth = arrays["truth"][:, spaced]
+    for report in used:
+        if report["stage"] in predictions:
+            predict = predictions[report["stage"]]
+            prediction = np.asarray(predict(inputs_of(record, rows[spaced])))
 
             def single(row: IntArray, receiver: int, predict: PredictAll = predict) -> NDArray[Any]:
                 return predict(inputs_of(record, row))
 
             milliseconds = _milliseconds_per_sample(single, rows, 0) / len(truth)
-        elif one is kept[-1]:
-            found, milliseconds = arrays["prediction"][:, some], metrics["ms_per_sample"]
+        elif report is used[-1]:
+            prediction, milliseconds = arrays["prediction"][:, spaced], metrics["ms_per_sample"]
         else:
             continue
-        one |= {"test": float(np.nanmean(task.of_rows(found, truth))), "ms": milliseconds}
+        report |= {"test": float(np.nanmean(task.of_rows(prediction, truth))), "ms": milliseconds}
     return {"stages": reports}
 
 
@@ -296,27 +296,30 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
             received no training row.
     """
     task, kind, rows = TASKS[record.task], record.observation.dtype, split.test
-    found: dict[str, Any] = {}
+    predictions: dict[str, Any] = {}
     if record.uplink is not None and task.from_uplink:
-        found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
+        predictions[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers))
     if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
         alone = split.held_receivers and not len(split.left)
         key, entry = (LAW, MRI) if alone else (task.reference, IDW)
         plain = replace(split, train=split.all_train, validation=split.validation[:0])
         problem = Problem(record, default_settings(entry, (), {})).seen(split)
         fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
-        inputs, receivers = inputs_of(record, rows), range(len(record.receivers))
-        found[key] = np.stack([fitted.predict(inputs, receiver).mean for receiver in receivers]).astype(kind)
+
+        def of_all(inputs: Inputs) -> NDArray[Any]:
+            return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])
+
+        inputs = inputs_of(record, rows)
+        predictions[key] = of_all(inputs)
         if record.carriers_hz is not None and inputs.carriers_hz is not None:
             known = np.unique(record.carriers_hz[split.all_train])
             nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
             if (nearest != inputs.carriers_hz).any():
-                there = replace(inputs, carriers_hz=nearest)
-                found[CARRIER] = np.stack([fitted.predict(there, receiver).mean for receiver in receivers]).astype(kind)
-    if not found:
+                predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
+    if not predictions:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
-    return found
+    return {key: values.astype(kind) for key, values in predictions.items()}
 
 
 def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:

@@ -158,6 +158,23 @@ def read_config(folder: Path) -> RunConfig:
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))
 
 
+def known_config(folder: Path) -> RunConfig | None:
+    """Content of ``config.yaml``; None where there is none, or for a model or settings that this version lacks."""
+    try:
+        return read_config(folder)
+    except InputError:
+        return None
+
+
+def stored_versions(folder: Path) -> dict[str, str]:
+    """Versions of packages, backend and device with which a run was made; empty where they are not stored."""
+    try:
+        content = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+        return {str(name): str(value) for name, value in content["versions"].items()}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return {}
+
+
 def check_format(folder: Path) -> None:
     """Refuse a run of another format by `InputError`; an unreadable configuration passes."""
     try:

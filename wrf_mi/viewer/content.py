@@ -173,15 +173,13 @@ class ViewContent:
     @property
     def counts(self) -> dict[str, int]:
         """Number of elements of each layer that is present."""
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         if self.scene is not None:
-            found["triangles"] = sum(len(mesh.corners_m) for mesh in self.scene.meshes)
+            counts["triangles"] = sum(len(mesh.corners_m) for mesh in self.scene.meshes)
         if self.rows is not None:
-            found |= {"held_out_rows": len(self.rows.row), "transmitters": len(self.rows.stored)}
+            counts |= {"held_out_rows": len(self.rows.row), "transmitters": len(self.rows.stored)}
         if self.gaussians is not None:
-            found["gaussians"] = len(self.gaussians.position_m)
+            counts["gaussians"] = len(self.gaussians.position_m)
         if self.paths is not None:
-            found["paths"] = len(self.paths.tx)
-        if self.maps:
-            found["maps"] = len(self.maps)
-        return found
+            counts["paths"] = len(self.paths.tx)
+        return counts | ({"maps": len(self.maps)} if self.maps else {})

@@ -56,8 +56,8 @@ def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
     facts = json.loads(str(arrays[FACTS]))
     axes = arrays["x_m"], arrays["y_m"], arrays.get("z_m")
     values = {name.removeprefix(VALUES): array for name, array in arrays.items() if name.startswith(VALUES)}
-    found = path.name, facts["height_m"], *axes, tuple(facts["receivers"]), values, facts["labels"]
-    return MapContent(*found), facts["notes"]
+    content = MapContent(path.name, facts["height_m"], *axes, tuple(facts["receivers"]), values, facts["labels"])
+    return content, facts["notes"]
 
 
 def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
@@ -89,13 +89,13 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
 
 def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[MapContent], list[str]]:
     """Maps with at most ``most`` values in all, of every k-th position along each axis, and a note where k > 1."""
-    step, found = 1, list(maps)
-    while sum(values.size for one in found for values in one.values.values()) > most:
+    step, thin = 1, list(maps)
+    while sum(values.size for content in thin for values in content.values.values()) > most:
         step += 1
-        found = [_every(one, step) for one in maps]
+        thin = [_every(content, step) for content in maps]
     if step == 1:
-        return found, []
-    return found, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
+        return thin, []
+    return thin, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
 
 
 def _every(one: MapContent, step: int) -> MapContent:

@@ -1,9 +1,11 @@
-"""The page of a view: one HTML document with plotly.js, its data and its script."""
+"""The page of a view: one HTML document with plotly.js, its data, arrays in 16 bits as text, and its script."""
 
 from __future__ import annotations
 
+import base64
 import html
 import json
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.resources import files
@@ -13,12 +15,11 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError
 from ..scene.preview import ENDS, SPAN_DB
 from .content import MapContent, ViewContent
-from .pack import plain
 
 SCALES = {"strength": "viridis", "gain": "plasma", "error": "YlOrRd", "map": "turbo"}  # colour map of each quantity
 STOPS = 12  # colours of a scale, between which the page interpolates
@@ -38,6 +39,10 @@ MATERIALS = {
 }
 """Colours of usual materials."""
 OTHER_MATERIALS = ("#8da0cb", "#66c2a5", "#fc8d62", "#e78ac3", "#a6d854", "#e5c494", "#7d9cb5")
+LARGEST = 65534  # number of steps of a range
+MISSING = 65535  # code of a value that is not finite
+SMALLEST_RANGE = 1e-300
+"""Range below which numbers are packed as equal: the steps of a smaller one have few digits or underflow."""
 
 
 @cache
@@ -63,16 +68,10 @@ def page(content: ViewContent) -> str:
     template, style, tools, script = (files(__package__).joinpath(name).read_text("utf-8") for name in names)
     # No text of the data can end the element that holds it.
     data = json.dumps(page_data(content), allow_nan=False).replace("<", "\\u003c")
-    fields = {
-        "title": html.escape(content.title),
-        "style": style,
-        "plotly": plotly_js(),
-        "data": data,
-        "tools": tools,
-        "script": script,
-    }
+    texts = {"title": html.escape(content.title), "style": style, "plotly": plotly_js()}
+    texts |= {"data": data, "tools": tools, "script": script}
     pieces = template.split("%%")  # texts at even places, names of fields at odd ones
-    return "".join(fields[piece] if index % 2 else piece for index, piece in enumerate(pieces))
+    return "".join(texts[piece] if index % 2 else piece for index, piece in enumerate(pieces))
 
 
 def page_data(content: ViewContent) -> dict[str, Any]:
@@ -109,3 +108,42 @@ def _range(values: NDArray[Any], tail: float) -> list[float]:
     """Ends of a colour scale that leave a percentage of the known values beyond either of them."""
     known = values[np.isfinite(values)]
     return np.percentile(known, [tail, 100 - tail]).tolist() if known.size else [0.0, 1.0]
+
+
+def plain(value: Any) -> Any:
+    """Values for JSON: dataclasses as dictionaries of their fields, arrays as of `packed`."""
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return packed(value) if isinstance(value, np.ndarray) else value
+
+
+def packed(values: ArrayLike) -> dict[str, Any]:
+    """Numbers as 16-bit codes of equal steps over their range, for ``unpack`` of ``tools.js``.
+
+    Args:
+        values: real numbers of any shape; integers over a range of at most `LARGEST` are exact, other numbers are
+            rounded to a 65534th of their range, and values that are not finite become NaN.
+
+    Returns:
+        ``shape``, ``low``, ``step`` and ``codes``: base64 of little-endian unsigned 16-bit integers c in the order of
+        the last axis, of values low + c * step.
+    """
+    array = np.asarray(values)
+    numbers = array.astype(float)
+    finite = np.isfinite(numbers)
+    known = numbers[finite]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    exact = array.dtype.kind in "iub" and high - low <= LARGEST
+    step = 1.0 if exact or high - low < SMALLEST_RANGE else (high - low) / LARGEST
+    codes = np.full(array.shape, MISSING, "<u2")
+    codes[finite] = np.round((known - low) / step)
+    return {
+        "shape": list(array.shape),
+        "low": low,
+        "step": step,
+        "codes": base64.b64encode(codes.tobytes()).decode("ascii"),
+    }

@@ -21,10 +21,18 @@ from ..runs.results import read_run
 from ..runs.run import Run, open_run
 from ..tasks.conditions import scene_carrier
 from .content import SHOWN_GAUSSIANS, SHOWN_PATHS, STORED_TRANSMITTERS, ViewContent, ViewOptions
+from .layers import (
+    OnStage,
+    gaussians_content,
+    paths_content,
+    read_scene,
+    rows_content,
+    run_scene,
+    scene_content,
+    surfaces_in,
+)
 from .map_layer import is_map, read_map, thinned
 from .page import page, plotly_js
-from .run_layers import OnStage, gaussians_content, paths_content, rows_content, run_scene
-from .scene_layer import read_scene, scene_content, surfaces_in
 
 Source = str | Path | Run | Any
 """A run, its folder, a scene by name, folder or file, a ``sionna.rt.Scene``, a map file or an ``xarray.Dataset``."""
@@ -111,10 +119,10 @@ class _Gathered:
             self.material_used = True
 
     def _add_map(self, source: Any) -> None:
-        found, notes = read_map(source)
-        self.content.maps.append(found)
+        content, notes = read_map(source)
+        self.content.maps.append(content)
         self.content.notes += notes
-        self.titles.append(found.name)
+        self.titles.append(content.name)
 
     def _take_scene(self, surfaces: Any, materials: dict[str, str]) -> None:
         if self.scene is None:
@@ -151,14 +159,12 @@ class _Gathered:
             self._add_paths(run, numbers, positions, scene)
 
     def _add_paths(self, run: Run, numbers: IntArray, positions: FloatArray, scene: Any) -> None:
+        limits = self.options, self.on_stage, self.progress
         try:
-            found, notes = paths_content(
-                run, numbers, positions, scene, self.options, self.on_stage, progress=self.progress
-            )
+            self.content.paths, notes = paths_content(run, numbers, positions, scene, *limits)
         except InputError as error:
             # A transmitter inside a solid, for example, hides paths but nothing else.
-            found, notes = None, [f"Paths: not traced, {error}"]
-        self.content.paths = found
+            notes = [f"Paths: not traced, {error}"]
         self.content.notes += notes
 
 
@@ -197,18 +203,18 @@ def view(
     if not sources:
         raise InputError("view: nothing to show; give a run folder, a scene or a map")
     plotly_js()  # refused before the work
-    found = _Gathered(options, material, on_stage, progress)
+    gathered = _Gathered(options, material, on_stage, progress)
     for source in sources:
-        found.add(source)
-    if material is not None and not found.material_used:
+        gathered.add(source)
+    if material is not None and not gathered.material_used:
         raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
-    content = found.content
-    if found.scene is not None:
-        content.scene, note = scene_content(*found.scene)
+    content = gathered.content
+    if gathered.scene is not None:
+        content.scene, note = scene_content(*gathered.scene)
         content.notes += [note] if note else []
     content.maps, notes = thinned(content.maps)
     content.notes += notes
-    content.title = "; ".join(found.titles)
+    content.title = "; ".join(gathered.titles)
     if not content.receivers:
         content.receivers = tuple(dict.fromkeys(name for one in content.maps for name in one.receivers))
         content.receivers_m = np.full((len(content.receivers), 3), np.nan)
