@@ -44,19 +44,12 @@ STRENGTHS, SIDES_M = 24, (-1.0, 5.0)  # number of signal strengths, and extent o
 
 
 class Command(ABC):
-    """A command of ``wrf-mi`` with its results below a folder.
+    """A command of ``wrf-mi`` with its results below a folder."""
 
-    Attributes:
-        name: name in reports.
-        file_bytes: limits of the size of files, in place of a full disk.
-        refused: exit statuses where results cannot be written.
-        locked: folders that one process at a time writes into.
-    """
-
-    name: str
-    file_bytes: Sequence[int] = (250, 400, 1500, 6000)
-    refused: Sequence[int] = (2,)
-    locked: Sequence[str] = ()
+    name: str  # name in reports
+    file_bytes: Sequence[int] = (250, 400, 1500, 6000)  # limits of the size of files, in place of a full disk
+    refused: Sequence[int] = (2,)  # exit statuses where results cannot be written
+    locked: Sequence[str] = ()  # folders that one process at a time writes into
 
     def prepare(self, children: bool) -> None:
         """Prepare this process, in which the command is called.

@@ -26,23 +26,14 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Projection:
-    """Gaussians in a receiver's frame and on its sphere of directions.
+    """Gaussians in a receiver's frame and on its sphere of directions."""
 
-    Attributes:
-        centre_m: shape [n, 3], metres.
-        depth_m: shape [n], distance of the centre.
-        direction: shape [n, 3], unit vector to the centre.
-        basis: shape [n, 2, 3], orthonormal vectors of the tangent plane: eastwards and towards the zenith.
-        covariance: shape [n, 2, 2], in that basis, radians squared, low-pass included.
-        order: the Gaussians that have a footprint, near to far.
-    """
-
-    centre_m: FloatArray
-    depth_m: FloatArray
-    direction: FloatArray
-    basis: FloatArray
-    covariance: FloatArray
-    order: IntArray
+    centre_m: FloatArray  # shape [n, 3], metres
+    depth_m: FloatArray  # shape [n], distance of the centre
+    direction: FloatArray  # shape [n, 3], unit vector to the centre
+    basis: FloatArray  # shape [n, 2, 3], orthonormal vectors of the tangent plane: eastwards and towards the zenith
+    covariance: FloatArray  # shape [n, 2, 2], in that basis, radians squared, low-pass included
+    order: IntArray  # the Gaussians that have a footprint, near to far
 
 
 def covariance_matrix(scale_m: ArrayLike, quaternion_xyzw: ArrayLike) -> FloatArray:

@@ -42,25 +42,15 @@ ROWS = 64
 
 @dataclass(frozen=True)
 class Cell:
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes:
-        title: label in the table.
-        model: name of the model.
-        n_train: number of training rows; None: all.
-        seed: seed of their draw and of the fit.
-        scene: whether the model knows the walls.
-        settings: ``key=value`` of the model.
-        intervals: whether its standard deviations are calibrated by held-out rows, as it states none.
-    """
-
-    title: str
-    model: str
-    n_train: int | None
-    seed: int = 0
-    scene: bool = True
-    settings: tuple[str, ...] = ()
-    intervals: bool = False
+    title: str  # label in the table
+    model: str  # name of the model
+    n_train: int | None  # number of training rows; None: all
+    seed: int = 0  # seed of their draw and of the fit
+    scene: bool = True  # whether the model knows the walls
+    settings: tuple[str, ...] = ()  # ``key=value`` of the model
+    intervals: bool = False  # whether its standard deviations are calibrated by held-out rows, as it states none
 
     @property
     def name(self) -> str:

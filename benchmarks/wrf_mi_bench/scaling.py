@@ -46,21 +46,13 @@ OPTIONS = TraceOptions(max_depth=2, rays=1 << 14)
 
 @dataclass(frozen=True)
 class Axis:
-    """A call whose cost is measured while a size grows.
+    """A call whose cost is measured while a size grows."""
 
-    Attributes:
-        name: name for JSON.
-        title: what is called, for the table.
-        work: what the size counts.
-        sizes: ascending sizes.
-        make: makes the call of a size; its time does not count.
-    """
-
-    name: str
-    title: str
-    work: str
-    sizes: tuple[int, ...]
-    make: Callable[[int], Call]
+    name: str  # name for JSON
+    title: str  # what is called, for the table
+    work: str  # what the size counts
+    sizes: tuple[int, ...]  # ascending sizes
+    make: Callable[[int], Call]  # makes the call of a size; its time does not count
 
 
 def _splat(count: int, height: int = HEIGHT, width: int = WIDTH) -> Call:

@@ -78,19 +78,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that are measured together.
+    """Figures that are measured together."""
 
-    Attributes:
-        name: name for files and progress.
-        figures: stored figures.
-        measure: function from the folder of runs to the figures' values.
-        present: whether the data are on this machine or can be made here.
-    """
-
-    name: str
-    figures: tuple[Figure, ...]
-    measure: Callable[[Path], Sequence[float]]
-    present: bool = True
+    name: str  # name for files and progress
+    figures: tuple[Figure, ...]  # stored figures
+    measure: Callable[[Path], Sequence[float]]  # function from the folder of runs to the figures' values
+    present: bool = True  # whether the data are on this machine or can be made here
 
 
 def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float]:

@@ -87,13 +87,9 @@ def stale_lines(found: Sequence[Mapping[str, Any]], count: int) -> str:
 
 @dataclass
 class History:
-    """Commits of the git repository of a folder; none where it is in no repository.
+    """Commits of the git repository of a folder; none where it is in no repository."""
 
-    Attributes:
-        folder: a folder of results.
-    """
-
-    folder: Path
+    folder: Path  # a folder of results
     _texts: dict[str, dict[str, str]] = field(default_factory=dict)
     _digests: dict[tuple[str, ...], dict[str, str]] = field(default_factory=dict)
 

@@ -74,25 +74,15 @@ Parts = dict[str, tuple[str, Mesh]]
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned geometry.
+    """An ill-conditioned geometry."""
 
-    Attributes:
-        parts: parts of the scene beside the room.
-        receiver: receiver from which paths are searched.
-        tx_pos_m: positions of transmitters [n, 3].
-        options: options of the search.
-        values: given parameters by name.
-        cancels: whether the traced side's gain cancels the learned side at the first transmitter.
-        moved: whether planes are shifted by millimetres and tilted by 0.01 rad.
-    """
-
-    parts: Parts = field(default_factory=dict)
-    receiver: Receiver = PLACE
-    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)
-    options: TraceOptions = TWO_BOUNCES
-    values: Mapping[str, FloatArray] = field(default_factory=dict)
-    cancels: bool = False
-    moved: bool = True
+    parts: Parts = field(default_factory=dict)  # parts of the scene beside the room
+    receiver: Receiver = PLACE  # receiver from which paths are searched
+    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)  # positions of transmitters [n, 3]
+    options: TraceOptions = TWO_BOUNCES  # options of the search
+    values: Mapping[str, FloatArray] = field(default_factory=dict)  # given parameters by name
+    cancels: bool = False  # whether the traced side's gain cancels the learned side at the first transmitter
+    moved: bool = True  # whether planes are shifted by millimetres and tilted by 0.01 rad
 
 
 CASES: Mapping[str, Case] = {

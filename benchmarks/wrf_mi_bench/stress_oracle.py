@@ -148,17 +148,11 @@ class TracedOracle:
 
 @dataclass(frozen=True)
 class ReportOracle:
-    """Reports of receivers in NumPy.
+    """Reports of receivers in NumPy."""
 
-    Attributes:
-        size: rows and columns of a hemisphere's directions.
-        elements_m: positions of the array's elements [m, 3].
-        frequency_hz: carrier frequency of spectra.
-    """
-
-    size: tuple[int, int]
-    elements_m: FloatArray
-    frequency_hz: float
+    size: tuple[int, int]  # rows and columns of a hemisphere's directions
+    elements_m: FloatArray  # positions of the array's elements [m, 3]
+    frequency_hz: float  # carrier frequency of spectra
 
     def learned(self, model: Any, field: ComplexArray) -> ComplexArray:
         """Signals of complex fields [n, directions]: the same, or at an antenna, for each frequency, their sum."""

@@ -64,21 +64,13 @@ class Worst:
 
 @dataclass
 class GradientWorst:
-    """Largest differences of derivatives in float32 from float64, by group, each times its parameters.
+    """Largest differences of derivatives in float32 from float64, by group, each times its parameters."""
 
-    Attributes:
-        error: norm of the difference over the norm.
-        cosine: 1 - cosine of the angle between both.
-        norm: difference of the ratio of their norms from 1.
-        signs: number of wrong signs among derivatives above `PLAIN`.
-        compared: number of signs compared.
-    """
-
-    error: Worst = field(default_factory=Worst)
-    cosine: Worst = field(default_factory=Worst)
-    norm: Worst = field(default_factory=Worst)
-    signs: int = 0
-    compared: int = 0
+    error: Worst = field(default_factory=Worst)  # norm of the difference over the norm
+    cosine: Worst = field(default_factory=Worst)  # 1 - cosine of the angle between both
+    norm: Worst = field(default_factory=Worst)  # difference of the ratio of their norms from 1
+    signs: int = 0  # number of wrong signs among derivatives above `PLAIN`
+    compared: int = 0  # number of signs compared
 
     def add(
         self,

@@ -16,23 +16,14 @@ SHARES = (1.0, 0.3, 0.1)
 
 @dataclass(frozen=True)
 class Entry:
-    """A method of a table.
+    """A method of a table."""
 
-    Attributes:
-        label: label in the table.
-        arguments: arguments of ``wrf-mi train`` except data set, split, rows and seed.
-        quick: further arguments of the small version, which takes half a minute.
-        seeds: seeds; several for random methods of less than three minutes.
-        few_seeds: seeds with fewer rows, which are random themselves.
-        published: figures of the paper, on other data; "": none.
-    """
-
-    label: str
-    arguments: tuple[str, ...]
-    quick: tuple[str, ...] = ()
-    seeds: Sequence[int] = ONE
-    few_seeds: Sequence[int] = SEEDS
-    published: str = ""
+    label: str  # label in the table
+    arguments: tuple[str, ...]  # arguments of ``wrf-mi train`` except data set, split, rows and seed
+    quick: tuple[str, ...] = ()  # further arguments of the small version, which takes half a minute
+    seeds: Sequence[int] = ONE  # seeds; several for random methods of less than three minutes
+    few_seeds: Sequence[int] = SEEDS  # seeds with fewer rows, which are random themselves
+    published: str = ""  # figures of the paper, on other data; "": none
 
 
 def _set(*settings: str) -> tuple[str, ...]:
@@ -150,27 +141,16 @@ FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")  # methods
 
 @dataclass(frozen=True)
 class Part:
-    """A data set with a split.
+    """A data set with a split."""
 
-    Attributes:
-        task: task of the data set.
-        table: overview: the task, or the input from which channels are predicted.
-        dataset: name of the data set.
-        split: name of the split.
-        entries: methods by name.
-        few: whether fewer rows are measured too.
-        scene: scene that `wrf_mi_bench.tables.scene_of` makes; "": none.
-        once: methods of more than three minutes on one thread, with one seed.
-    """
-
-    task: str
-    table: str
-    dataset: str
-    split: str
-    entries: Mapping[str, Entry] = field(hash=False)
-    few: bool = False
-    scene: str = ""
-    once: Collection[str] = ()
+    task: str  # task of the data set
+    table: str  # overview: the task, or the input from which channels are predicted
+    dataset: str  # name of the data set
+    split: str  # name of the split
+    entries: Mapping[str, Entry] = field(hash=False)  # methods by name
+    few: bool = False  # whether fewer rows are measured too
+    scene: str = ""  # scene that `wrf_mi_bench.tables.scene_of` makes; "": none
+    once: Collection[str] = ()  # methods of more than three minutes on one thread, with one seed
 
 
 PARTS = (

@@ -41,21 +41,13 @@ LOOK_EVERY_S = 1e-3
 
 @dataclass(frozen=True)
 class Split:
-    """Shares of the time of a call, in ms.
+    """Shares of the time of a call, in ms."""
 
-    Attributes:
-        tracing: Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder.
-        code_generation: generation of kernels that were not in the cache, with LLVM's or CUDA's compiler.
-        execution: execution of kernels; concurrent ones count in full, up to the time of the call.
-        kernels: number of launched kernels, reductions and sorts included.
-        compiled: number of compiled kernels among them.
-    """
-
-    tracing: float
-    code_generation: float
-    execution: float
-    kernels: int
-    compiled: int
+    tracing: float  # Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder
+    code_generation: float  # generation of kernels that were not in the cache, with LLVM's or CUDA's compiler
+    execution: float  # execution of kernels; concurrent ones count in full, up to the time of the call
+    kernels: int  # number of launched kernels, reductions and sorts included
+    compiled: int  # number of compiled kernels among them
 
 
 def settle(result: Any) -> None:
@@ -66,15 +58,10 @@ def settle(result: Any) -> None:
 
 @dataclass(frozen=True)
 class Within:
-    """A call in a context whose entering and leaving is not timed, for example another variant of Mitsuba.
+    """A call in a context whose entering and leaving is not timed, for example another variant of Mitsuba."""
 
-    Attributes:
-        call: timed call.
-        context: function that returns the context.
-    """
-
-    call: Call
-    context: Callable[[], AbstractContextManager[Any]]
+    call: Call  # timed call
+    context: Callable[[], AbstractContextManager[Any]]  # function that returns the context
 
     def __call__(self) -> Any:
         """Result of the call in its context."""

@@ -48,21 +48,13 @@ FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 
 @dataclass(frozen=True)
 class Held:
-    """A data set, and the split whose folds are held out.
+    """A data set, and the split whose folds are held out."""
 
-    Attributes:
-        dataset: name.
-        kind: ``frequency`` or ``receiver``.
-        n_train: number of training rows; None: all.
-        parts: what is corrected; None: the default of the task.
-        folds: number of folds.
-    """
-
-    dataset: str
-    kind: str
-    n_train: int | None
-    parts: tuple[str, ...] | None
-    folds: int
+    dataset: str  # name
+    kind: str  # ``frequency`` or ``receiver``
+    n_train: int | None  # number of training rows; None: all
+    parts: tuple[str, ...] | None  # what is corrected; None: the default of the task
+    folds: int  # number of folds
 
 
 CARRIERS = (Held(BANDS, "frequency", None, ("materials",), 5),)

@@ -23,15 +23,10 @@ from .format import DATASET, RUN, SCENE, ExportOptions
 
 @dataclass(frozen=True)
 class Source:
-    """Source of an export.
+    """Source of an export."""
 
-    Attributes:
-        name: as given: a path or a name.
-        kind: what it is exported as: a run, a scene or a data set.
-    """
-
-    name: str
-    kind: str
+    name: str  # as given: a path or a name
+    kind: str  # what it is exported as: a run, a scene or a data set
 
     @property
     def is_run(self) -> bool:

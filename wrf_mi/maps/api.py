@@ -188,14 +188,11 @@ def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`.
-
-    Attributes:
-        headings_rad: headings of the transmitter that are averaged over; empty: the model does not know it.
-    """
+    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`."""
 
     threshold_db: float | None
     transmit_dbm: float
+    # headings of the transmitter that are averaged over; empty: the model does not know it
     headings_rad: tuple[float, ...] = ()
     frequency_hz: float | None = None
 

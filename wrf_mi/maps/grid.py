@@ -40,17 +40,11 @@ all of them take 0.8 GB.
 
 @dataclass(frozen=True)
 class Grid:
-    """Positions at one height.
+    """Positions at one height."""
 
-    Attributes:
-        x_m: coordinates along x [nx], ascending, metres.
-        y_m: coordinates along y [ny], ascending, metres.
-        height_m: height z of all positions, metres.
-    """
-
-    x_m: FloatArray
-    y_m: FloatArray
-    height_m: float
+    x_m: FloatArray  # coordinates along x [nx], ascending, metres
+    y_m: FloatArray  # coordinates along y [ny], ascending, metres
+    height_m: float  # height z of all positions, metres
 
     @property
     def positions_m(self) -> FloatArray:
@@ -61,13 +55,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """Triangles at whose centres a map is computed.
+    """Triangles at whose centres a map is computed."""
 
-    Attributes:
-        triangles_m: corners of the triangles [m, 3, 3], metres.
-    """
-
-    triangles_m: FloatArray
+    triangles_m: FloatArray  # corners of the triangles [m, 3, 3], metres
 
     @property
     def positions_m(self) -> FloatArray:
@@ -221,15 +211,10 @@ def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Positions that a transmitter may have.
+    """Positions that a transmitter may have."""
 
-    Attributes:
-        grid: grid over the area's rectangle.
-        inside: positions of the grid that are candidates [ny * nx].
-    """
-
-    grid: Grid
-    inside: NDArray[np.bool_]
+    grid: Grid  # grid over the area's rectangle
+    inside: NDArray[np.bool_]  # positions of the grid that are candidates [ny * nx]
 
     @cached_property
     def positions_m(self) -> FloatArray:

@@ -51,24 +51,15 @@ FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run fo
 
 @dataclass(frozen=True)
 class Calibration:
-    """Likelihood and nearest neighbours of a run, with what held-out rows say of them.
+    """Likelihood and nearest neighbours of a run, with what held-out rows say of them."""
 
-    Attributes:
-        likelihood: form of the likelihood.
-        neighbours: nearest neighbours; None: the run has no training rows to compare with.
-        rows: number of located held-out rows; 0: the form is the default one, as nothing could be held out.
-        error_m: their mean distance from the estimate, metres.
-        inside: share of them inside the regions of probability `LEVEL`.
-        neighbours_error_m: mean held-out distance of nearest neighbours, metres.
-        scores: mean log posterior density at the true positions of each form that was tried, per square metre.
-    """
-
-    likelihood: Likelihood
-    neighbours: Neighbours | None = None
-    rows: int = 0
-    error_m: float = np.nan
-    inside: float = np.nan
-    neighbours_error_m: float = np.nan
+    likelihood: Likelihood  # form of the likelihood
+    neighbours: Neighbours | None = None  # nearest neighbours; None: the run has no training rows to compare with
+    rows: int = 0  # number of located held-out rows; 0: the form is the default one, as nothing could be held out
+    error_m: float = np.nan  # their mean distance from the estimate, metres
+    inside: float = np.nan  # share of them inside the regions of probability `LEVEL`
+    neighbours_error_m: float = np.nan  # mean held-out distance of nearest neighbours, metres
+    # mean log posterior density at the true positions of each form that was tried, per square metre
     scores: dict[str, float] | None = None
 
 

@@ -36,15 +36,10 @@ METRICS = ("euclidean", "nan_euclidean")
 
 @dataclass(frozen=True)
 class Silence:
-    """Probability that a receiver reports nothing, logistic in the predicted mean.
+    """Probability that a receiver reports nothing, logistic in the predicted mean."""
 
-    Attributes:
-        middle_dbm: predicted mean at which half of the rows are received.
-        slope_per_db: logit of the reception per decibel, above 0.
-    """
-
-    middle_dbm: float
-    slope_per_db: float
+    middle_dbm: float  # predicted mean at which half of the rows are received
+    slope_per_db: float  # logit of the reception per decibel, above 0
 
     def log_probability(self, mean_dbm: NDArray[np.floating], received: bool) -> NDArray[np.floating]:
         """Logarithm of the probability of reception, or of none, of the shape of the predicted mean."""
@@ -54,19 +49,12 @@ class Silence:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Form of the likelihood.
+    """Form of the likelihood."""
 
-    Attributes:
-        degrees: degrees of freedom of the Student-t distribution; None: normal.
-        scale: factor of the stated standard deviations.
-        offset_db: standard deviation of the offset that all receivers share.
-        silence: probability of receiving nothing; None: receivers without a value are left out.
-    """
-
-    degrees: float | None = 8.0
-    scale: float = 1.0
-    offset_db: float = 0.0
-    silence: Silence | None = None
+    degrees: float | None = 8.0  # degrees of freedom of the Student-t distribution; None: normal
+    scale: float = 1.0  # factor of the stated standard deviations
+    offset_db: float = 0.0  # standard deviation of the offset that all receivers share
+    silence: Silence | None = None  # probability of receiving nothing; None: receivers without a value are left out
 
     def log(
         self, observed_dbm: NDArray[np.floating], mean_dbm: NDArray[np.floating], std_db: NDArray[np.floating]

@@ -25,19 +25,12 @@ PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """Environment of the client, which workers adopt before each part.
+    """Environment of the client, which workers adopt before each part."""
 
-    Attributes:
-        folder: working directory, to which relative paths refer.
-        variables: environment variables that begin with `VARIABLES`.
-        backend: ``"llvm"`` or ``"cuda"``.
-        versions: versions of Python and `PACKAGES`.
-    """
-
-    folder: str
-    variables: tuple[tuple[str, str], ...]
-    backend: str
-    versions: tuple[tuple[str, str], ...]
+    folder: str  # working directory, to which relative paths refer
+    variables: tuple[tuple[str, str], ...]  # environment variables that begin with `VARIABLES`
+    backend: str  # ``"llvm"`` or ``"cuda"``
+    versions: tuple[tuple[str, str], ...]  # versions of Python and `PACKAGES`
 
 
 def worker_environment() -> WorkerEnvironment:

@@ -54,21 +54,13 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Section:
-    """Runs of a data set with their tables and pictures.
+    """Runs of a data set with their tables and pictures."""
 
-    Attributes:
-        slug: name of the section in links, and beginning of its files' names.
-        runs: the runs.
-        scores: rows of the table of scores, by `COLUMNS`.
-        differences: paired differences.
-        pictures: file and heading of each picture.
-    """
-
-    slug: str
-    runs: Sequence[Results]
-    scores: Sequence[Mapping[str, Any]]
-    differences: Sequence[Difference]
-    pictures: Sequence[tuple[Path, str]]
+    slug: str  # name of the section in links, and beginning of its files' names
+    runs: Sequence[Results]  # the runs
+    scores: Sequence[Mapping[str, Any]]  # rows of the table of scores, by `COLUMNS`
+    differences: Sequence[Difference]  # paired differences
+    pictures: Sequence[tuple[Path, str]]  # file and heading of each picture
 
     @property
     def title(self) -> str:

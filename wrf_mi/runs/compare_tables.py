@@ -52,25 +52,17 @@ FEWEST = 2  # least number of common rows of a difference with an interval
 
 @dataclass(frozen=True)
 class Difference:
-    """Paired difference of a run and a run or reference, in favour of the first where it is positive.
+    """Paired difference of a run and a run or reference, in favour of the first where it is positive."""
 
-    Attributes:
-        run: name of the run.
-        against: name of the other run or of the reference.
-        rows: number of common rows.
-        difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows.
-        verdict: `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`.
-        seeds: number of seeds of which the verdict is.
-    """
-
-    run: str
-    against: str
-    rows: int
-    verdict: str
+    run: str  # name of the run
+    against: str  # name of the other run or of the reference
+    rows: int  # number of common rows
+    verdict: str  # `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`
+    # difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows
     difference: float | None = None
     low: float | None = None
     high: float | None = None
-    seeds: int = 1
+    seeds: int = 1  # number of seeds of which the verdict is
 
 
 def common(runs: Sequence[Results]) -> list[tuple[str, int]]:

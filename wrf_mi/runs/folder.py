@@ -75,19 +75,12 @@ class RunRequest:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them.
-
-    Attributes:
-        task: task of the data set.
-        split: name of the split; that of a fold is, e.g., ``blocked:2``.
-        settings: all settings of the model.
-        left_out: training rows of the receivers that are left out for having too few, by name.
-    """
+    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them."""
 
     model: str
     dataset: str
-    task: str
-    split: str
+    task: str  # task of the data set
+    split: str  # name of the split; that of a fold is, e.g., ``blocked:2``
     n_train: int | float | None
     seed: int
     scene: str | None
@@ -95,7 +88,8 @@ class RunConfig:
     antennas: AntennaOptions
     deterministic: bool
     intervals: bool
-    settings: Any
+    settings: Any  # all settings of the model
+    # training rows of the receivers that are left out for having too few, by name
     left_out: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property

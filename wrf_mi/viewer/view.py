@@ -43,13 +43,9 @@ FRAME_HEIGHT_PX = 640  # height of a view in a notebook
 
 @dataclass(frozen=True)
 class View:
-    """A view of a scene, runs and maps.
+    """A view of a scene, runs and maps."""
 
-    Attributes:
-        content: what it shows.
-    """
-
-    content: ViewContent
+    content: ViewContent  # what it shows
 
     @cached_property
     def html(self) -> str:
