@@ -83,13 +83,10 @@ Write = Callable[[Source, Path, ExportOptions], dict[str, Any]]
 
 
 def kinds_of(name: str | Path) -> tuple[str, ...]:
-    """Kinds that a source may be of, in the order of preference.
+    """Kinds that a source may be of, in the order of preference; `InputError` for neither a path nor a known name.
 
     A folder is a run if it holds ``config.yaml``, else a scene if it holds ``scene.yml``, else a data set. A file is a
     scene or a data set by its ending.
-
-    Raises:
-        InputError: neither a path nor a known name.
     """
     path, text = Path(name), str(name)
     if path.is_dir():

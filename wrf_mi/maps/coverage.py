@@ -58,16 +58,10 @@ class Reliability:
 def reliability(
     level_db: FloatArray, std_db: FloatArray, measured_db: FloatArray, threshold_db: FloatArray | None = None
 ) -> Reliability:
-    """Reliability of probabilities of coverage.
+    """Reliability of probabilities of coverage from predicted levels, standard deviations and measured levels, any shape.
 
-    Args:
-        level_db: predicted levels, any shape.
-        std_db: their standard deviations, likewise.
-        measured_db: measured levels, likewise; NaN where nothing was received, which is left out.
-        threshold_db: thresholds [t]; None: the quantiles `QUANTILES` of the measured levels.
-
-    Raises:
-        InputError: nothing was measured.
+    Measured levels are NaN where nothing was received. Thresholds [t] are by default `QUANTILES` of the measured
+    levels. `InputError` where nothing was measured.
     """
     known = np.isfinite(measured_db)
     level, std, measured = (np.asarray(values, float)[known] for values in (level_db, std_db, measured_db))

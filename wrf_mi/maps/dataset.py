@@ -55,21 +55,13 @@ def maps_package(name: str, extra: str = "maps") -> Any:
 
 
 def require_packages(path: Path, extra: str = "maps") -> None:
-    """Refuse a map file whose packages are not installed; any suffix but ``.zarr`` and ``.csv`` is NetCDF.
-
-    Raises:
-        InputError: naming the first package that is missing.
-    """
+    """Refuse by `InputError` a map file whose packages are missing; any suffix but ``.zarr`` and ``.csv`` is NetCDF."""
     for name in PACKAGES.get(path.suffix.lower(), PACKAGES[NETCDF]):
         maps_package(name, extra)
 
 
 def check_map_file(out: Path) -> None:
-    """Refuse a file name of another format than NetCDF, Zarr and CSV, and a missing package.
-
-    Raises:
-        InputError: naming suffixes, or the package.
-    """
+    """Refuse by `InputError` a file name of another format than NetCDF, Zarr and CSV, and a missing package."""
     suffix = out.suffix.lower()
     if suffix not in PACKAGES:
         raise InputError(f"{out}: maps are written as NetCDF ({NETCDF}), Zarr ({ZARR}) or {CSV}; give such a name")
@@ -87,20 +79,12 @@ def map_dataset(
     level_unit: str,
     attributes: Mapping[str, Any],
 ) -> xarray.Dataset:
-    """Dataset of a map.
+    """Dataset of a map from arrays [receivers, m] by the names of `VARIABLES`; levels in ``dBm``, or ``dB`` uncalibrated.
 
-    Args:
-        places: positions of the map.
-        receivers: receivers of the map.
-        values: arrays [receivers, m] by the names of `VARIABLES`.
-        level_unit: unit of received powers: ``dBm``, or ``dB`` without an absolute calibration.
-        attributes: attributes of the whole.
-
-    Returns:
-        Variables with dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, and
-        ``best_receiver`` without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``,
-        ``receiver_z``; ``x``, ``y``, ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are
-        ``triangle`` (point, corner, axis). Metres, in the frame of the data.
+    Variables have dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, ``best_receiver`` is
+    without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``, ``receiver_z``; ``x``, ``y``,
+    ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are ``triangle`` (point, corner, axis). Metres,
+    in the frame of the data.
     """
     xr = maps_package("xarray")
     at = np.stack([receiver.position_m for receiver in receivers])

@@ -66,16 +66,10 @@ class SurfaceMesh:
 
 
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
-    """Grid over a rectangle: square cells from its lower corner on, whose centres lie in it.
+    """Grid over a rectangle between two corners [2 or more], metres: square cells whose centres lie in it.
 
     Where an extent is no multiple of the step, it is rounded to the nearest one, half down: of a last cell that the
     upper side cuts, the centre decides. An extent of up to half a step has one position, in its middle.
-
-    Args:
-        low_m: lower corner of the rectangle [2 or more], metres; coordinates beyond the second are ignored.
-        high_m: upper corner, likewise.
-        step_m: distance between neighbouring positions, metres.
-        height_m: height of all positions, metres.
 
     Raises:
         InputError: a step that is not positive and finite, or more than `LARGEST` positions.
@@ -96,11 +90,7 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
 
 
 def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
-    """Triangles of a mesh file, halved until no edge is longer than a step.
-
-    Args:
-        mesh: a format of `wrf_mi.scene.mesh.files.mesh_parts`, in metres and the frame of the data.
-        step_m: longest edge of a triangle, metres; None: the faces as they are.
+    """Triangles of a mesh file in metres, halved until no edge is longer than a step; None: the faces as they are.
 
     Raises:
         InputError: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
@@ -165,11 +155,6 @@ def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
 
 def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
     """Refuse a plane that the scene's floor or ceiling hides from all receivers; warn of one outside of what is known.
-
-    Args:
-        run: a finished run.
-        height_m: height z of the plane, metres.
-        tx_pos_m: positions of the transmitters of the data [n, 3], metres.
 
     Raises:
         InputError: a height above or below a scene with a surface between it and every receiver, with the scene's.
@@ -240,10 +225,7 @@ class Candidates:
 def candidates_of(run: Run, step_m: float | None = None, height_m: float | None = None) -> Candidates:
     """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
 
-    Args:
-        run: a finished run.
-        step_m: distance between neighbours; None: `CANDIDATE_STEP_M`, more for large areas.
-        height_m: their height; None: the median of the training rows.
+    By default their step is `CANDIDATE_STEP_M`, more for large areas, and their height the training rows' median.
 
     Raises:
         InputError: a step that is not positive or too small, no candidate, or neither scene nor known positions.

@@ -66,13 +66,9 @@ class Calibration:
 def predict_candidates(
     fitted: Fitted, count: int, headings: int, candidates: Candidates, report: Callable[[float], None]
 ) -> NDArray[np.float32]:
-    """Predictions of a fitted model for all its receivers, ``count``, at equally spaced headings where it uses them.
+    """Means in dBm and standard deviations in dB [2, headings, n_rx, p] of a fitted model at the candidates.
 
-    Returns:
-        Means in dBm and standard deviations in dB [2, headings, n_rx, p].
-
-    Raises:
-        InputError: the model states no standard deviation.
+    Headings are equally spaced where the model uses them. `InputError` where it states no standard deviation.
     """
     positions = candidates.positions_m
     predicted = np.empty((2, headings, count, len(positions)), np.float32)
@@ -109,11 +105,8 @@ class Located:
 def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibration:
     """The stored choice of a run for these candidates, else a new one, which is stored in the run folder.
 
-    Finished folds are kept until all are, so that a stopped choice goes on.
-
-    Raises:
-        InputError: a fold that the model cannot be fitted to.
-        Interrupted: stopped.
+    Finished folds are kept until all are, so that a stopped choice (`Interrupted`) goes on. `InputError` of a fold
+    that the model cannot be fitted to.
     """
     grid, file = candidates.grid, run.folder / FILE
     key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}

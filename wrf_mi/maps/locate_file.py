@@ -35,19 +35,11 @@ REGION, ESTIMATE, NEIGHBOURS, TRUTH = "tab:orange", "tab:red", "tab:purple", "bl
 def read_observations(
     path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = ()
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Read the signal strengths of each receiver from a CSV file with a header.
+    """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a CSV file.
 
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
-    needed for each receiver; a field is empty where nothing was received. Columns ``x`` and ``y``, if any, are true
-    positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
-
-    Args:
-        path: the file.
-        receivers: receivers of the run.
-        left_out: names of receivers whose columns are ignored.
-
-    Returns:
-        Signal strengths [n_rx, m], NaN where nothing was received, and true positions [m, 2], metres, or None.
+    needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
+    true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
 
     Raises:
         InputError: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver,

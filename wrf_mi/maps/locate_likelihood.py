@@ -59,12 +59,9 @@ class Likelihood:
     def log(
         self, observed_dbm: NDArray[np.floating], mean_dbm: NDArray[np.floating], std_db: NDArray[np.floating]
     ) -> FloatArray:
-        """Logarithm of the likelihood [p] of an observation at p candidate positions.
+        """Logarithm of the likelihood [p] of strengths [n_rx], NaN where nothing was received, at p candidates.
 
-        Args:
-            observed_dbm: received strengths [n_rx], NaN where nothing was received.
-            mean_dbm: predicted means [headings, n_rx, p]; a single heading where the model does not use it.
-            std_db: their standard deviations, of the same shape.
+        Predicted means and standard deviations are [headings, n_rx, p], one heading where the model does not use it.
         """
         known = np.isfinite(observed_dbm)
         scale = self.scale * std_db[:, known]
@@ -103,16 +100,11 @@ class Likelihood:
 
 
 def region_of(probability: FloatArray, distance_m: FloatArray, level: float) -> tuple[int, float, NDArray[np.bool_]]:
-    """Estimate and regions of a transmitter.
-
-    Args:
-        probability: probabilities of the candidates [p], of sum 1.
-        distance_m: distances between all candidates [p, p], metres.
-        level: probability that the regions hold.
+    """Estimate and regions of a transmitter from probabilities [p] of candidates with distances [p, p] in metres.
 
     Returns:
         The candidate of the least expected distance from the transmitter (geometric median), the radius in metres of
-        the circle around it that holds the probability, and a mask [p] of the highest-density region.
+        the circle around it that holds the probability ``level``, and a mask [p] of the highest-density region.
     """
     best = int(np.argmin(distance_m @ probability))
     order = np.argsort(distance_m[best], kind="stable")

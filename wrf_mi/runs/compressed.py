@@ -32,11 +32,10 @@ WARM_UP = 2  # pairs before them: the first call compiles, the second still fill
 
 
 def spectrum_times(predictors: Mapping[str, Predictor], tx_pos_m: Any, repeats: int = REPEATS) -> dict[str, Any]:
-    """Times of single warm spectra of several predictors called in turn at positions [m, 3] in metres.
+    """Times of single warm spectra of several predictors called in turn at positions [m, 3] in metres, by name.
 
-    Returns:
-        By name: ``ms`` (median), ``ms_least``, and ``times_faster`` than the first: median of the rounds' ratios and
-        its 95 % interval.
+    ``ms`` is the median, ``ms_least`` the least; ``times_faster`` than the first are the median of the rounds' ratios
+    and its 95 % interval.
     """
     turns = itertools.islice(itertools.cycle(np.asarray(tx_pos_m, float)[:, None]), WARM_UP + repeats)
     ms = np.empty((WARM_UP + repeats, len(predictors)))
@@ -61,14 +60,7 @@ def compress_run(
     record: Record | None = None,
     on_progress: OnProgress = quiet,
 ) -> dict[str, Any]:
-    """Make a smaller run from a run and score it on the same held-out rows.
-
-    Args:
-        run: run folder of a learned field (WRF-GS or WRF-GS+).
-        out: run folder to make; must not exist or be empty.
-        how: target sizes and precision.
-        record: data set of the run; None: loaded by its name.
-        on_progress: progress callback.
+    """Make a smaller run in ``out`` from a run of a learned field, and score it on the same held-out rows.
 
     Returns:
         Content of ``compression.json``: ``before`` and ``after`` with ``gaussians``, ``bytes``, ``ssim`` (median) and

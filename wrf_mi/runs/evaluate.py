@@ -70,11 +70,8 @@ def _milliseconds_per_sample(predict: Predict, rows: IntArray, receiver: int) ->
 def evaluate(record: Record, split: Split, predict: Predict, single: Predict | None = None) -> Scores:
     """Score predictions on the test rows of a split, together with the references that the data allow.
 
-    Args:
-        record: data of any task in `wrf_mi.tasks.TASKS`.
-        split: rows; references (`reference_predictions`) use all its training rows, validation rows included.
-        predict: predictions to score; finite wherever something was received.
-        single: prediction that is timed at one row; None: ``predict``.
+    References (`reference_predictions`) use all training rows of the split, validation rows included. ``single`` is
+    timed at one row; None: ``predict``.
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
@@ -257,16 +254,13 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
 
 
 def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Write predictions as ``.npz``, observations without their first axis where there is one receiver.
+    """Write predictions as ``.npz``, observations without their first axis where there is one receiver; the arrays written.
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
     [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
     [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
     deviation of the same shape, real.
-
-    Returns:
-        The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
     written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}

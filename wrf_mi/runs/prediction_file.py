@@ -34,10 +34,8 @@ SPOOLED_BYTES = 1 << 26  # size from which predictions are collected on the disk
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
     """Read what a model predicts from; positions are NaN where only an uplink is given.
 
-    Args:
-        csv_file: file with columns x, y, z in metres and optionally heading_rad and frequency_hz; or
-        npz_file: file with arrays ``tx_pos`` [m, 3] and optionally ``heading_rad`` [m] and ``frequency_hz`` [m], or
-            with ``uplink`` [m, antennas, subcarriers] and optionally all of these.
+    A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
+    [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
 
     Raises:
         InputError: the file is missing, or a row is not made of finite numbers.
@@ -94,12 +92,7 @@ def _from_npz(path: Path) -> Inputs:
 
 
 def check_prediction_file(out: Path, run: Path) -> None:
-    """Refuse a file name whose format cannot hold the predictions of a run.
-
-    Raises:
-        InputError: a suffix other than ``.npz`` and ``.csv``, or ``.csv`` for a run that does not predict signal
-            strengths.
-    """
+    """Refuse by `InputError` a suffix but ``.npz`` and ``.csv``, and ``.csv`` for other than signal strengths."""
     suffix = out.suffix.lower()
     if suffix not in (NPZ, CSV):
         raise InputError(f"{out}: predictions are written as {NPZ}, or signal strengths as {CSV}; give such a name")
@@ -115,13 +108,7 @@ def check_prediction_file(out: Path, run: Path) -> None:
 def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
     """Array to be filled, in memory while small, else in a temporary file, which has no name: nothing is left of it.
 
-    Args:
-        folder: folder of the temporary file, which is made if need be.
-        shape: shape of the array.
-        kind: type of its numbers.
-
-    Raises:
-        InputError: the disk has no room for it.
+    The file lies in ``folder``, which is made if need be; `InputError` where the disk has no room for it.
     """
     needed = math.prod(shape) * kind.itemsize
     if needed <= SPOOLED_BYTES:
@@ -139,15 +126,11 @@ def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArra
 def write_prediction_file(
     out: Path, inputs: Inputs, receivers: Sequence[str], observations: dict[str, NDArray[Any]]
 ) -> dict[str, Any]:
-    """Write predictions in the format of the suffix.
+    """Write predictions, ``prediction`` and optionally ``std`` with a first axis of the receivers, by the suffix.
 
-    Args:
-        out: ``.npz``: as `wrf_mi.runs.evaluate.write_predictions`. ``.csv``: one row for each position with columns
-            ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each
-            receiver and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
-        inputs: what was predicted from.
-        receivers: names of the receivers.
-        observations: ``prediction`` and optionally ``std``, with a first axis of the receivers.
+    ``.npz`` is as of `wrf_mi.runs.evaluate.write_predictions`. ``.csv`` has one row for each position with columns
+    ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each receiver
+    and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
 
     Returns:
         The arrays as an ``.npz`` file has them.

@@ -46,14 +46,9 @@ OnStage = Callable[[str, float], None]
 
 
 def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
-    """Surfaces of a scene, and the radio material of each by its name.
+    """Surfaces of a scene, by name, folder, XML or mesh, and the radio material of each by its name.
 
-    Args:
-        source: name of a scene, scene folder, Mitsuba XML or mesh.
-        material: radio material of a mesh; None: it is shown without one.
-
-    Raises:
-        InputError: no such scene, or one that cannot be opened.
+    A mesh without a material is shown without one. `InputError` for no such scene, or one that cannot be opened.
     """
     bare = material is None and Path(source).suffix.lower() in MESHES
     if bare and not Path(source).is_file():
@@ -141,9 +136,8 @@ def representative(score: FloatArray, count: int) -> IntArray:
 def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
     """Measured and predicted observations of some test rows for the page.
 
-    Returns:
-        ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
-        receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
+    ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
+    receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
     """
     task = TASKS[results.task]
     both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}

@@ -47,11 +47,7 @@ SMALLEST_RANGE = 1e-300
 
 @cache
 def plotly_js() -> str:
-    """The source of plotly.js.
-
-    Raises:
-        InputError: plotly is not installed.
-    """
+    """The source of plotly.js; `InputError` where plotly is not installed."""
     try:
         return str(import_module("plotly.offline").get_plotlyjs())
     except ModuleNotFoundError:
@@ -59,11 +55,7 @@ def plotly_js() -> str:
 
 
 def page(content: ViewContent) -> str:
-    """The document.
-
-    Raises:
-        InputError: plotly is not installed.
-    """
+    """The document; `InputError` where plotly is not installed."""
     names = ("page.html", "page.css", "tools.js", "page.js")
     template, style, tools, script = (files(__package__).joinpath(name).read_text("utf-8") for name in names)
     # No text of the data can end the element that holds it.
@@ -124,13 +116,9 @@ def plain(value: Any) -> Any:
 def packed(values: ArrayLike) -> dict[str, Any]:
     """Numbers as 16-bit codes of equal steps over their range, for ``unpack`` of ``tools.js``.
 
-    Args:
-        values: real numbers of any shape; integers over a range of at most `LARGEST` are exact, other numbers are
-            rounded to a 65534th of their range, and values that are not finite become NaN.
-
-    Returns:
-        ``shape``, ``low``, ``step`` and ``codes``: base64 of little-endian unsigned 16-bit integers c in the order of
-        the last axis, of values low + c * step.
+    Integers over a range of at most `LARGEST` are exact, other numbers are rounded to a 65534th of their range, and
+    values that are not finite become NaN. ``codes`` are base64 of little-endian unsigned 16-bit integers c in the order
+    of the last axis, of values ``low`` + c * ``step``, in the ``shape``.
     """
     array = np.asarray(values)
     numbers = array.astype(float)
