@@ -26,7 +26,7 @@ COMMANDS = {
     "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
     "train": ("wrf_mi.cli.train",),
     NAMED: ("wrf_mi_bench.scene",),
-    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.correct"),
+    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.scenes"),
 }
 """Modules behind words of commands that benchmarks run in subprocesses."""
 RUNNER = f"{__package__}.bench"  # lists, runs and stores benchmarks; makes no figure

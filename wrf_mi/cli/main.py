@@ -16,8 +16,7 @@ from ..core.files import os_failure
 from ..version import __version__
 from .options import Parser
 
-MODULES = ("doctor", "data", "mesh", "correct", "edit", "train", "runs", "maps", "export", "bench", "demo")
-"""Modules of the commands, in the order of the help."""
+MODULES = ("doctor", "data", "scenes", "train", "runs", "maps", "export", "bench", "demo")  # in the order of the help
 
 
 def build_parser() -> Parser:

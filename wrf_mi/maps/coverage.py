@@ -58,7 +58,7 @@ class Reliability:
 def reliability(
     level_db: FloatArray, std_db: FloatArray, measured_db: FloatArray, threshold_db: FloatArray | None = None
 ) -> Reliability:
-    """Reliability of probabilities of coverage from predicted levels, standard deviations and measured levels, any shape.
+    """Reliability of probabilities of coverage from predicted levels, their deviations and measured levels, any shape.
 
     Measured levels are NaN where nothing was received. Thresholds [t] are by default `QUANTILES` of the measured
     levels. `InputError` where nothing was measured.

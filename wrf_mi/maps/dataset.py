@@ -79,7 +79,7 @@ def map_dataset(
     level_unit: str,
     attributes: Mapping[str, Any],
 ) -> xarray.Dataset:
-    """Dataset of a map from arrays [receivers, m] by the names of `VARIABLES`; levels in ``dBm``, or ``dB`` uncalibrated.
+    """Dataset of arrays [receivers, m] by the names of `VARIABLES`; levels in ``dBm``, or ``dB`` without calibration.
 
     Variables have dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, ``best_receiver`` is
     without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``, ``receiver_z``; ``x``, ``y``,

@@ -254,7 +254,7 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
 
 
 def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Write predictions as ``.npz``, observations without their first axis where there is one receiver; the arrays written.
+    """Write predictions as ``.npz``, without the first axis where there is one receiver; return the arrays.
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
