@@ -24,7 +24,7 @@ from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
 from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
-from wrf_mi.runs.sweep import dataset_files
+from wrf_mi.runs.sweep import dataset_files, markdown_table
 
 from .fit_key import fit_key
 from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
@@ -311,20 +311,15 @@ NOTE = (
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of results."""
-    lines = [
-        "| what | SSIM median | mean | p10 | p90 | IDW median | steps | training | ms per spectrum | peak memory |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    head = ("what", "SSIM median", "mean", "p10", "p90", "IDW median")
+    rows = []
     for result in results:
         m = result["metrics"]
-        score, idw = m["ssim"], m["reference"]["idw4"]["median"]
-        minutes = f"{m['train_seconds'] / 60:.1f} min"
-        quantiles = " | ".join(f"{score[key]:.3f}" for key in ("mean", "p10", "p90"))
-        lines.append(
-            f"| {result['title']} | **{score['median']:.3f}** | {quantiles} "
-            f"| {idw:.3f} | {m['steps']:,} | {minutes} | {m['ms_per_sample']:.1f} | {m['peak_memory_mb']:.0f} MB |"
-        )
-    return "\n".join(lines)
+        scores = [f"**{m['ssim']['median']:.3f}**", *(f"{m['ssim'][key]:.3f}" for key in ("mean", "p10", "p90"))]
+        costs = f"{m['steps']:,}", f"{m['train_seconds'] / 60:.1f} min", f"{m['ms_per_sample']:.1f}"
+        idw, memory = f"{m['reference']['idw4']['median']:.3f}", f"{m['peak_memory_mb']:.0f} MB"
+        rows.append([result["title"], *scores, idw, *costs, memory])
+    return markdown_table([*head, "steps", "training", "ms per spectrum", "peak memory"], rows)
 
 
 def own_table(result: Mapping[str, Any]) -> str:
@@ -335,8 +330,6 @@ def own_table(result: Mapping[str, Any]) -> str:
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of checks."""
-    lines = ["| what | measured | asked |", "| --- | --- | --- |"]
-    for result in results:
-        rows = result["figures"]["rows"]
-        lines += [f"| {result['title']}: {r['what']} | **{r['value']}** | {r['asked']} |" for r in rows]
-    return "\n".join(lines)
+    pairs = [(result["title"], row) for result in results for row in result["figures"]["rows"]]
+    cells = ([f"{title}: {row['what']}", f"**{row['value']}**", row["asked"]] for title, row in pairs)
+    return markdown_table(["what", "measured", "asked"], cells)

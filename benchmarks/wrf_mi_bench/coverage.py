@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 
@@ -74,8 +75,8 @@ def main() -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table, a line for each data set and split: share inside and CRPS of each model."""
-    lines = [f"| data | {' | '.join(MODELS)} |", "| --- |" + " --- |" * len(MODELS)]
+    lines = []
     for cell in dict.fromkeys(row["cell"] for row in rows):
         known = {row["model"]: f"{row['inside_90']:.0%}, {row['crps']:.3g}" for row in rows if row["cell"] == cell}
-        lines.append(f"| {cell} | {' | '.join(known.get(name, '') for name in MODELS)} |")
-    return "\n".join(lines)
+        lines.append([cell, *(known.get(name, "") for name in MODELS)])
+    return markdown_table(["data", *MODELS], lines)

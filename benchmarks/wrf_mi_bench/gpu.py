@@ -15,6 +15,7 @@ from typing import Any
 from wrf_mi.backend import BackendError, choose
 from wrf_mi.core import InputError
 from wrf_mi.parallel import run_module
+from wrf_mi.runs.sweep import markdown_table
 
 from .bench import BenchFailed
 
@@ -54,9 +55,6 @@ def _measured(backend: str) -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: times on both, and how many times faster the GPU is."""
-    lines = [
-        f"| what | {rows[0]['cuda']} | {rows[0]['llvm']} | times faster |",
-        "| --- | --- | --- | --- |",
-        *(f"| {row['what']} | {row['gpu_ms']:.3g} ms | {row['cpu_ms']:.3g} ms | **{row['value']}** |" for row in rows),
-    ]
-    return "\n".join(lines)
+    times = ((f"{row['gpu_ms']:.3g} ms", f"{row['cpu_ms']:.3g} ms") for row in rows)
+    lines = ([row["what"], *of_row, f"**{row['value']}**"] for row, of_row in zip(rows, times, strict=True))
+    return markdown_table(["what", rows[0]["cuda"], rows[0]["llvm"], "times faster"], lines)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from wrf_mi.maps.locate_likelihood import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
@@ -112,20 +113,23 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Row of the table: one draw of the training rows, or all draws pooled, which score the same test rows."""
 
     def of(key: str) -> FloatArray:
-        return np.array([found[key] for found in draws], float)
+        return np.array([draw[key] for draw in draws], float)
+
+    def interval(values: FloatArray) -> list[float]:
+        mean = bootstrap(stretches(values), statistic=np.mean)
+        return [mean.value, mean.low, mean.high]
 
     error, near, best = of("error_m"), of("neighbours_error_m"), of("best_neighbours_error_m")
-    gain, over_best = (bootstrap(stretches(other - error), statistic=np.mean) for other in (near, best))
-    inside = bootstrap(stretches(of("inside")), statistic=np.mean)
+    gain, inside = interval(near - error), interval(of("inside"))
     figures = {
         "median_m": float(np.median(error)),
         "mean_m": float(error.mean()),
         "neighbours_median_m": float(np.median(near)),
         "neighbours_mean_m": float(near.mean()),
         "best_neighbours_mean_m": float(best.mean()),
-        "gain_m": [gain.value, gain.low, gain.high],
-        "gain_over_best_m": [over_best.value, over_best.low, over_best.high],
-        "inside": [inside.value, inside.low, inside.high],
+        "gain_m": gain,
+        "gain_over_best_m": interval(best - error),
+        "inside": inside,
         "area_m2": float(np.median(of("area_m2"))),
         "radius_m": float(np.median(of("radius_m"))),
     }
@@ -134,8 +138,8 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     value = (
         f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN {figures['neighbours_median_m']:.2f} m "
     )
-    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside.value:.0%} inside"
-    asked = f"gain {gain.value:.2f} m ({gain.low:.2f} to {gain.high:.2f}), 85 to 95 % inside"
+    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside[0]:.0%} inside"
+    asked = f"gain {gain[0]:.2f} m ({gain[1]:.2f} to {gain[2]:.2f}), 85 to 95 % inside"
     return {**line(what, value, asked), **figures}
 
 
@@ -192,28 +196,14 @@ def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: error, gain over nearest neighbours with its 95 % interval, and regions."""
-    head = (
-        "training rows, model, seed",
-        "error, median (mean), m",
-        "kNN, median (mean), m",
-        "gain on kNN, m",
-        "gain on kNN of the best k, m",
-        "inside 90 % regions",
-        "region, m²",
-        "radius, m",
-    )
-    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
-    for row in rows:
-        gain, best = ("{:.2f} ({:.2f} to {:.2f})".format(*row[key]) for key in ("gain_m", "gain_over_best_m"))
-        cells = (
-            row["what"],
-            f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
-            f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
-            gain,
-            best,
-            "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
-            f"{row['area_m2']:.1f}",
-            f"{row['radius_m']:.1f}",
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
+        "training rows, model, seed": lambda row: row["what"],
+        "error, median (mean), m": lambda row: f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
+        "kNN, median (mean), m": lambda row: f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
+        "gain on kNN, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_m"]),
+        "gain on kNN of the best k, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_over_best_m"]),
+        "inside 90 % regions": lambda row: "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
+        "region, m²": lambda row: f"{row['area_m2']:.1f}",
+        "radius, m": lambda row: f"{row['radius_m']:.1f}",
+    }
+    return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in rows))

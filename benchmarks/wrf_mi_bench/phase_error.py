@@ -6,7 +6,6 @@ figure uses the seeds of these rooms.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,12 +18,13 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import Survey, random_room_record
 
-from .comparison import kept, line
+from .comparison import kept_work, line
 from .fit_key import fit_key, source_files
 
 SEEDS = range(101, 105)
@@ -59,8 +59,8 @@ def measure_room(seed: int, folder: Path) -> list[list[float]]:
         tracer = RayTracer(true, instrument, TRUTH)
         truth = tracer.observe(tracer.trace(record.tx_pos_m))[0]
         paths = RayTracer(scan, instrument, PREDICTION).trace(record.tx_pos_m).paths
-        found = [replace(instrument, phase_error=rad).observe(paths)[0] for rad in PHASE_ERRORS_RAD]
-        means.append([float(np.mean(TASKS["spectrum"].score(one, truth))) for one in found])
+        spectra = [replace(instrument, phase_error=rad).observe(paths)[0] for rad in PHASE_ERRORS_RAD]
+        means.append([float(np.mean(TASKS["spectrum"].score(predicted, truth))) for predicted in spectra])
     return means
 
 
@@ -70,12 +70,8 @@ def main() -> dict[str, Any]:
     Returns:
         ``rows``: of each carrier, ``ssim`` by phase error, the mean over rooms.
     """
-    place, rooms = RUNS / fit_key(source_files()), []
-    for seed in SEEDS:
-        folder = place / str(seed)
-        shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
-        rooms.append(kept(place / f"{seed}.json", partial(measure_room, seed, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+    place = RUNS / fit_key(source_files())
+    rooms = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]
     rows = []
     for hz, means in zip(CARRIERS_HZ, np.mean(rooms, axis=0).tolist(), strict=True):
         best = PHASE_ERRORS_RAD[int(np.argmax(means))]
@@ -87,9 +83,8 @@ def main() -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the mean SSIM by phase error; the best of each carrier is bold."""
-    head = ["phase error, rad", *(f"{rad:g}" for rad in PHASE_ERRORS_RAD)]
-    lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * len(PHASE_ERRORS_RAD)]
+    lines = []
     for row in rows:
-        cells = [f"**{one:.3f}**" if one == max(row["ssim"]) else f"{one:.3f}" for one in row["ssim"]]
-        lines.append(f"| {row['what']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = (f"**{ssim:.3f}**" if ssim == max(row["ssim"]) else f"{ssim:.3f}" for ssim in row["ssim"])
+        lines.append([row["what"], *cells])
+    return markdown_table(["phase error, rad", *(f"{rad:g}" for rad in PHASE_ERRORS_RAD)], lines)

@@ -34,6 +34,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.graph import Batch
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
@@ -281,10 +282,8 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
     """Markdown table of measured ratios."""
     titles = {pair.name: pair.title for pair in PAIRS}
-    lines = ["| ratio | measured (95 % interval) | medians |", "| --- | --- | --- |"]
+    lines = []
     for name, one in ratios.items():
-        lines.append(
-            f"| {titles[name]} | **{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g}) "
-            f"| {one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms |"
-        )
-    return "\n".join(lines)
+        interval = f"**{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g})"
+        lines.append([titles[name], interval, f"{one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms"])
+    return markdown_table(["ratio", "measured (95 % interval)", "medians"], lines)

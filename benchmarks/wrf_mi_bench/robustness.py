@@ -11,7 +11,7 @@ from typing import Any
 
 from . import endurance, faults
 from .bench import BenchFailed
-from .comparison import Row, kept, line
+from .comparison import Row, kept, kept_work, line
 from .fault_commands import COMMANDS
 from .fit_key import fit_key, source_files
 from .hostile_files import run_readers
@@ -61,17 +61,13 @@ def main() -> dict[str, Any]:
     place = RUNS / fit_key(source_files())
     found: dict[str, Any] = {}
     for name in COMMANDS:
-        folder = place / f"faults-{name}"
-        for kind, one in kept(place / f"faults-{name}.json", partial(faults.run, folder, [name])).items():
+        of_command = kept_work(place, f"faults-{name}", partial(faults.run, names=[name]))
+        for kind, counts in of_command.items():
             total = found.setdefault(kind, {"cases": 0, "failed": []})
-            total["cases"] += one["cases"]
-            total["failed"] += one["failed"]
-        shutil.rmtree(folder, ignore_errors=True)
-    long = []
-    for work in (endurance.lost_worker, endurance.memory, endurance.demo):
-        folder = place / work.__name__
-        long.append(kept(place / f"{work.__name__}.json", partial(work, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+            total["cases"] += counts["cases"]
+            total["failed"] += counts["failed"]
+    works = (endurance.lost_worker, endurance.memory, endurance.demo)
+    long = [kept_work(place, work.__name__, work) for work in works]
     files = []
     groups = [list(READERS)[k : k + TOGETHER] for k in range(0, len(READERS), TOGETHER)]
     for number, names in enumerate(groups):

@@ -7,7 +7,6 @@ nothing was tuned on them.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
 
-from .comparison import kept, line
+from .comparison import kept_work, line
 from .fit_key import fit_key, source_files
 from .scene import match
 
@@ -108,12 +107,8 @@ def main() -> dict[str, Any]:
         ``rows``: of each room, and of the median over rooms, ``cea_db`` by column, and for each room how wrong its
         ``scan`` is and sizes and duration of its ``correction``.
     """
-    place, rows = RUNS / fit_key(source_files()), list[dict[str, Any]]()
-    for seed in SEEDS:
-        folder = place / str(seed)
-        shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
-        rows.append(kept(place / f"{seed}.json", partial(measure_room, seed, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+    place = RUNS / fit_key(source_files())
+    rows = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]
     gains = [row["cea_db"][CORRECTED] - row["cea_db"][SCAN] for row in rows]
     medians = {column: float(np.median([row["cea_db"][column] for row in rows])) for column in COLUMNS}
     text = f"{np.median(gains):.1f} dB ({min(gains):.1f} to {max(gains):.1f} dB)"

@@ -27,7 +27,7 @@ from scipy.stats import binomtest, quantile_test
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
-from wrf_mi.runs.sweep import dataset_files
+from wrf_mi.runs.sweep import dataset_files, markdown_table
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
@@ -228,9 +228,9 @@ def _say(text: str) -> None:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of stored and measured figures."""
-    lines = ["| figure | stored | equal within | measured | verdict |", "| --- | --- | --- | --- | --- |"]
+    lines = []
     for row in rows:
         measured = "" if row["measured"] is None else f"{row['measured']:.4g}"
         interval = f"{row['low']:.4g} to {row['high']:.4g}"
-        lines.append(f"| {row['what']} | {row['stored']:.4g} | {interval} | {measured} | {row['verdict']} |")
-    return "\n".join(lines)
+        lines.append([row["what"], f"{row['stored']:.4g}", interval, measured, row["verdict"]])
+    return markdown_table(["figure", "stored", "equal within", "measured", "verdict"], lines)

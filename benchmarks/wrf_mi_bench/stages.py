@@ -22,6 +22,7 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
@@ -221,26 +222,15 @@ def stages_text(stages: Sequence[Mapping[str, Any]]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table, a line for each cell: the hybrid, its stages, its best part by mean score, kriging and IDW."""
-    head = (
-        "data",
-        "hybrid",
-        "inside",
-        "CRPS",
-        "stages, held-out score",
-        "best part alone",
-        "gain over it",
-        "kriging",
-        "IDW",
-        "clearly worse than",
-    )
-    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+    head = ["data", "hybrid", "inside", "CRPS", "stages, held-out score", "best part alone", "gain over it"]
+    lines = []
     for cell in dict.fromkeys(row["cell"] for row in rows):
         hybrid, *others = (row for row in rows if row["cell"] == cell)
         medians = {row["model"]: f"{row['score']['median']:.3g}" for row in others}
         best = min(others, key=lambda row: row["gain"])
         worse = [row["model"] for row in others if row["gain_high"] < 0]
         inside, crps = hybrid["inside_90"], hybrid["crps"]
-        cells = (
+        cells = [
             hybrid["what"].rpartition(":")[0],
             f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
             "" if inside is None else f"{inside:.0%}",
@@ -250,9 +240,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
             *(medians.get(name, "") for name in ("kriging", "idw")),
             ", ".join(worse),
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        ]
+        lines.append(cells)
+    return markdown_table([*head, "kriging", "IDW", "clearly worse than"], lines)
 
 
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -261,12 +251,8 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     beyond = [row for row in pairs if row["gain"] < -LIMITS[row["block"]]]
     hybrids = [row for row in rows if "gain" not in row and row["inside_90"] is not None]
     inside = [row for row in hybrids if INSIDE[0] <= row["inside_90"] <= INSIDE[1]]
-    counts: dict[str, Any] = {
-        "comparisons": len(pairs),
-        "worse": len(worse),
-        "cells": len(hybrids),
-        "inside": len(inside),
-    }
+    counts: dict[str, Any] = {"comparisons": len(pairs), "worse": len(worse)}
+    counts |= {"cells": len(hybrids), "inside": len(inside)}
     if len(worse) > WORSE_SHARE * len(pairs) or beyond:
         text = f"clearly worse than a part alone in {len(worse)} of {len(pairs)} comparisons"
         counts["failed"] = f"{text}, by more than the limit in {len(beyond)}"

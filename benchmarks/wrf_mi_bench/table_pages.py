@@ -13,6 +13,7 @@ import numpy as np
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically, write_figure
 from wrf_mi.runs.figures import score_cdf
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 
 from .table_plan import MADE_HERE, PARTS, SHARES, Part, plan
@@ -127,7 +128,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         for rank, method in enumerate(sorted(medians, key=lambda method: sign * medians[method])):
             ranks.setdefault(method, []).append(rank / max(len(medians) - 1, 1))
     entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
-    lines = _head([task.label, *(title_of(part) for part in columns), "paper, other data"])
+    lines = []
     best = {part: min(medians.values(), key=lambda median: sign * median) for part, medians in columns.items()}
     for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
         cells = []
@@ -138,16 +139,8 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         # Where labels differ between columns, as the inputs do, the plain name is shown.
         labels = {entry.label for entry in entries[method]}
         label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
-        lines.append(_cells([label, *cells, entries[method][0].published]))
-    return "\n".join(lines)
-
-
-def _cells(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _head(cells: Sequence[str]) -> list[str]:
-    return [_cells(cells), _cells(["---"] * len(cells))]
+        lines.append([label, *cells, entries[method][0].published])
+    return markdown_table([task.label, *(title_of(part) for part in columns), "paper, other data"], lines)
 
 
 def title_of(part: Part) -> str:
@@ -163,8 +156,8 @@ def part_table(part: Part, groups: Groups) -> str:
     def median(key: tuple[float, str]) -> float:
         return float(np.mean([one["score"]["median"] for one in groups[key]]))
 
-    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
-    lines = _head([*heads, "paper, other data"])
+    head = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
+    lines = []
     digits, newest = task.digits, newest_data(groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
         found = groups[share, method]
@@ -181,12 +174,11 @@ def part_table(part: Part, groups: Groups) -> str:
             f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
             part.entries[method].published if share == max(share for share, _ in groups) else "",
         ]
-        lines.append(_cells(cells))
-    lines += _reference_rows(part, groups)
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown_table([*head, "paper, other data"], [*lines, *_reference_rows(part, groups)])
 
 
-def _reference_rows(part: Part, groups: Groups) -> list[str]:
+def _reference_rows(part: Part, groups: Groups) -> list[list[str]]:
     """Lines of the references that every run states, where the part has no row of interpolation."""
     if "idw" in part.entries:
         return []
@@ -194,6 +186,6 @@ def _reference_rows(part: Part, groups: Groups) -> list[str]:
     one = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
     words, lines = TASKS[part.task].references, []
     for key, block in one["reference"].items():
-        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
-        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
+        scores = (f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
+        lines.append([str(one["n_train"]), words[key], f"**{block['median']:.{digits}f}**", *scores, *[""] * 4])
     return lines

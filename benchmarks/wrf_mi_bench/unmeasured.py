@@ -22,6 +22,7 @@ from wrf_mi.correction import CorrectionOptions, correct_scene, default_options,
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import train
 from wrf_mi.runs.results import Observations, Results, read_run
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
 from wrf_mi.synthetic.room_bands import NAME as BANDS
@@ -204,12 +205,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     methods = [row["method"] for row in by_place[0]][1:]
     shared = any([row["method"] for row in found][1:] != methods for found in by_place)
     columns = ["held out", HYBRID, "inside", *(["others"] if shared else methods)]
-    lines = [f"| {' | '.join(columns)} |", f"| {' | '.join(['---'] * len(columns))} |"]
+    lines = []
     for at, (hybrid, *others) in zip(places, by_place, strict=True):
         cells = [f"{row['method']} {_with_gain(row)}" if shared else _with_gain(row) for row in others]
         first = [at, f"**{_score(hybrid)}**", f"{hybrid['inside']:.0%}"]
-        lines.append(f"| {' | '.join([*first, *(['; '.join(cells)] if shared else cells)])} |")
-    return "\n".join(lines)
+        lines.append([*first, *(["; ".join(cells)] if shared else cells)])
+    return markdown_table(columns, lines)
 
 
 def _score(row: Mapping[str, Any]) -> str:

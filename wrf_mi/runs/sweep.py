@@ -15,7 +15,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -290,12 +290,13 @@ def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
 
 def sweep_table(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:
     """Markdown table of the rows of `run_sweep`."""
-    columns = [*varied, *HEADINGS.values()]
-    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
-    for row in rows:
-        cells = [_cell(key, row[key]) for key in (*varied, *HEADINGS)]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    cells = ([_cell(key, row[key]) for key in (*varied, *HEADINGS)] for row in rows)
+    return markdown_table([*varied, *HEADINGS.values()], cells)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Table in Markdown of a heading and rows of as many cells."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def _cell(key: str, value: Any) -> str:
