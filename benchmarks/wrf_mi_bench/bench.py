@@ -108,7 +108,9 @@ _OWN: Mapping[str, Check] = {
     "budgets": _here("fields at budgets", "budget:main", RFID),
     "training": _here("training", "training:main", RFID),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
-    "intervals": _here("intervals of three models", "coverage:main", RFID, FLAT, resumes=True, table="coverage:table"),
+    "intervals": _here(
+        "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
+    ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "new-carriers": _here(
         "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
@@ -156,10 +158,7 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
     """Measure cases and checks, each in a subprocess, and write ``<case>.json`` and ``README.md`` to ``out``.
 
     A case that is finished in ``runs`` for the same arguments, source, data and versions is used again; a stopped one
-    is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths.
-
-    Returns:
-        Content of the JSON file of each case.
+    is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths. Content of each JSON file.
     """
     for name in names:
         if name not in CASES and name not in CHECKS:
@@ -235,11 +234,7 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
 
 
 def run_command(arguments: Sequence[str], folder: Path, where: str = "", resumes: bool = True) -> float | None:
-    """Run ``wrf-mi`` into a run folder, or resume it there.
-
-    Returns:
-        Elapsed seconds; None where the run was resumed.
-    """
+    """Run ``wrf-mi`` into a run folder, or resume it there; elapsed seconds, None where it was resumed."""
     resumed = resumes and (folder / CONFIG).exists()
     call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
     start = time.perf_counter()
@@ -271,8 +266,7 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
 def provenance(*modules: str) -> dict[str, Any]:
     """Date, machine, versions of packages, digests of the source and, in a worker, its number of threads.
 
-    Args:
-        modules: modules that made the result; what they import counts too.
+    ``modules`` made the result; what they import counts too.
     """
     count, known = worker_threads(), versions()
     machine = {

@@ -55,11 +55,10 @@ BUDGETS: Mapping[str, Budget] = {
 def budgets(
     record: Record, work: Path, schedule: Sequence[str] = (), given: Mapping[str, Budget] = BUDGETS
 ) -> dict[str, Any]:
-    """Fit a field at each budget on the official split and measure them beside each other.
+    """Fit a field at each budget on the official split and measure them beside each other; by name:
 
-    Returns:
-        By name: ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
-        `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
+    ``gaussians``, ``bytes``, ``ssim`` (quantiles on the test rows), ``train_seconds``, the times of
+    `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
     """
     fits, folders = dict[str, Path](), dict[str, Path]()
     for number, (name, budget) in enumerate(given.items()):

@@ -17,13 +17,9 @@ SETTINGS = ("deterministic=true", "density.every=10", "density.start=0", "valida
 
 
 def main(file: str, backend: str, threads: str, small: str) -> None:
-    """Compute images, gradients and metrics, and store them as ``.npz``.
+    """Compute images, gradients and metrics, and store them as ``.npz``; ``small`` is "1" for few rows and steps.
 
-    Args:
-        file: file to write.
-        backend: ``llvm`` or ``cuda``; a deterministic training is only made on ``llvm``.
-        threads: number of threads of the CPU.
-        small: ``1``: few rows, Gaussians and steps.
+    A deterministic training, with one thread, is only made on ``llvm``.
     """
     known = init(backend, int(threads))
     import drjit as dr

@@ -60,15 +60,9 @@ def growth_mb(work: Callable[[], object], calls: int) -> float:
 
 
 def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -> dict[str, Any]:
-    """Growth of memory by predictions and by opened runs, of kriging and of Gaussians.
+    """Growth of memory by predictions and by opened runs, of kriging and of Gaussians: ``rows`` and ``wrong``.
 
-    Args:
-        folder: folder for data and runs.
-        predictions: predictions of each run.
-        opened: number of times that each run is opened, and its results are read.
-
-    Returns:
-        ``rows`` and ``wrong``.
+    Each run predicts ``predictions`` times, and is opened and its results read ``opened`` times.
     """
     prepare_data(folder)
     field = with_settings(default_config("spectrum", False), FIELD)
@@ -103,11 +97,7 @@ def _tree(process: psutil.Process) -> Iterator[psutil.Process]:
 
 
 def demo(folder: Path) -> dict[str, Any]:
-    """Largest resident memory of ``wrf-mi demo`` and its child processes, together.
-
-    Returns:
-        ``rows`` and ``wrong``.
-    """
+    """Largest resident memory of ``wrf-mi demo`` and its child processes together: ``rows`` and ``wrong``."""
     call = [sys.executable, "-m", "wrf_mi.cli", "demo", "--out", str(folder / "demo")]
     started, most = subprocess.Popen(call, stdout=subprocess.DEVNULL), 0
     process = psutil.Process(started.pid)
@@ -125,11 +115,7 @@ def demo(folder: Path) -> dict[str, Any]:
 
 
 def lost_worker(folder: Path) -> dict[str, Any]:
-    """Tables on two workers, one of which is killed while it works, against tables of one process.
-
-    Returns:
-        ``rows`` and ``wrong``.
-    """
+    """Tables on two workers, one of which is killed at work, against one process: ``rows`` and ``wrong``."""
     stored = folder / "lost.json"
     status, _ = run_module("wrf_mi_bench.endurance", [str(folder), str(stored)])
     wrong = json.loads(stored.read_text()) if status == 0 else [f"lost worker: ended with status {status}"]

@@ -54,9 +54,8 @@ class Command(ABC):
     def prepare(self, children: bool) -> None:
         """Prepare this process, in which the command is called.
 
-        Args:
-            children: False: what the command starts as a child process is called in this one, so that its writes
-                count, and it ends with it.
+        Without ``children`` what the command starts as a child process is called in this one, so that its writes count,
+        and it ends with it.
         """
         return
 
@@ -89,7 +88,6 @@ class Training(Command):
         self.name, self._data = name, data
 
     def call(self, place: Path) -> list[str]:
-        """Arguments, see `Command`."""
         out = place / "run"
         if (out / CONFIG).exists():
             return ["train", "--resume", str(out)]
@@ -99,7 +97,6 @@ class Training(Command):
         return [*call, *scene, *(part for setting in SETTINGS[self.name] for part in ("--set", setting))]
 
     def content(self, place: Path) -> dict[str, Any]:
-        """Metrics, fitted arrays and predictions."""
         return _run_content(place / "run")
 
 
@@ -130,7 +127,6 @@ class Correction(Command):
         init("llvm", threads=1)
 
     def call(self, place: Path) -> list[str] | None:
-        """Arguments, see `Command`."""
         out = place / "scene"
         if out.exists():
             return None
@@ -179,11 +175,9 @@ class Tables(Command):
             setattr(bench, "run_module", run_module)  # noqa: B010
 
     def call(self, place: Path) -> list[str]:
-        """Arguments, see `Command`."""
         return ["bench", "tables", "--out", str(place / "results"), "--runs", str(place / "runs")]
 
     def content(self, place: Path) -> dict[str, Any]:
-        """Rows, pages and pictures, scenes, and runs."""
         content = _file_content(place / "results") | _file_content(place / "runs" / "tables" / "scenes")
         for name in [name for name in content if name.endswith("-seed0.json")]:
             content[name] = {key: value for key, value in json.loads(content[name]).items() if key not in WHEN}

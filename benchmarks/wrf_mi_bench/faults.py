@@ -47,11 +47,8 @@ Signals = Sequence[tuple[float, int]]
 def watch_changes(folder: Path, at: int = 0, number: int = signal.SIGKILL, times: int = 1) -> list[str]:
     """Audit events of the changes of files below a folder that this process makes, kept up to date.
 
-    Args:
-        folder: the folder.
-        at: change that a signal precedes, counted from 1; 0: none.
-        number: number of the signal, which this process sends to itself.
-        times: signals, one at each of so many changes.
+    A signal, which this process sends to itself, precedes the change ``at``, counted from 1, and the next ones, as many
+    ``times`` in all; 0: none.
     """
     changes, below = list[str](), str(folder)
 
@@ -105,12 +102,7 @@ def obey_permissions() -> None:
 
 
 class Trial:
-    """A command, and its results without faults.
-
-    Args:
-        command: the command.
-        folder: folder for data and results.
-    """
+    """A command, and its results without faults, in a folder for data and results."""
 
     def __init__(self, command: Command, folder: Path) -> None:
         self.command, self.folder = command, folder
@@ -142,11 +134,8 @@ class Trial:
     ) -> int:
         """Status of the command with its results in a folder, where it goes on if it was begun.
 
-        Args:
-            place: folder for the results.
-            before: called in the fork before the command; what it returns, if callable, is called after it.
-            signals: signals to the fork.
-            children: leave the processes that the command starts processes, see `Command.prepare`.
+        ``before`` is called in the fork before the command; what it returns, if callable, is called after it. With
+        ``children`` the processes that the command starts stay processes, see `Command.prepare`.
         """
         place.mkdir(exist_ok=True)
         call = self.command.call(place)
@@ -293,12 +282,9 @@ def locked(trial: Trial) -> Iterator[str]:
 
 
 def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, Any]:
-    """Cases and failures of all faults, by their kind.
+    """Cases and failures of all faults of commands (`wrf_mi_bench.fault_commands.COMMANDS`), by their kind.
 
-    Args:
-        folder: folder for data and results.
-        names: keys of `wrf_mi_bench.fault_commands.COMMANDS`.
-        kills: random kills, and kills at changes of files, of each command; None: 20, and all.
+    ``kills`` are random kills, and kills at changes of files, of each command; None: 20, and all.
     """
     found: dict[str, list[str]] = {}
     for name in names:

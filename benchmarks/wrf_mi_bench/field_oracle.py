@@ -57,16 +57,10 @@ def tangent_basis(direction: ArrayLike) -> FloatArray:
 
 
 def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, receiver: Receiver) -> Projection:
-    """Project Gaussians onto a receiver's sphere of directions.
+    """Project Gaussians onto a receiver's sphere of directions; the order omits Gaussians nearer than ``NEAR_M``.
 
-    Args:
-        mean_m: shape [n, 3], world frame, metres.
-        scale_m: shape [n, 3], standard deviations along the Gaussian's axes, metres.
-        quaternion_xyzw: shape [n, 4], the Gaussian's axes to world.
-        receiver: pose of the receiver.
-
-    Returns:
-        The projection; its order omits Gaussians nearer than ``NEAR_M``.
+    Means [n, 3] in the world frame and standard deviations [n, 3] along the Gaussians' axes are in metres, quaternions
+    [n, 4] turn these axes to the world.
     """
     mean = np.asarray(mean_m, float)
     to_world = receiver.to_world
@@ -105,15 +99,9 @@ def footprint(projection: Projection, index: int, directions: FloatArray) -> Flo
 
 
 def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLike) -> ComplexArray:
-    """WRF-GS: R = sum_i G'_i S_i prod_{j<i} (1 - G'_j (1 - delta_j)).
+    """WRF-GS: R = sum_i G'_i S_i prod_{j<i} (1 - G'_j (1 - delta_j)), the complex field [...] at each direction.
 
-    Args:
-        footprints: shape [n, ...], near to far.
-        signal: complex S, shape [n].
-        attenuation: complex delta, shape [n], magnitude at most 1.
-
-    Returns:
-        Complex, shape [...]: the received field at each direction.
+    Footprints [n, ...] are near to far, signals S [n] complex, attenuations delta [n] complex with magnitude at most 1.
 
     Source: WRF-GS, eq. 12 and 13, where footprints are 0 or 1; G' interpolates between passing a Gaussian
     by (factor 1) and crossing its centre (factor delta).
@@ -127,15 +115,9 @@ def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLi
 
 
 def blend_alpha(footprints: ArrayLike, signal: ArrayLike, opacity: ArrayLike) -> ComplexArray:
-    """WRF-GS+: R = sum_i S_i alpha_i prod_{j<i} (1 - alpha_j) with alpha_i = o_i G'_i.
+    """WRF-GS+: R = sum_i S_i alpha_i prod_{j<i} (1 - alpha_j) with alpha_i = o_i G'_i, as `blend_product`.
 
-    Args:
-        footprints: shape [n, ...], near to far.
-        signal: complex S, static part and deviation together, shape [n].
-        opacity: real o, shape [n], in 0..1.
-
-    Returns:
-        Complex, shape [...]: the received field at each direction.
+    Signals S [n] are static part and deviation together, opacities o [n] are in 0..1.
 
     Source: WRF-GS+, complex-valued alpha blending.
     """
@@ -154,23 +136,10 @@ def render(
     attenuation: ArrayLike | None = None,
     opacity: ArrayLike | None = None,
 ) -> ComplexArray:
-    """Complex field at a receiver; give ``attenuation`` for WRF-GS or ``opacity`` for WRF-GS+.
+    """Complex field [H, W] at a receiver; give ``attenuation`` for WRF-GS or ``opacity`` for WRF-GS+.
 
-    Args:
-        mean_m: shape [n, 3], world frame, metres.
-        scale_m: shape [n, 3], metres.
-        quaternion_xyzw: shape [n, 4].
-        signal: complex, shape [n].
-        receiver: pose of the receiver.
-        directions: unit vectors in the receiver's frame, [H, W, 3] as of ``core.pixel_directions``.
-        attenuation: complex delta, shape [n].
-        opacity: real, shape [n].
-
-    Returns:
-        Complex, shape [H, W].
-
-    Raises:
-        TypeError: neither or both of ``attenuation`` and ``opacity``.
+    Gaussians are as of `project`, signals as of `blend_product` and `blend_alpha`; directions [H, W, 3] are unit
+    vectors in the receiver's frame, as of ``core.pixel_directions``. `TypeError` for neither or both.
     """
     if (attenuation is None) == (opacity is None):
         raise TypeError("give either attenuation (WRF-GS) or opacity (WRF-GS+)")

@@ -18,13 +18,9 @@ DIGITS = 16  # hexadecimal digits of a key: two of a million fits share a key wi
 
 
 def fit_key(*determining: Any) -> str:
-    """Key of a fit: a digest of `versions` and of the given values.
+    """Key of a fit: a digest of `versions` and of values as for `wrf_mi.core.digest.content_digest`.
 
-    Args:
-        determining: values as for `wrf_mi.core.digest.content_digest`.
-
-    Raises:
-        InputError: a path that does not exist.
+    `InputError` for a path that does not exist.
     """
     return content_digest(versions(), *determining)[:DIGITS]
 

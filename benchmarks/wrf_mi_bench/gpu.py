@@ -23,11 +23,7 @@ JOB = "wrf_mi_bench.gpu_job"
 
 
 def main() -> dict[str, Any]:
-    """Both backends of this machine.
-
-    Raises:
-        InputError: no GPU works here.
-    """
+    """Both backends of this machine; `InputError` where no GPU works."""
     try:
         choose("cuda")
     except BackendError as error:

@@ -73,16 +73,11 @@ def mutated(content: bytes, number: int, name: str) -> bytes:
 
 
 def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str, Any]]:
-    """Give each reader ``count`` inputs, in child processes.
+    """Give each reader (`wrf_mi_bench.hostile_samples.READERS`) ``count`` inputs, in child processes.
 
-    Args:
-        folder: folder for samples and results, which are used again.
-        names: readers (`wrf_mi_bench.hostile_samples.READERS`).
-        count: inputs of each.
-
-    Returns:
-        For each reader: ``reader``, ``inputs``, ``refused``, ``loaded``, ``failed`` (messages by number of the input),
-        ``slowest_s`` and ``largest_mb``, growth of the resident memory by one input.
+    Samples and results in ``folder`` are used again. Each reader has ``reader``, ``inputs``, ``refused``, ``loaded``,
+    ``failed`` (messages by number of the input), ``slowest_s`` and ``largest_mb``, growth of the resident memory by one
+    input.
     """
     from .hostile_samples import prepare
 

@@ -157,9 +157,8 @@ def _show(name: str) -> Any:
 def main() -> dict[str, Any]:
     """Measure all cells, those that this code has measured before excepted; `InputError` where data are missing.
 
-    Returns:
-        ``rows``; ``calibration`` of each cell; ``failed`` where nearest neighbours are not clearly worse with `ROWS`
-        rows and the walls, or regions do not hold 85 to 95 % of the true positions, draws pooled.
+    ``failed`` is there where nearest neighbours are not clearly worse with `ROWS` rows and the walls, or regions do not
+    hold 85 to 95 % of the true positions, draws pooled; ``calibration`` is that of each cell.
     """
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())

@@ -67,8 +67,7 @@ def measure_room(seed: int, folder: Path) -> list[list[float]]:
 def main() -> dict[str, Any]:
     """Measure all rooms; a room that this code has measured before is not measured again.
 
-    Returns:
-        ``rows``: of each carrier, ``ssim`` by phase error, the mean over rooms.
+    Rows have, of each carrier, ``ssim`` by phase error, the mean over rooms.
     """
     place = RUNS / fit_key(source_files())
     rooms = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]

@@ -27,11 +27,7 @@ ASKED = "0.85 and 0.85"
 
 
 def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_M) -> tuple[float, float]:
-    """Agreement of walls [n, 2, 2] made with true ones [m, 2, 2], end points in m.
-
-    Returns:
-        Share of the true walls' length that lies near a made wall, and the reverse.
-    """
+    """Shares of true walls [m, 2, 2] near walls made [n, 2, 2], by length, and the reverse; end points in m."""
     made, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
     found = shapely.intersection(true, shapely.buffer(made, near_m)).length / true.length
     right = shapely.intersection(made, shapely.buffer(true, near_m)).length / made.length
@@ -41,10 +37,8 @@ def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_
 def flat_plan() -> dict[str, Any]:
     """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv``.
 
-    An upper bound for any method is the share of the layout near an occupied cell.
-
-    Returns:
-        ``rows`` for the table, and per source: shares, what can be seen, walls, scale of the registration, seconds.
+    An upper bound for any method is the share of the layout near an occupied cell. Each source has shares, what can be
+    seen, walls, scale of the registration, seconds.
     """
     home = data_folder("flat-ble")
     true = layout_walls(read_layout(home / "layout.csv"))

@@ -43,8 +43,8 @@ from wrf_mi.training.step import TrainingData, device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
-from .stock import StockRenderer, rgb_variant
 from .timing import Call, Within, interleaved, ratio
+from .traced import StockRenderer, rgb_variant
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"

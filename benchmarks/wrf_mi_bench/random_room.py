@@ -57,14 +57,9 @@ SCANNER_CLEAR_M = 0.35  # least distance of the LiDAR from surfaces, metres
 
 
 def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) -> tuple[Record, Path, Path]:
-    """Measure the room of a seed: its channels, and a scene made from a scan of it.
+    """Measure the room of a seed: its channels, and a scene made from a scan of it; all files go into ``folder``.
 
     The official split is the first ``train`` rows and the rest; positions are drawn independently.
-
-    Args:
-        seed: seed of the room and of all that is drawn in it.
-        folder: folder for both scenes and the scan.
-        survey: parameters.
 
     Returns:
         The record, with ``task="csi"`` and `Record.truth`; the scene file of the true room, for comparison only; and

@@ -79,11 +79,7 @@ def main() -> dict[str, Any]:
 def quick(
     inputs: int = QUICK_INPUTS, names: Sequence[str] = QUICK_COMMANDS, kills: int = QUICK_KILLS
 ) -> dict[str, Any]:
-    """Few cases of each kind.
-
-    Raises:
-        BenchFailed: one is wrong.
-    """
+    """Few cases of each kind; `BenchFailed` where one is wrong."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         found = faults.run(place / "faults", names, kills)

@@ -53,10 +53,8 @@ def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
 
     Paths are the same where directions at both ends and lengths agree (`wrf_mi_bench.scene.match`); the scan's are
     right where the length is, too, within a quarter of the wavelength, as other phases add up to another channel.
-
-    Returns:
-        ``missing``, the share of the true paths that the scan lacks; ``wrong``, the share of the scan's paths that are
-        not there or not right; and the root mean square ``phase_error_rad`` of reflected paths that are the same.
+    ``missing`` is the share of the true paths that the scan lacks; ``wrong`` that of the scan's paths that are not there
+    or not right; ``phase_error_rad`` the root mean square error of reflected paths that are the same.
     """
     ours, theirs = match(truth.paths, scan.paths)
     longer = np.abs(truth.paths.length_m[ours] - scan.paths.length_m[theirs])
@@ -103,9 +101,8 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
 def main() -> dict[str, Any]:
     """Measure all rooms; a room that this code has measured before is not measured again.
 
-    Returns:
-        ``rows``: of each room, and of the median over rooms, ``cea_db`` by column, and for each room how wrong its
-        ``scan`` is and sizes and duration of its ``correction``.
+    Rows have, of each room and of the median over rooms, ``cea_db`` by column, and for each room how wrong its ``scan``
+    is and sizes and duration of its ``correction``.
     """
     place = RUNS / fit_key(source_files())
     rows = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]

@@ -123,8 +123,7 @@ def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
 def main() -> dict[str, Any]:
     """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture.
 
-    Raises:
-        InputError: signal strengths that are not on this machine; the other data are made here.
+    `InputError` for signal strengths that are not on this machine; the other data are made here.
     """
     data_folder(FLAT)
     place, found = RUNS / fit_key(source_files()), list[dict[str, Any]]()

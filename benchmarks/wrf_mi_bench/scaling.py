@@ -155,9 +155,8 @@ AXES: list[Axis] = [
 def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: float = CALL_S) -> dict[str, Any]:
     """Times and memory of one call at each size.
 
-    Returns:
-        ``sizes`` that were measured, ``left_out``, ``ms`` and ``memory_mb`` of each, and the ``exponent`` of time with
-        its interval and ``limit``, that of n log n at the same sizes.
+    ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time with
+    its interval, ``limit`` that of n log n at the same sizes.
     """
     sizes: list[int] = []
     times: list[Any] = []

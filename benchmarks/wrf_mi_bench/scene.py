@@ -39,11 +39,7 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
 
     Reflections are perfect, two at most, so a path of length d has the power 1 / d^2 up to a constant. Paths of equal
     ends are matched one to one. *Recall* is the share of power of the room's paths that are matched, *precision* that
-    of the made scene's.
-
-    Returns:
-        ``recall`` and ``precision`` of power and of the number of paths, by the number of reflections too, numbers of
-        points, surfaces and paths, seconds and the process's memory.
+    of the made scene's; both are also of the number of paths, and by the number of reflections.
     """
     file = Path(room)
     points, frequency_hz = scanned_points(file, poses, seed=seed)

@@ -3,6 +3,10 @@
 Each cell is a run of the hybrid and one of each part on the same rows. Scores are compared row by row; a part is
 *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
 is measured (`wrf_mi_bench.comparison.stored_part`).
+
+The benchmark of intervals counts test values inside the 90 % intervals of three models. Standard deviations are those of
+errors on training rows that are held out in space: the hybrid has its own, other models are fitted once more, as
+``wrf-mi train --intervals`` does.
 """
 
 from __future__ import annotations
@@ -95,6 +99,13 @@ class Cell:
 
 
 CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
+INTERVAL_CELLS = tuple(
+    Cell(dataset, split, n_train)
+    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CHANNELS: None}.items()
+    for split in ("official", "blocked")
+)
+INTERVAL_MODELS = ("kriging", JOINT, HYBRID)
+"""Models; Gaussians are trained jointly with the paths of the scene where there is one."""
 
 
 def scene_of_cell(cell: Cell, folder: Path) -> str | None:
@@ -191,10 +202,8 @@ def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, 
 def main() -> dict[str, Any]:
     """Measure all cells that are not stored; `InputError` where data are not on this machine.
 
-    Returns:
-        ``rows``; ``worse``: number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside``:
-        number of runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; and ``failed``, where a limit is
-        exceeded.
+    ``worse`` is the number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside`` that of
+    runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; ``failed`` is there where a limit is exceeded.
     """
     for name in (RFID, FLAT):
         data_folder(name)
@@ -257,3 +266,54 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         text = f"clearly worse than a part alone in {len(worse)} of {len(pairs)} comparisons"
         counts["failed"] = f"{text}, by more than the limit in {len(beyond)}"
     return counts
+
+
+def measured_intervals(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
+    """Score, share inside the 90 % intervals, CRPS and time of training of a model, as they are stored."""
+    data, scene = data_of(cell, folder)
+    if name == HYBRID:
+        run = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
+    else:
+        run = run_alone(cell, data, folder, name, scene, intervals=True)
+    block = TASKS[run.task].block
+    return {"block": block, "score": run.metrics[block]} | {
+        key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")
+    }
+
+
+def intervals() -> dict[str, Any]:
+    """Measure all runs that are not stored; `InputError` where data are not on this machine.
+
+    ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` is there where some do not.
+    """
+    for name in (RFID, FLAT):
+        data_folder(name)
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    for cell in INTERVAL_CELLS:
+        for name in INTERVAL_MODELS:
+            print(f"intervals: {cell.title}: {name}", file=sys.stderr, flush=True)
+            part = stored_part(
+                "intervals", f"{cell.name}-{name}", partial(measured_intervals, cell, name, place / cell.name)
+            )
+            parts.append(part)
+            value = f"{part['inside_90']:.1%} inside, CRPS {part['crps']:.3g}"
+            known = {key: part[key] for key in ("inside_90", "crps", "score")}
+            row = {"what": f"{cell.title}: {name}", "value": value, "asked": "85 to 95 % inside"}
+            rows.append({**row, **known, "cell": cell.title, "model": name})
+            print(f"intervals: {row['what']}: {value}", file=sys.stderr, flush=True)
+    inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
+    found = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
+    if inside < len(rows):
+        found["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
+    return found
+
+
+def interval_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table, a line for each data set and split: share inside and CRPS of each model."""
+    lines = []
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        known = {row["model"]: f"{row['inside_90']:.0%}, {row['crps']:.3g}" for row in rows if row["cell"] == cell}
+        lines.append([cell, *(known.get(name, "") for name in INTERVAL_MODELS)])
+    return markdown_table(["data", *INTERVAL_MODELS], lines)

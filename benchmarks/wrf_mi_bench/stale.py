@@ -32,12 +32,8 @@ SHOWN = 4  # changed folders in a line; ``--json`` has all
 def stale(out: Path) -> tuple[list[dict[str, Any]], int]:
     """Results in ``out`` whose source has changed or is unknown, and the number of all results.
 
-    Returns:
-        ``name``, ``date``, ``command``, which measures it anew, and ``changed``: folders of source files, or `UNKNOWN`.
-        The number of results.
-
-    Raises:
-        InputError: a result that cannot be read.
+    A result has ``name``, ``date``, ``command``, which measures it anew, and ``changed``: folders of source files, or
+    `UNKNOWN`. `InputError` for a result that cannot be read.
     """
     history, found, count = History(out), [], 0
     digests = cache(lambda modules: source_digests(*modules))

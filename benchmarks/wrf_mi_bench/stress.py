@@ -23,12 +23,11 @@ from wrf_mi.training.trainer import Trainer
 from .bench import BenchFailed
 from .stress_curves import curves, draw
 from .stress_fields import HARD, HARDEST, RECEIVER, SMALL, cases, gradient_row, image_row, layers, made, ordinary
-from .stress_joint import CANCELLING, COPLANAR, joint
+from .stress_joint import CANCELLING, COPLANAR, joint, phases
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
 from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
-from .stress_traced import phases
 
 PICTURE = Path("docs/images/numerics.png")  # picture of the error curves, written only in a checkout of the project
 SHORT = (

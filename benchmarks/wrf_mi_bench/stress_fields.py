@@ -256,14 +256,9 @@ def gradient_row(
     single: Slope | None = None,
     least: int = 1,
 ) -> Row:
-    """Row of derivatives in float32 compared with float64.
+    """Row of derivatives in float32, by ``single`` or else `gradient`, compared with float64.
 
-    Args:
-        what: beginning of the row.
-        given: cases.
-        report: differentiated arrays, see `gradient`.
-        single: derivatives in float32; None: `gradient`.
-        least: number of Gaussians below which a case is skipped.
+    Arrays of ``report`` are differentiated, see `gradient`; cases with fewer than ``least`` Gaussians are skipped.
     """
     worst, number = GradientWorst(), 0
     for name, field, blending, seed in given:

@@ -146,12 +146,9 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
 def tables(
     out: Path, runs: Path, quick: bool = False, scheduler: Scheduler | None = None, most_s: float | None = None
 ) -> list[dict[str, Any]]:
-    """Measure all rows that are not stored yet and write tables and pictures.
+    """Measure all rows that are not stored yet and write tables and pictures; all stored rows.
 
     A row whose command fails is reported and omitted; the other rows are measured.
-
-    Returns:
-        All stored rows.
     """
     place = out / (f"{FOLDER}-quick" if quick else FOLDER)
     place.mkdir(parents=True, exist_ok=True)

@@ -72,9 +72,7 @@ class Within:
 def seconds(call: Call, processor: bool = False) -> float:
     """Time of one call, until all its kernels have run.
 
-    Args:
-        call: timed call.
-        processor: whether to measure the processor time of this process, which other processes do not lengthen.
+    ``processor`` measures the processor time of this process, which other processes do not lengthen.
     """
     if isinstance(call, Within):
         with call.context():
@@ -95,12 +93,8 @@ def interleaved(
 ) -> dict[str, NDArray[np.float64]]:
     """Times in ms [rounds] of several interleaved calls in this process; every round calls each once.
 
-    Args:
-        calls: calls by name.
-        repeats: number of timed rounds.
-        warm_up: number of rounds before them.
-        most_s: seconds after which no further round begins; three are timed in any case.
-        processor: see `seconds`.
+    ``warm_up`` rounds precede the timed ones; after ``most_s`` seconds no further round begins, but three are timed in
+    any case. ``processor``: see `seconds`.
     """
     start = time.perf_counter()
     for _ in range(warm_up):
@@ -193,12 +187,7 @@ def _watched(call: Call) -> int:
 def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) -> Interval:
     """Exponent of the growth of time with size: the least-squares slope of their logarithms over the larger sizes.
 
-    Overheads hide the growth at small sizes. The interval is from resampled repetitions at each size.
-
-    Args:
-        sizes: ascending sizes, two or more.
-        times: times of the repetitions at each size.
-        seed: seed of the resamples.
+    Overheads hide the growth at small sizes. Sizes ascend; the interval is from resampled repetitions at each size.
     """
     if len(sizes) != len(times) or len(sizes) < 2:
         raise ValueError(f"exponent: {len(sizes)} sizes and {len(times)} sets of times; give two or more of both")

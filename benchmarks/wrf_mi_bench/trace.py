@@ -40,11 +40,8 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
 
     MATLAB's image method has perfect reflections without change of sign, two at most, so the channel is the sum over
     paths of lambda / (4 pi d) exp(-j k d). Paths that MATLAB lacks are confirmed in float64 by `confirm_paths`.
-
-    Returns:
-        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers with a channel in
-        MATLAB and over those where MATLAB lacks no path, seconds, and memory; None for quantiles of no receiver and
-        the share of no path.
+    Quantiles of ``cea_db`` are over all receivers with a channel in MATLAB, and over those where MATLAB lacks no path;
+    quantiles of no receiver and the share of no path are None.
     """
     file = Path(room)
     data = read_arrays(file, KEYS)
@@ -115,13 +112,8 @@ def match_paths(ours: PathKey, theirs: PathKey) -> tuple[IntArray, IntArray]:
 def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntArray, IntArray]:
     """One-to-one assignment of as many paths as possible of the same position, all of whose distances are below 1.
 
-    Args:
-        ours: index of the position of each path, [p].
-        theirs: index of the position of each path of the other list, [q].
-        distances: matrices of distances between paths a [n] and b [m] of both lists, [n, m] each.
-
-    Returns:
-        Indices into both lists, of equal length.
+    Positions are indices [p] and [q] of both lists of paths; ``distances`` gives matrices [n, m] between paths a [n]
+    and b [m] of both. Returns indices into both lists, of equal length.
     """
     pairs = [np.zeros((2, 0), np.int64)]
     for position in np.intersect1d(ours, theirs):
@@ -138,11 +130,7 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
 def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
     """Which paths are mirror reflections or lines of sight without obstruction, by brute force in float64.
 
-    Args:
-        paths: paths of reflections to a receiver.
-        tx_pos_m: positions of the transmitters, [n_tx, 3].
-        rx_pos_m: position of the receiver, [3].
-        triangles: corners of the mesh in metres, [f, 3, 3].
+    Transmitters [n_tx, 3], a receiver [3] and corners of the mesh's triangles [f, 3, 3] are in metres.
     """
     corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)
