@@ -83,19 +83,26 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
     )
 
 
+def reach(projection: Projection, index: int, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared Mahalanobis distances of Gaussian ``index`` at unit vectors [..., 3], and cosines to its direction.
+
+    The distance is taken in the tangent plane, where the pixel's ray meets it (central projection).
+    """
+    cosine = directions @ projection.direction[index]
+    # Behind the receiver there is no such point; the divisor only avoids warnings.
+    point = directions @ projection.basis[index].T / np.where(cosine > MIN_COSINE, cosine, 1.0)[..., None]
+    return np.einsum("...i,ij,...j->...", point, np.linalg.inv(projection.covariance[index]), point), cosine
+
+
 def footprint(projection: Projection, index: int, directions: FloatArray) -> FloatArray:
     """Footprint G' in 0..1 of Gaussian ``index`` at unit vectors [..., 3] in the receiver's frame.
 
-    exp(-m^2 / 2) for a Mahalanobis distance m below ``CUTOFF``, else 0; m is taken in the tangent plane at
-    the point where the pixel's ray meets it (central projection).
+    exp(-m^2 / 2) for a Mahalanobis distance m (`reach`) below ``CUTOFF``, else 0.
     """
     if projection.depth_m[index] < NEAR_M:
         return np.zeros(directions.shape[:-1])
-    cosine = directions @ projection.direction[index]
-    in_front = cosine > MIN_COSINE
-    point = directions @ projection.basis[index].T / np.where(in_front, cosine, 1.0)[..., None]
-    squared = np.einsum("...i,ij,...j->...", point, np.linalg.inv(projection.covariance[index]), point)
-    return np.where(in_front & (squared < CUTOFF**2), np.exp(-squared / 2), 0.0)
+    squared, cosine = reach(projection, index, directions)
+    return np.where((cosine > MIN_COSINE) & (squared < CUTOFF**2), np.exp(-squared / 2), 0.0)
 
 
 def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLike) -> ComplexArray:

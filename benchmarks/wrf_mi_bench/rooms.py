@@ -53,8 +53,8 @@ def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
 
     Paths are the same where directions at both ends and lengths agree (`wrf_mi_bench.scene.match`); the scan's are
     right where the length is, too, within a quarter of the wavelength, as other phases add up to another channel.
-    ``missing`` is the share of the true paths that the scan lacks; ``wrong`` that of the scan's paths that are not there
-    or not right; ``phase_error_rad`` the root mean square error of reflected paths that are the same.
+    ``missing`` is the share of the true paths that the scan lacks; ``wrong`` that of the scan's paths that are not
+    there or not right; ``phase_error_rad`` the root mean square error of reflected paths that are the same.
     """
     ours, theirs = match(truth.paths, scan.paths)
     longer = np.abs(truth.paths.length_m[ours] - scan.paths.length_m[theirs])

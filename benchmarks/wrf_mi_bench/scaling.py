@@ -155,8 +155,8 @@ AXES: list[Axis] = [
 def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: float = CALL_S) -> dict[str, Any]:
     """Times and memory of one call at each size.
 
-    ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time with
-    its interval, ``limit`` that of n log n at the same sizes.
+    ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time
+    with its interval, ``limit`` that of n log n at the same sizes.
     """
     sizes: list[int] = []
     times: list[Any] = []

@@ -176,8 +176,8 @@ def groups() -> list[Group]:
 def main() -> dict[str, Any]:
     """Measure all sentinels whose data are on this machine, unless this code was measured before.
 
-    Rows have, of each figure, ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and ``date`` and
-    ``seconds`` of its group; ``failed`` is a line, where a figure got worse or was not measured.
+    Rows have, of each figure, ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and
+    ``date`` and ``seconds`` of its group; ``failed`` is a line, where a figure got worse or was not measured.
     """
     known = groups()
     place = RUNS / fit_key(source_files())

@@ -4,8 +4,8 @@ Each cell is a run of the hybrid and one of each part on the same rows. Scores a
 *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
 is measured (`wrf_mi_bench.comparison.stored_part`).
 
-The benchmark of intervals counts test values inside the 90 % intervals of three models. Standard deviations are those of
-errors on training rows that are held out in space: the hybrid has its own, other models are fitted once more, as
+The benchmark of intervals counts test values inside the 90 % intervals of three models. Standard deviations are those
+of errors on training rows that are held out in space: the hybrid has its own, other models are fitted once more, as
 ``wrf-mi train --intervals`` does.
 """
 
@@ -284,7 +284,7 @@ def measured_intervals(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
 def intervals() -> dict[str, Any]:
     """Measure all runs that are not stored; `InputError` where data are not on this machine.
 
-    ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` is there where some do not.
+    ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` states where some do not.
     """
     for name in (RFID, FLAT):
         data_folder(name)

@@ -149,6 +149,12 @@ def image(field: Field, blending: str, size: Size) -> ComplexArray:
     return (re.numpy().astype(float) + 1j * im.numpy()).reshape(size)
 
 
+def off_edges(squared: FloatArray, cosine: FloatArray) -> NDArray[np.bool_]:
+    """Mask of directions off the edge of a footprint, where float32 may fall on the other side of the jump."""
+    inside = (np.abs(np.sqrt(squared) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
+    return np.asarray(inside & (np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE))
+
+
 def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> tuple[ComplexArray, NDArray[np.bool_]]:
     """Image [height, width] by `field_oracle` in float64, and a mask of pixels off all footprints' edges.
 
@@ -162,11 +168,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
     seen = field_oracle.project(*parts, RECEIVER)
     clear = np.ones(directions.shape[:2], bool)
     for i in seen.order:
-        cosine = directions @ seen.direction[i]
-        point = directions @ seen.basis[i].T / np.where(cosine > MIN_COSINE, cosine, 1)[..., None]
-        reach = np.sqrt(np.einsum("...i,ij,...j->...", point, np.linalg.inv(seen.covariance[i]), point))
-        clear &= (np.abs(reach - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
-        clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
+        clear &= off_edges(*field_oracle.reach(seen, i, directions))
     return field_oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 

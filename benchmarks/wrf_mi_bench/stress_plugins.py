@@ -28,7 +28,6 @@ from wrf_mi.gaussians.parameters import Gaussians
 from . import field_oracle
 from .stress_fields import (
     HARD,
-    ON_THE_EDGE,
     RECEIVER,
     SIZE,
     SMALL,
@@ -41,6 +40,7 @@ from .stress_fields import (
     image_row,
     layers,
     made,
+    off_edges,
     on_device,
     ordinary,
 )
@@ -91,8 +91,7 @@ def defined(field: Field, blending: str, size: Size) -> tuple[ComplexArray, NDAr
         square = ((t[..., None] * along - centre) ** 2).sum(-1)
         cosine = rays @ (offset[i] / depth[i])
         responses[row] = np.where((square < CUTOFF**2) & (cosine > MIN_COSINE), np.exp(-square / 2), 0)
-        clear &= (np.abs(np.sqrt(square) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
-        clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
+        clear &= off_edges(square, cosine)
     if blending == "alpha":
         return field_oracle.blend_alpha(responses, field.signal[order], field.opacity[order]), clear
     return field_oracle.blend_product(responses, field.signal[order], field.attenuation[order]), clear

@@ -109,16 +109,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
     """
-    columns: dict[Part, dict[str, float]] = {}
-    former = set[tuple[Part, str]]()
-    for part in PARTS:
-        groups = grouped(part, stored, quick) if part.table == name else {}
-        newest = newest_data(groups) if groups else None
-        for (share, method), rows in groups.items():
-            if quick or share == SHARES[0]:
-                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
-                if is_former(part, rows, newest):
-                    former.add((part, method))
+    columns, former = _medians(name, stored, quick)
     if not columns:
         return ""
     task = TASKS[next(iter(columns)).task]
@@ -141,6 +132,23 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
         lines.append([label, *cells, entries[method][0].published])
     return markdown_table([task.label, *(title_of(part) for part in columns), "paper, other data"], lines)
+
+
+def _medians(
+    name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool
+) -> tuple[dict[Part, dict[str, float]], set[tuple[Part, str]]]:
+    """Medians of each method by part of an overview, and those measured on former data."""
+    columns: dict[Part, dict[str, float]] = {}
+    former = set[tuple[Part, str]]()
+    for part in PARTS:
+        groups = grouped(part, stored, quick) if part.table == name else {}
+        newest = newest_data(groups) if groups else None
+        for (share, method), rows in groups.items():
+            if quick or share == SHARES[0]:
+                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
+                if is_former(part, rows, newest):
+                    former.add((part, method))
+    return columns, former
 
 
 def title_of(part: Part) -> str:
