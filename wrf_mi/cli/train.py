@@ -94,11 +94,7 @@ def _is_deterministic(folder: Path) -> bool:
 
 
 def training_request(a: Arguments) -> RunRequest:
-    """What the arguments of the command line ask to fit.
-
-    Raises:
-        InputError: options that do not belong together.
-    """
+    """What the arguments of the command line ask to fit; `InputError`: options that do not belong together."""
     from ..runs.folder import RunRequest
 
     model = a.model or HYBRID

@@ -64,11 +64,7 @@ class Format:
     text: str
 
     def check(self, out: Path, options: ExportOptions) -> None:
-        """Refuse a name of the file, or options, that do not belong to the format.
-
-        Raises:
-            InputError: naming them.
-        """
+        """Refuse a name of the file, or options, that do not belong to the format; `InputError`: naming them."""
         if self.suffix and out.suffix.lower() != self.suffix:
             raise InputError(f"{out}: format {self.name} is a file {self.suffix}; give such a name")
         unset = ExportOptions()

@@ -45,11 +45,7 @@ class Source:
         return load_record(self.name, progress=progress)
 
     def trace(self) -> TraceResult:
-        """The stored paths of a run.
-
-        Raises:
-            InputError: a run that stores none.
-        """
+        """The stored paths of a run; `InputError`: a run that stores none."""
         path = Path(self.name) / PATHS
         if not path.exists():
             text = f"{self.name}: a run of {self.run.config.model} that stores no paths"

@@ -43,11 +43,7 @@ COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
 
 
 def maps_package(name: str, extra: str = "maps") -> Any:
-    """A package that maps need, installed by an extra of this one.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """A package that maps need, installed by an extra of this one; `InputError`: it is not installed."""
     try:
         return import_module(name)
     except ModuleNotFoundError:

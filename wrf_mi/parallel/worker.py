@@ -34,11 +34,7 @@ class WorkerEnvironment:
 
 
 def worker_environment() -> WorkerEnvironment:
-    """The environment of this process.
-
-    Raises:
-        BackendError: neither LLVM nor CUDA can be used here.
-    """
+    """The environment of this process; `BackendError`: neither LLVM nor CUDA can be used here."""
     variables = tuple(sorted((k, v) for k, v in os.environ.items() if k.startswith(VARIABLES)))
     # The import of Mitsuba can wait where nothing has imported it yet.
     backend = init() if "mitsuba" in sys.modules else choose()

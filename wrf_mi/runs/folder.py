@@ -94,11 +94,7 @@ class RunConfig:
 
     @cached_property
     def entry(self) -> Model:
-        """Registry entry of the model.
-
-        Raises:
-            InputError: no model of that name.
-        """
+        """Registry entry of the model; `InputError`: no model of that name."""
         entry = known_model(self.model).serving(self.task, self.scene is not None)
         return with_intervals(entry) if self.intervals else entry
 

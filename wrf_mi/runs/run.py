@@ -60,11 +60,7 @@ class Run:
 
     @cached_property
     def config(self) -> RunConfig:
-        """Content of ``config.yaml``.
-
-        Raises:
-            InputError: not a run folder, or a damaged one.
-        """
+        """Content of ``config.yaml``; `InputError`: not a run folder, or a damaged one."""
         return read_config(self.folder)
 
     @property
@@ -82,11 +78,7 @@ class Run:
 
     @cached_property
     def fitted(self) -> Fitted:
-        """Fitted model.
-
-        Raises:
-            InputError: not a finished run, or a run with several splits.
-        """
+        """Fitted model; `InputError`: not a finished run, or a run with several splits."""
         problem = self.problem
         if not (self.folder / SPLIT).exists():
             raise InputError(f"{self.folder}: one model for each block; choose one, e.g. {self.folder / 'fold0'}")

@@ -226,11 +226,7 @@ def _files(sweep: Sweep) -> dict[str, list[Path]]:
 
 
 def dataset_files(name_or_folder: str) -> list[Path]:
-    """Folder or file of a data set; empty where it is not on this machine.
-
-    Raises:
-        InputError: no such data set.
-    """
+    """Folder or file of a data set; empty where it is not on this machine; `InputError`: no such data set."""
     path = Path(name_or_folder)
     found = path if path.exists() else locate(name_or_folder)
     return [] if found is None else [found]

@@ -49,11 +49,7 @@ class View:
 
     @cached_property
     def html(self) -> str:
-        """The page: one HTML document that needs no network.
-
-        Raises:
-            InputError: it would be larger than `LARGEST_BYTES`.
-        """
+        """The page: one HTML document that needs no network; `InputError`: it would be larger than `LARGEST_BYTES`."""
         text = page(self.content)
         if (size := len(text.encode())) > LARGEST_BYTES:
             remedy = "lower --transmitters, --gaussians or --paths, or give fewer maps"
@@ -66,11 +62,7 @@ class View:
         return self.content.counts
 
     def write(self, path: str | Path) -> Path:
-        """Write the page atomically.
-
-        Raises:
-            InputError: as `html`.
-        """
+        """Write the page atomically; `InputError`: as `html`."""
         return write_atomically(Path(path), self.html)
 
     def _repr_html_(self) -> str:
