@@ -173,6 +173,12 @@ class Trial:
         wrong = differing(self.content, content)
         return f"other results: {', '.join(wrong)}" if wrong else ""
 
+    def judged(self, place: Path, how: str, wrong: str = "") -> str:
+        """What is wrong after a fault, or with the results of going on, which are removed; "" if nothing is."""
+        wrong = wrong or self.finished(place)
+        shutil.rmtree(place, ignore_errors=True)
+        return wrong and f"{self.command.name}, {how}: {wrong}"
+
     def message(self) -> str:
         """Last line of the standard error of the last call."""
         lines = self.errors.read_text(errors="replace").strip().splitlines()
@@ -191,9 +197,8 @@ def killed_at_changes(trial: Trial, most: int | None) -> Iterator[str]:
     for number in trial.numbers(most):
         place = trial.folder / f"change{number}"
         status = trial.run(place, partial(watch_changes, place, number))
-        wrong = trial.finished(place) if status == -signal.SIGKILL else f"status {status} for a kill"
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, killed at change {number} of {len(trial.changes)}: {wrong}"
+        wrong = "" if status == -signal.SIGKILL else f"status {status} for a kill"
+        yield trial.judged(place, f"killed at change {number} of {len(trial.changes)}", wrong)
 
 
 def killed_at_random(trial: Trial, count: int) -> Iterator[str]:
@@ -204,9 +209,7 @@ def killed_at_random(trial: Trial, count: int) -> Iterator[str]:
         while rng.random() < 0.7 or not kills:
             trial.run(place, signals=[(rng.uniform(0, trial.seconds), signal.SIGKILL)])
             kills += 1
-        wrong = trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, killed at {kills} random moments: {wrong}"
+        yield trial.judged(place, f"killed at {kills} random moments")
 
 
 def full_disk(trial: Trial, most: int | None) -> Iterator[str]:
@@ -217,9 +220,7 @@ def full_disk(trial: Trial, most: int | None) -> Iterator[str]:
         limits = (size, resource.RLIM_INFINITY)
         status = trial.run(place, partial(resource.setrlimit, resource.RLIMIT_FSIZE, limits))
         wrong = trial.one_line(status, *trial.command.refused) if status else ""
-        wrong = wrong or trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, files of {size} bytes at most: {wrong}"
+        yield trial.judged(place, f"files of {size} bytes at most", wrong)
 
 
 def no_permission(trial: Trial) -> Iterator[str]:
@@ -229,29 +230,25 @@ def no_permission(trial: Trial) -> Iterator[str]:
     place.chmod(0o500)
     wrong = trial.one_line(trial.run(place, obey_permissions), REFUSED)
     place.chmod(0o700)
-    wrong = wrong or trial.finished(place)
-    shutil.rmtree(place)
-    yield wrong and f"{trial.command.name}, no write permission: {wrong}"
+    yield trial.judged(place, "no write permission", wrong)
 
 
 def interrupted(trial: Trial, most: int | None) -> Iterator[str]:
     """Ctrl-C twice: at a change of files and the next one, which may be the cleaning up, and at random moments."""
     rng = random.Random(trial.command.name)
 
-    def judged(place: Path, status: int, when: str) -> str:
+    def stopped(place: Path, status: int, when: str) -> str:
         wrong = trial.one_line(status, INTERRUPTED) if status else ""  # it may have been about to end
-        wrong = wrong or trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        return wrong and f"{trial.command.name}, Ctrl-C twice {when}: {wrong}"
+        return trial.judged(place, f"Ctrl-C twice {when}", wrong)
 
     for number in trial.numbers(5 if most is None else 2):
         place = trial.folder / f"stopped{number}"
         twice = partial(watch_changes, place, number, signal.SIGINT, 2)
-        yield judged(place, trial.run(place, twice, children=True), f"at change {number} of {len(trial.changes)}")
+        yield stopped(place, trial.run(place, twice, children=True), f"at change {number} of {len(trial.changes)}")
     for number in range(5 if most is None else 1):
         place, first_s = trial.folder / f"impatient{number}", rng.uniform(0.1, trial.seconds)
         signals = [(first_s, signal.SIGINT), (first_s + rng.uniform(0, 0.5), signal.SIGINT)]
-        yield judged(place, trial.run(place, signals=signals, children=True), f"after {first_s:.2f} s")
+        yield stopped(place, trial.run(place, signals=signals, children=True), f"after {first_s:.2f} s")
 
 
 def closed_pipe(trial: Trial) -> Iterator[str]:
@@ -265,9 +262,7 @@ def closed_pipe(trial: Trial) -> Iterator[str]:
 
     status, text = trial.run(place, closed), trial.errors.read_text()
     silent = status in (0, CLOSED) and "Traceback" not in text and "wrf-mi: " not in text
-    wrong = trial.finished(place) if silent else f"status {status}, {trial.message()[:200]!r}"
-    shutil.rmtree(place)
-    yield wrong and f"{trial.command.name}, a closed pipe: {wrong}"
+    yield trial.judged(place, "a closed pipe", "" if silent else f"status {status}, {trial.message()[:200]!r}")
 
 
 def locked(trial: Trial) -> Iterator[str]:

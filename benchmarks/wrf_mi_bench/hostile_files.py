@@ -18,7 +18,8 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
     failures: dict[str, dict[int, str]] = {name: {} for name in names}
     place, first = 0, 0
     while place < len(names):
-        write_atomically(folder / STATE, _tally(names[place], first))
+        write_atomically(folder / STATE, json.dumps(asdict(Tally(names[place], first))))
         call = [sys.executable, "-m", __name__ if __name__ != "__main__" else "wrf_mi_bench.hostile_files"]
         call += [str(folder), ",".join(names[place:]), str(first), str(count)]
         with (folder / "errors.txt").open("w") as errors:
@@ -115,18 +116,17 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
     return rows
 
 
-def _tally(
-    reader: str,
-    number: int,
-    refused: int = 0,
-    loaded: int = 0,
-    failed: Mapping[str, str] | None = None,
-    slowest_s: float = 0.0,
-    largest_mb: float = 0.0,
-) -> str:
-    """Results of a reader before an input, as JSON."""
-    counts = {"reader": reader, "number": number, "refused": refused, "loaded": loaded, "failed": failed or {}}
-    return json.dumps({**counts, "slowest_s": slowest_s, "largest_mb": largest_mb})
+@dataclass
+class Tally:
+    """Results of a reader before the input of a number."""
+
+    reader: str
+    number: int
+    refused: int = 0
+    loaded: int = 0
+    failed: dict[str, str] = field(default_factory=dict)  # messages by number of the input
+    slowest_s: float = 0.0
+    largest_mb: float = 0.0  # growth of the resident memory by one input
 
 
 def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
@@ -206,26 +206,25 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):
-        reader, work = READERS[name], place / "work"
-        refused = loaded = 0
-        failed: dict[str, str] = {}
-        slowest = largest = 0.0
+        reader, work, tally = READERS[name], place / "work", Tally(name, start)
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(place / SAMPLES / reader.group, work)
         whole = (work / reader.file).read_bytes()
         if (wrong := _read_one(reader, work)) is not None:
-            failed["whole"] = f"the whole file is not read: {wrong}"
+            tally.failed["whole"] = f"the whole file is not read: {wrong}"
         for number in range(start, int(count)):
-            write_atomically(place / STATE, _tally(name, number, refused, loaded, failed, slowest, largest))
+            tally.number = number
+            write_atomically(place / STATE, json.dumps(asdict(tally)))
             (work / reader.file).write_bytes(mutated(whole, number, name))
             before, peak = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             wrong = _read_one(reader, work)
-            slowest = max(slowest, time.perf_counter() - before)
-            largest = max(largest, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1e3)
-            refused, loaded = refused + (wrong == ""), loaded + (wrong is None)
+            tally.slowest_s = max(tally.slowest_s, time.perf_counter() - before)
+            growth_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1e3
+            tally.largest_mb = max(tally.largest_mb, growth_mb)
+            tally.refused, tally.loaded = tally.refused + (wrong == ""), tally.loaded + (wrong is None)
             if wrong:
-                failed[str(number)] = wrong
-        append_line(place / RESULTS, _tally(name, int(count), refused, loaded, failed, slowest, largest))
+                tally.failed[str(number)] = wrong
+        append_line(place / RESULTS, json.dumps(asdict(tally) | {"number": int(count)}))
         start = 0
     shutil.rmtree(place / "work", ignore_errors=True)
 

@@ -75,32 +75,29 @@ def _load(folder: Path) -> None:
     check_parts(load(folder))
 
 
-def _of(reader: Callable[..., Any], group: str, *files: str) -> dict[str, Reader]:
-    return {file: Reader(group, file, partial(_read_file, reader, file)) for file in files}
+def _whole(kind: str, *files: str) -> dict[str, Reader]:
+    """Files of a data set, which is read as a whole."""
+    return {f"{kind}: {Path(file).name}": Reader(kind, file, _load) for file in files}
 
 
-def _read_file(reader: Callable[..., Any], file: str, folder: Path) -> Any:
-    return reader(folder / file)
+def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "files") -> dict[str, Reader]:
+    """Files that a reader reads one by one."""
+
+    def read(file: str, folder: Path) -> Any:
+        return reader(folder / file)
+
+    return {f"{kind}: {file}": Reader(group, file, partial(read, file)) for file in files}
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
     """Read a run folder and predict."""
-
-    def read(folder: Path) -> None:
-        run = open_run(folder / name)
-        run.predict([[2.0, 1.0, 1.0]])
-
-    return read
+    return lambda folder: open_run(folder / name).predict([[2.0, 1.0, 1.0]])
 
 
 def _predicted_by_operator(folder: Path) -> None:
     run = open_run(folder / "field")
     run.predict([[2.0, 1.0, 1.0]])
     assert np.isfinite(run.predict([[2.0, 1.0, 1.0]]).mean).all()
-
-
-def _inputs(folder: Path) -> None:
-    read_inputs(folder / "inputs.csv", None)
 
 
 def _observations(folder: Path) -> None:
@@ -114,25 +111,18 @@ def _imported(folder: Path) -> None:
 
 
 READERS: Mapping[str, Reader] = {
-    "spectra: gateway_info.yml": Reader("spectra", "gateway_info.yml", _load),
-    "spectra: tx_pos.csv": Reader("spectra", "tx_pos.csv", _load),
-    "spectra: train_index.txt": Reader("spectra", "train_index.txt", _load),
-    "spectra: 00001.png": Reader("spectra", "spectrum/00001.png", _load),
-    "ble: anchors.csv": Reader("ble", "anchors.csv", _load),
-    "ble: calibration_df.csv": Reader("ble", "calibration_df.csv", _load),
-    "nerf2-ble: gateway_position.yml": Reader("nerf2-ble", "gateway_position.yml", _load),
-    "nerf2-ble: gateway_rssi.csv": Reader("nerf2-ble", "gateway_rssi.csv", _load),
-    "nerf2-csi: base-station.yml": Reader("nerf2-csi", "base-station.yml", _load),
-    "nerf2-csi: csidata.npy": Reader("nerf2-csi", "csidata.npy", _load),
-    **{f"newrf: {k}": v for k, v in _of(read_newrf, "files", "room.npz").items()},
-    **{f"newrf: {k}": v for k, v in _of(read_pickled_table, "files", "table.pkl").items()},
-    **{f"argos: {k}": v for k, v in _of(read_argos, "files", "capture.hdf5").items()},
+    **_whole("spectra", "gateway_info.yml", "tx_pos.csv", "train_index.txt", "spectrum/00001.png"),
+    **_whole("ble", "anchors.csv", "calibration_df.csv"),
+    **_whole("nerf2-ble", "gateway_position.yml", "gateway_rssi.csv"),
+    **_whole("nerf2-csi", "base-station.yml", "csidata.npy"),
+    **_each("newrf", read_newrf, "room.npz"),
+    **_each("newrf", read_pickled_table, "table.pkl"),
+    **_each("argos", read_argos, "capture.hdf5"),
     "deepmimo: params.json": Reader("deepmimo", "params.json", read_deepmimo),
     "deepmimo: power.mat": Reader("deepmimo", "power_t000_tx000_r001.mat", read_deepmimo),
-    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.ply", "cloud.las", "cloud.laz").items()},
-    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.xyz", "cloud.npz").items()},
-    **{f"mesh: {k}": v for k, v in _of(read_mesh, "files", "box.ply", "box.stl", "box.obj", "box.glb").items()},
-    **{f"plan: {k}": v for k, v in _of(read_plan, "files", "plan.npz", "plan.yaml", "plan.png", "plan.csv").items()},
+    **_each("points", read_points, "cloud.ply", "cloud.las", "cloud.laz", "cloud.xyz", "cloud.npz"),
+    **_each("mesh", read_mesh, "box.ply", "box.stl", "box.obj", "box.glb"),
+    **_each("plan", read_plan, "plan.npz", "plan.yaml", "plan.png", "plan.csv"),
     "scene: scene.xml": Reader("scene", "scene.xml", lambda folder: open_scene(folder / "scene.xml", CARRIER_HZ)),
     "scene: floor.ply": Reader("scene", "meshes/floor.ply", lambda folder: open_scene(folder, CARRIER_HZ)),
     "scene: scene.yml": Reader("scene", "scene.yml", read_scene_folder),
@@ -146,15 +136,15 @@ READERS: Mapping[str, Reader] = {
     "run: log.jsonl": Reader("runs", "stopped/log.jsonl", lambda folder: cut_log(folder / "stopped", 2)),
     "run: predictions.npz": Reader("runs", "kriging/predictions.npz", lambda folder: read_run(folder / "kriging")),
     "run: metrics.json": Reader("runs", "kriging/metrics.json", lambda folder: read_run(folder / "kriging")),
-    **{f"run: {k}": v for k, v in _of(load_paths, "files", "paths.npz").items()},
-    **{f"split: {k}": v for k, v in _of(load_split, "files", "split.npz").items()},
-    **{f"paths: {k}": v for k, v in _of(read_paths, "files", "paths.csv").items()},
-    **{f"map: {k}": v for k, v in _of(read_map, "runs", "map.nc", "surface.nc").items()},
+    **_each("run", load_paths, "paths.npz"),
+    **_each("split", load_split, "split.npz"),
+    **_each("paths", read_paths, "paths.csv"),
+    **_each("map", read_map, "map.nc", "surface.nc", group="runs"),
     "map: chunk of map.zarr": Reader("runs", "map.zarr/power_dbm/0.0.0", lambda folder: read_map(folder / "map.zarr")),
     "map: .zmetadata": Reader("runs", "map.zarr/.zmetadata", lambda folder: read_map(folder / "map.zarr")),
     "import: field.npz": Reader("runs", "field.npz", _imported),
     "locate: heard.csv": Reader("files", "heard.csv", _observations),
-    "predict: inputs.csv": Reader("files", "inputs.csv", _inputs),
+    "predict: inputs.csv": Reader("files", "inputs.csv", lambda folder: read_inputs(folder / "inputs.csv", None)),
     "predict: inputs.npz": Reader("files", "inputs.npz", lambda folder: read_inputs(None, folder / "inputs.npz")),
 }
 """All readers by name."""

@@ -126,16 +126,24 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
     return bootstrap(ours / theirs)
 
 
-def split(call: Call) -> Split:
-    """Shares of the time of a call, from Dr.Jit's kernel history.
+def history_of(call: Call, again: bool = False) -> tuple[float, list[dict[str, Any]]]:
+    """Time of a call in ms, and Dr.Jit's history of its kernels.
 
-    A frozen function that was recorded without the history is recorded again by the first call.
+    A frozen function that was recorded without the history is recorded again by the first call, which is made before
+    where ``again`` is given.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        if again:
+            call()
         dr.sync_thread()
         dr.kernel_history_clear()
         whole = 1e3 * seconds(call)
-        history = dr.kernel_history()
+        return whole, dr.kernel_history()
+
+
+def split(call: Call) -> Split:
+    """Shares of the time of a call, see `history_of`."""
+    whole, history = history_of(call)
     generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
     # Kernels may run concurrently with each other and with the recording of the next.
     executed = min(sum(entry["execution_time"] for entry in history), max(whole - generated, 0.0))

@@ -33,7 +33,7 @@ from wrf_mi.training.trainer import Trainer
 
 from .bench import run_command
 from .comparison import line
-from .timing import interleaved, seconds
+from .timing import history_of, interleaved
 
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "kriging": "kriging"}
@@ -169,12 +169,7 @@ PRODUCTS, WALKS = "products of networks", "two longest kernels, the walks of spl
 
 def shares(call: Callable[[], Any]) -> dict[str, float]:
     """Shares of the time of a call by kind of work, from Dr.Jit's kernel history."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()  # recorded again, as recordings depend on this flag
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        whole = 1e3 * seconds(call)
-        history = dr.kernel_history()
+    whole, history = history_of(call, again=True)  # recorded again, as recordings depend on the history's flag
     by_kind: Counter[str] = Counter()
     by_kernel: Counter[str] = Counter()
     for entry in history:

@@ -9,7 +9,7 @@ intervals are 95 % bootstrap intervals over rows. Each fold of each seed is stor
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -224,32 +224,37 @@ def _with_gain(row: Mapping[str, Any]) -> str:
 
 def carriers() -> dict[str, Any]:
     """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
+    place = RUNS / fit_key(source_files())
+    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
     for held in CARRIERS:
         hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
         for fold in range(held.folds):
-            found = []
-            for seed in SEEDS:
-                name = f"{held.dataset}-{fold}-{seed}"
-                how = partial(at_carrier, held, fold, seed, place / name)
-                found.append(stored_part("new-carriers", name, how))
-            every += found
-            rows += _rows(f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz", found)
-    return {"rows": rows, "measured": measured_on(every)}
+            names = {seed: f"{held.dataset}-{fold}-{seed}" for seed in SEEDS}
+            parts[f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
+                name: partial(at_carrier, held, fold, seed, place / name) for seed, name in names.items()
+            }
+    return _measured("new-carriers", parts)
 
 
 def receivers() -> dict[str, Any]:
     """Measure receivers held out in turn, without and with few rows of their own, three seeds, as `carriers`."""
     data_folder(FLAT)
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
+    place = RUNS / fit_key(source_files())
+    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
     for held in RECEIVERS:
         for left in LEFT:
-            found = []
-            for seed in SEEDS:
-                for fold in range(held.folds):
-                    name = f"{held.dataset}-{left}-{fold}-{seed}"
-                    how = partial(at_receivers, held, left, fold, seed, place / name)
-                    found.append(stored_part("new-receivers", name, how))
-            every += found
-            rows += _rows(f"{held.dataset}, {left} rows at new receivers", found)
-    return {"rows": rows, "measured": measured_on(every)}
+            names = {(seed, k): f"{held.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(held.folds)}
+            parts[f"{held.dataset}, {left} rows at new receivers"] = {
+                name: partial(at_receivers, held, left, k, seed, place / name) for (seed, k), name in names.items()
+            }
+    return _measured("new-receivers", parts)
+
+
+def _measured(benchmark: str, parts: Mapping[str, Mapping[str, Callable[[], dict[str, Any]]]]) -> dict[str, Any]:
+    """Rows of the table, of stored or new measurements by name, which are pooled by what was held out."""
+    rows, measurements = list[dict[str, Any]](), list[dict[str, Any]]()
+    for what, works in parts.items():
+        pooled = [stored_part(benchmark, name, work) for name, work in works.items()]
+        measurements += pooled
+        rows += _rows(what, pooled)
+    return {"rows": rows, "measured": measured_on(measurements)}
