@@ -98,7 +98,7 @@ def summary(record: Record) -> dict[str, Any]:
     from ..models.checks import check_parts
 
     check_parts(record)
-    seen = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
+    received = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
     carriers = None
     if record.carriers_hz is not None:
         hz, rows = np.unique(record.carriers_hz, return_counts=True)
@@ -112,14 +112,14 @@ def summary(record: Record) -> dict[str, Any]:
         "task": record.task,
         "source": record.source,
         "rows": len(record),
-        "receivers": {r.name: int(count) for r, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
+        "receivers": {r.name: int(count) for r, count in zip(record.receivers, received.sum(axis=1), strict=True)},
         "observation": list(record.observation.shape[2:]),
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
         "carriers_hz": carriers,
         "runs": runs,
-        "n_readings": _range(record.n_readings, seen),
-        "std_db": _range(record.std, seen),
+        "n_readings": _range(record.n_readings, received),
+        "std_db": _range(record.std, received),
         "positions": record.has_positions,
         "headings": record.tx_heading_rad is not None,
         "uplink": record.uplink is not None,
@@ -157,11 +157,11 @@ def render(facts: dict[str, Any]) -> str:
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 
 
-def _range(values: NDArray[Any] | None, seen: NDArray[np.bool_]) -> list[float] | None:
+def _range(values: NDArray[Any] | None, received: NDArray[np.bool_]) -> list[float] | None:
     """Minimum, median and maximum where something was received."""
-    if values is None or not seen.any():
+    if values is None or not received.any():
         return None
-    return [float(value) for value in np.percentile(values[seen], [0, 50, 100])]
+    return [float(value) for value in np.percentile(values[received], [0, 50, 100])]
 
 
 def _shown(values: list[float] | None, unit: str) -> str:

@@ -52,19 +52,19 @@ def _reliability(run: Path, picture: Path) -> dict[str, Any]:
     from ..core.files import write_figure
     from ..maps.coverage import reliability_figure, run_reliability
 
-    found = run_reliability(run)
-    write_figure(picture, reliability_figure({run.resolve().name: found}))
-    return {"error": found.error, "brier": found.brier, "threshold_db": found.threshold_db.tolist()}
+    result = run_reliability(run)
+    write_figure(picture, reliability_figure({run.resolve().name: result}))
+    return {"error": result.error, "brier": result.brier, "threshold_db": result.threshold_db.tolist()}
 
 
 def _add_predict(commands: Any) -> None:
     parser = add_command(commands, "predict", predict_command, "predict at new transmitter positions")
     parser.add_argument("run", metavar="RUN", help="run folder")
-    given = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group(required=True)
     text = "positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
-    given.add_argument("--tx", metavar="FILE.csv", help=text)
+    source.add_argument("--tx", metavar="FILE.csv", help=text)
     text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
-    given.add_argument("--input", metavar="FILE.npz", help=text)
+    source.add_argument("--input", metavar="FILE.npz", help=text)
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
     parser.add_argument("--out", required=True, metavar="FILE", help=text)
     add_operator(parser)
@@ -109,8 +109,8 @@ def compress_command(a: Arguments) -> int:
 
     how = Compression(a.budget, a.width, a.layers, a.terms, a.distil, a.fine_tune, a.precision)
     with Watch() as watch:
-        found = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
-    return show(a.json, found, f"{render(found)}\nresults: {a.out}")
+        result = compress_run(a.run, a.out, how, on_progress=watch.on_progress)
+    return show(a.json, result, f"{render(result)}\nresults: {a.out}")
 
 
 def _add_compare(commands: Any) -> None:

@@ -51,22 +51,10 @@ def mesh_command(a: Arguments) -> int:
     from ..scene.register import read_pairs, register_pairs
 
     pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
-    scene = make_scene(
-        a.points,
-        a.out,
-        units=a.units,
-        up=a.up,
-        origin_m=a.origin,
-        materials=a.materials,
-        height_m=a.height,
-        floor_m=a.floor,
-        resolution_m=a.resolution,
-        registration=pairs,
-        register_walls_of=a.register_walls,
-        positions=a.positions,
-        row_0=a.row_0,
-        replace=a.replace,
-    )
+    source = {"units": a.units, "up": a.up, "origin_m": a.origin, "row_0": a.row_0, "resolution_m": a.resolution}
+    storey = {"height_m": a.height, "floor_m": a.floor, "materials": a.materials}
+    frame = {"registration": pairs, "register_walls_of": a.register_walls, "positions": a.positions}
+    scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
     kinds = list(scene.materials.surfaces.values())
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
@@ -170,8 +158,12 @@ def edit_command(a: Arguments) -> int:
         raise InputError("edit: give the folder of the edited scene (--out)")
     surfaces, materials = read_surfaces(a.scene)
     rows = [
-        {"part": one.name, "material": materials.of(one.name, one.kind), "box_m": box_of([one]).round(3).tolist()}
-        for one in surfaces
+        {
+            "part": surface.name,
+            "material": materials.of(surface.name, surface.kind),
+            "box_m": box_of([surface]).round(3).tolist(),
+        }
+        for surface in surfaces
     ]
     width = max(len(row["part"]) for row in rows) + 2
     lines = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"]

@@ -53,8 +53,8 @@ def train_command(a: Arguments) -> int:
         print(_settings_text())
         return 0
     if a.resume:
-        given = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
-        if any(value is not None and value is not False and value != [] for value in given):
+        values = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
+        if any(value is not None and value is not False and value != [] for value in values):
             raise InputError("--resume RUN goes on with the settings of RUN: omit data set and settings")
         return _resume(a)
     if not a.dataset or not a.out:
@@ -153,7 +153,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
     seed = None if a.calibrate is not None else a.seed
     numbers = {"max_depth": a.depth, "max_reflections": a.reflections, "rays": a.rays, "seed": seed}
     numbers["phase_error"] = a.phase_error
-    stated: dict[str, Any] = {key: given for key, given in numbers.items() if given is not None}
+    stated: dict[str, Any] = {key: value for key, value in numbers.items() if value is not None}
     if a.rays is not None and a.rays != "auto":
         if not a.rays.isdecimal():
             raise InputError(f'rays {a.rays!r}: give a whole number, or "auto"')
@@ -251,10 +251,10 @@ def sweep_command(a: Arguments) -> int:
     from ..runs.sweep import check_failures, check_run, plan_sweep, run_sweep, sweep_table
 
     # Read off the parser, so that no option of train is left out.
-    given = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
-    settings = given.pop("set")
-    options = {name: str(value) for name, value in given.items() if value is not None and not isinstance(value, bool)}
-    flags = [f"--{name}" for name, value in given.items() if value is True]
+    stated = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
+    settings = stated.pop("set")
+    options = {name: str(value) for name, value in stated.items() if value is not None and not isinstance(value, bool)}
+    flags = [f"--{name}" for name, value in stated.items() if value is True]
     sweep = plan_sweep(a.out, a.vary, options, settings, flags)
     parser = Parser(prog="wrf-mi")
     _add_train(parser.add_subparsers())

@@ -34,12 +34,12 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     """
     run = source.run
     field = field_of(run)
-    kept = {key: values for key, values in field.arrays().items() if not key.startswith((PARAM, PACKED))}
+    form = {key: values for key, values in field.arrays().items() if not key.startswith((PARAM, PACKED))}
     model = stored_arrays(run.folder / FITTED)
     arrays: dict[str, Any] = {
         VERSION: FORMAT,
         **keyed(PARAM, field.params),
-        **kept,
+        **form,
         **{key: values for key, values in model.items() if key.startswith(FITTED_ARRAYS)},
         **keyed(SPLIT_ARRAYS, stored_arrays(run.folder / SPLIT)),
     }

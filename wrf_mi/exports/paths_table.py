@@ -58,14 +58,14 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
 
 def _traced(source: Source, options: ExportOptions) -> TraceResult:
     """Stored paths of a run, or paths of a scene that are traced now."""
-    given = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
+    ends = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
     if source.is_run:
         more = {"--material": options.material, "--paths": options.kinds, "--depth": options.depth}
-        if stated := [name for name, value in (given | more).items() if value is not None]:
+        if stated := [name for name, value in (ends | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
         return source.trace()
     if options.tx_pos_m is None or options.rx_pos_m is None or options.frequency_hz is None:
-        lacking = ", ".join(name for name, value in given.items() if value is None)
+        lacking = ", ".join(name for name, value in ends.items() if value is None)
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"max_depth": options.depth}
@@ -129,20 +129,11 @@ def read_paths(file: str | Path) -> Paths:
             raise InputError(
                 f"{file}, row {path + 1}: interactions, vertices and objects do not fit; restore it"
             ) from None
-    return Paths(
-        tx,
-        rx,
-        table.numbers("gain_re") + 1j * table.numbers("gain_im"),
-        table.numbers("length_m"),
-        _directions(table, "departure"),
-        _directions(table, "arrival"),
-        interactions,
-        vertices,
-        objects,
-        tuple(names),
-        int(tx.max(initial=-1)) + 1,
-        int(rx.max(initial=-1)) + 1,
-    )
+    gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
+    directions = _directions(table, "departure"), _directions(table, "arrival")
+    bounces: Any = (interactions, vertices, objects, tuple(names))
+    counts = (int(numbers.max(initial=-1)) + 1 for numbers in (tx, rx))
+    return Paths(tx, rx, gain, table.numbers("length_m"), *directions, *bounces, *counts)
 
 
 def _directions(table: CsvTable, end: str) -> FloatArray:

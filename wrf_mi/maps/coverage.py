@@ -96,22 +96,22 @@ def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) 
 
     def levels(values: Any, std: Any = None) -> Prediction:
         rows = int(np.prod(values.shape[:2]))
-        given = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
-        return task.level(Prediction(values.reshape(rows, *values.shape[2:]), given))
+        deviations = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
+        return task.level(Prediction(values.reshape(rows, *values.shape[2:]), deviations))
 
     stated = levels(results.prediction, results.std)
     return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db)
 
 
-def reliability_figure(found: Mapping[str, Reliability]) -> Figure:
+def reliability_figure(results: Mapping[str, Reliability]) -> Figure:
     """Observed share against predicted probability of coverage; bins of fewer than `FEWEST` pairs are left out."""
     figure = Figure(figsize=(4.6, 4.4), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--", label="calibrated")
-    for name, one in found.items():
-        shown = one.count >= FEWEST
-        label = f"{name} (error {one.error:.3f})"
-        axes.plot(one.predicted[shown], one.observed[shown], marker="o", markersize=4, linewidth=1.2, label=label)
+    for name, result in results.items():
+        shown = result.count >= FEWEST
+        label = f"{name} (error {result.error:.3f})"
+        axes.plot(result.predicted[shown], result.observed[shown], marker="o", markersize=4, linewidth=1.2, label=label)
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
     axes.set_xlabel("predicted P(level > threshold)")
     axes.set_ylabel("observed share of test values")

@@ -85,9 +85,7 @@ def predict_candidates(
 
 def headings_of(run: Run) -> int:
     """Number of headings at which a run's model is evaluated; 1 where it does not use the heading."""
-    stated = run.fitted.uses_heading
-    uses = run.model.headings if stated is None else stated
-    return HEADINGS if uses and run.problem.record.tx_heading_rad is not None else 1
+    return HEADINGS if run.takes_heading and run.problem.record.tx_heading_rad is not None else 1
 
 
 @dataclass(frozen=True)
@@ -228,8 +226,8 @@ def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelih
     located have errors of another day (Breiman et al., "Classification and regression trees" (1984), section 3.4.3: the
     rule of one standard error).
     """
-    best = scores[int(np.argmax([one.mean() for one in scores]))]
-    able = [form for form, one in zip(forms, scores, strict=True) if _clear_gain(best - one) <= 0]
+    best = scores[int(np.argmax([of_form.mean() for of_form in scores]))]
+    able = [form for form, of_form in zip(forms, scores, strict=True) if _clear_gain(best - of_form) <= 0]
     return max(
         able, key=lambda form: form.scale * (norm() if form.degrees is None else student_t(form.degrees)).ppf(WIDE)
     )

@@ -72,9 +72,9 @@ def page(sections: Sequence[Section], folder: Path) -> str:
     """HTML of a comparison in a folder; the pictures must have been written."""
     runs = [run for section in sections for run in section.runs]
     count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
-    links = " · ".join(f'<a href="#{_text(one.slug)}">{_text(one.title)}</a>' for one in sections)
+    links = " · ".join(f'<a href="#{_text(part.slug)}">{_text(part.title)}</a>' for part in sections)
     contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
-    made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    today = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     again = shlex.join(["wrf-mi", "compare", *(str(run.path) for run in runs), "--out", str(folder)])
     style, script = (files(__package__).joinpath(f"compare_page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     return f"""<!DOCTYPE html>
@@ -85,7 +85,7 @@ def page(sections: Sequence[Section], folder: Path) -> str:
 <style>
 {style}</style>
 <h1>Comparison of {count}</h1>
-<p class="note">Made {made} by <code>{_text(again)}</code></p>
+<p class="note">Made {today} by <code>{_text(again)}</code></p>
 {contents}
 {"".join(map(_section, sections))}
 <h2>Versions and machines</h2>
@@ -253,11 +253,12 @@ def model_words(config: RunConfig) -> str:
 def changed_settings(config: RunConfig) -> dict[str, Any]:
     """Settings, by dotted name, that differ from the model's defaults for these data; not those of `GIVEN`."""
     entry = config.entry
-    given = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
-    standard = dict(flat(asdict(default_settings(entry, (), given))))
-    stated = flat(asdict(config.settings))
+    stated = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
+    standard = dict(flat(asdict(default_settings(entry, (), stated))))
     return {
-        name: value for name, value in stated if value != standard[name] and not (name in GIVEN and name in entry.given)
+        name: value
+        for name, value in flat(asdict(config.settings))
+        if value != standard[name] and not (name in GIVEN and name in entry.given)
     }
 
 

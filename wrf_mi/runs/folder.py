@@ -233,11 +233,11 @@ def run_parts(folder: Path) -> list[Path]:
 
 def is_finished(folder: Path) -> bool:
     """Whether a run has its metrics; what a process left there that was killed after them is removed."""
-    found = (folder / METRICS).exists()
-    if found and (folder / LOCK).exists():
+    finished = (folder / METRICS).exists()
+    if finished and (folder / LOCK).exists():
         with suppress(InputError), locked_folder(folder):  # refused while another process writes
             pass
-    return found
+    return finished
 
 
 def load_rows(folder: Path, record: Record) -> Split:

@@ -100,6 +100,11 @@ class Run:
             raise InputError(f"{self.folder}: a run of {self.config.model}, not of a learned field of spectra")
         return self.fitted
 
+    @property
+    def takes_heading(self) -> bool:
+        """Whether predictions may be given the transmitter's heading."""
+        return self.model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading
+
     def predictor(self) -> Predictor:
         """Predictor of the trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
 
@@ -177,7 +182,7 @@ class Run:
         """
         model = self.model
         if inputs.tx_heading_rad is not None:
-            if not (model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading):
+            if not self.takes_heading:
                 raise InputError(f"{self.folder}: {UNUSED_HEADING}")
             self._check_numbers(inputs, inputs.tx_heading_rad, "headings", "finite heading")
         if inputs.carriers_hz is not None or model.several_carriers:
@@ -272,9 +277,9 @@ def _inputs(
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
     """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part, config.entry)
-    seen = problem.seen(load_split(part / SPLIT))
+    visible = problem.seen(load_split(part / SPLIT))
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
-        return config.entry.load(arrays, seen, part), seconds
+        return config.entry.load(arrays, visible, part), seconds
 
 
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:

@@ -134,9 +134,9 @@ def plan_sweep(
         name = ",".join(f"{key}={word}" for key, word in words.items())
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        given = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
-        dataset = [given.pop("dataset")] if "dataset" in given else []
-        arguments = [part for key, value in given.items() for part in (f"--{key}", value)]
+        stated_options = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
+        dataset = [stated_options.pop("dataset")] if "dataset" in stated_options else []
+        arguments = [part for key, value in stated_options.items() for part in (f"--{key}", value)]
         switched = [f"--{key}" for key, value in varied.items() if key in FLAGS and value == "true"]
         stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in (*OPTIONS, *FLAGS))]
         set_all = [part for setting in stated for part in ("--set", setting)]
@@ -213,23 +213,23 @@ def _claim(sweep: Sweep) -> None:
 
 def _files(sweep: Sweep) -> dict[str, list[Path]]:
     """Files of data sets, scenes and settings by the name that the command gives."""
-    found: dict[str, list[Path]] = {}
+    files: dict[str, list[Path]] = {}
     for run in sweep.runs:
         words = run.arguments[1:]
         for before, word in itertools.pairwise(("dataset", *words)):
             key, _, value = word.partition("=") if before == "--set" else (before.removeprefix("--"), "", word)
             if key == "dataset" and not word.startswith("--"):
-                found[value] = dataset_files(value)
+                files[value] = dataset_files(value)
             elif key in FILES:
-                found[value] = scene_files(value)
-    return {name: paths for name, paths in found.items() if paths}
+                files[value] = scene_files(value)
+    return {name: paths for name, paths in files.items() if paths}
 
 
 def dataset_files(name_or_folder: str) -> list[Path]:
     """Folder or file of a data set; empty where it is not on this machine; `InputError`: no such data set."""
     path = Path(name_or_folder)
-    found = path if path.exists() else locate(name_or_folder)
-    return [] if found is None else [found]
+    place = path if path.exists() else locate(name_or_folder)
+    return [] if place is None else [place]
 
 
 def scene_files(scene: str | Path) -> list[Path]:

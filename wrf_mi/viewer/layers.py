@@ -72,16 +72,16 @@ def scene_content(
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
     ceiling = np.concatenate([ceiling_faces(surface, low, high) for surface in surfaces])
     number = np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces])
-    kept, note = np.ones(len(corners), bool), None
+    drawn, note = np.ones(len(corners), bool), None
     if len(corners) > most:
-        kept[:] = False
-        kept[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
+        drawn[:] = False
+        drawn[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
         note = f"Mesh: the largest {most} of {len(corners)} triangles."
     labels = np.array([material_label(materials[surface.name]) for surface in surfaces])
     meshes = []
     for label in sorted(set(labels)):
         for above in (False, True):
-            chosen = np.flatnonzero(kept & (labels[number] == label) & (ceiling == above))
+            chosen = np.flatnonzero(drawn & (labels[number] == label) & (ceiling == above))
             if len(chosen):
                 used, index = np.unique(number[chosen], return_inverse=True)
                 names = tuple(surfaces[k].name for k in used)
@@ -144,7 +144,7 @@ def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
     if task.image:
         size = list(results.truth.shape[-2:])
         return {"kind": "image", "size": size} | {
-            key: [[png(one) for one in part] for part in both[key]] for key in both
+            key: [[png(spectrum) for spectrum in part] for part in both[key]] for key in both
         }
     if task.axes == 0:
         return {"kind": "level"} | {key: packed(values) for key, values in both.items()}
@@ -231,12 +231,12 @@ def paths_content(
         source = f"traced for this view in {run.config.scene}, at most {depth} interactions, {traced.rays} rays"
     else:
         return None, []
-    found = path_layer(traced, limits.paths)
+    layer = path_layer(traced, limits.paths)
     notes = [f"Paths: {source}."]
-    if len(found.tx) < len(traced.paths):
-        text = f"the strongest {len(found.tx)} of {len(traced.paths)}"
+    if len(layer.tx) < len(traced.paths):
+        text = f"the strongest {len(layer.tx)} of {len(traced.paths)}"
         notes.append(f"Paths: {text}, at most {limits.paths} of each transmitter to each receiver.")
-    return found, notes
+    return layer, notes
 
 
 def path_layer(traced: TraceResult, most: int) -> PathsContent:
@@ -248,8 +248,8 @@ def path_layer(traced: TraceResult, most: int) -> PathsContent:
     rank = np.arange(len(order)) - np.searchsorted(pair[order], pair[order])
     # Paths of each pair of devices that a page has room for.
     room = PATH_NUMBERS // (3 * (paths.interactions.shape[1] + 2) * max(1, paths.n_tx * paths.n_rx))
-    kept = np.sort(order[rank < min(most, max(1, room))])
-    paths, gain_db = paths.select(kept), gain_db[kept]
+    strongest = np.sort(order[rank < min(most, max(1, room))])
+    paths, gain_db = paths.select(strongest), gain_db[strongest]
     bounces = paths.bounces
     receivers_m = np.stack([receiver.position_m for receiver in traced.receivers])
     corners = [np.zeros((0, 3))]

@@ -72,14 +72,14 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
         if variable.dtype.kind not in "fiub" or set(variable.dims) not in (set(plane), {RECEIVER, *plane}):
             skipped.append(str(key))
             continue
-        given = variable if RECEIVER in variable.dims else variable.expand_dims(RECEIVER)
-        values[str(key)] = np.asarray(given.transpose(RECEIVER, *plane), np.float32)
+        by_receiver = variable if RECEIVER in variable.dims else variable.expand_dims(RECEIVER)
+        values[str(key)] = np.asarray(by_receiver.transpose(RECEIVER, *plane), np.float32)
         units = str(variable.attrs.get("units", ""))
         words = str(variable.attrs.get("long_name", key)).replace("_", " ")
         labels[str(key)] = f"{words} ({units})" if units not in ("", "1") else words
     if not values:
         raise InputError(f"{name}: no numbers over {' and '.join(plane)} in it; give a map made by wrf-mi map")
-    receivers = tuple(str(one) for one in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
+    receivers = tuple(str(name) for name in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
     x_m, y_m = (np.asarray(dataset[axis], float) for axis in "xy")
     z_m = np.asarray(dataset["z"], float) if points else None
     height_m = None if points else float(dataset["height"])
@@ -98,10 +98,10 @@ def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[M
     return thin, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
 
 
-def _every(one: MapContent, step: int) -> MapContent:
+def _every(content: MapContent, step: int) -> MapContent:
     """A map of every ``step``-th position along each axis, and of as small a share of the points of a surface."""
-    part = slice(None, None, step if one.z_m is None else step * step)
-    index = (..., part, part) if one.z_m is None else (..., part)
-    values = {name: array[index] for name, array in one.values.items()}
-    z_m = None if one.z_m is None else one.z_m[part]
-    return replace(one, x_m=one.x_m[part], y_m=one.y_m[part], z_m=z_m, values=values)
+    part = slice(None, None, step if content.z_m is None else step * step)
+    index = (..., part, part) if content.z_m is None else (..., part)
+    values = {name: array[index] for name, array in content.values.items()}
+    z_m = None if content.z_m is None else content.z_m[part]
+    return replace(content, x_m=content.x_m[part], y_m=content.y_m[part], z_m=z_m, values=values)

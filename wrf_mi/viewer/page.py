@@ -89,10 +89,10 @@ def _material_colours(content: ViewContent) -> dict[str, str]:
 def _quantities(maps: list[MapContent]) -> dict[str, Any]:
     """Label and common range of the colours of each quantity of all maps."""
     quantities: dict[str, Any] = {}
-    for name in dict.fromkeys(name for one in maps for name in one.values):
-        having = [one for one in maps if name in one.values]
-        values = np.concatenate([one.values[name].ravel() for one in having])
-        quantities[name] = {"label": having[0].labels[name], "range": _range(values, 1)}
+    for name in dict.fromkeys(name for content in maps for name in content.values):
+        with_it = [content for content in maps if name in content.values]
+        values = np.concatenate([content.values[name].ravel() for content in with_it])
+        quantities[name] = {"label": with_it[0].labels[name], "range": _range(values, 1)}
     return quantities
 
 
@@ -107,9 +107,9 @@ def plain(value: Any) -> Any:
     if is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, dict):
-        return {key: plain(one) for key, one in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     return packed(value) if isinstance(value, np.ndarray) else value
 
 

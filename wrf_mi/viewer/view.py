@@ -204,7 +204,7 @@ def view(
     content.notes += notes
     content.title = "; ".join(gathered.titles)
     if not content.receivers:
-        content.receivers = tuple(dict.fromkeys(name for one in content.maps for name in one.receivers))
+        content.receivers = tuple(dict.fromkeys(name for shown in content.maps for name in shown.receivers))
         content.receivers_m = np.full((len(content.receivers), 3), np.nan)
     if content.scene is None and content.rows is None and not content.maps:
         raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")
