@@ -70,13 +70,13 @@ class Command(ABC):
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Keys of results, from `Command.content`, that differ in a bit, or that one of them lacks."""
-    return sorted(key for key in one.keys() | other.keys() if not _same(one.get(key), other.get(key)))
 
+    def same(a: Any, b: Any) -> bool:
+        if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+            return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+        return type(a) is type(b) and bool(a == b)
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    return type(one) is type(other) and bool(one == other)
+    return sorted(key for key in one.keys() | other.keys() if not same(one.get(key), other.get(key)))
 
 
 class Training(Command):

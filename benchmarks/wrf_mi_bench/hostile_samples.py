@@ -49,6 +49,7 @@ from wrf_mi.viewer.map_layer import read_map
 
 UP = np.array([0.0, 0, 0, 1])
 CARRIER_HZ = 2.4e9
+HEARD_BY = [Receiver(name, np.zeros(3), UP) for name in ("one", "other")]
 # A table of pandas 3.1 with columns of numbers and of arrays, by Python's pickle, protocol 5.
 PICKLE = (
     "c-oy)O>fgc5RLOi+7zfjgd(AGLZp{eTo4DKX%m6c2vfDaR;#tMj;+{hYrR$zi3&J0w9?)f`a9vq4Q4lqk|1(n59_f#@9mq}H=j%2Ul(&`sd7SjkE"
@@ -71,13 +72,11 @@ class Reader:
     read: Callable[[Path], Any]
 
 
-def _load(folder: Path) -> None:
-    check_parts(load(folder))
-
-
 def _whole(kind: str, *files: str) -> dict[str, Reader]:
     """Files of a data set, which is read as a whole."""
-    return {f"{kind}: {Path(file).name}": Reader(kind, file, _load) for file in files}
+    return {
+        f"{kind}: {Path(file).name}": Reader(kind, file, lambda folder: check_parts(load(folder))) for file in files
+    }
 
 
 def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "files") -> dict[str, Reader]:
@@ -98,10 +97,6 @@ def _predicted_by_operator(folder: Path) -> None:
     run = open_run(folder / "field")
     run.predict([[2.0, 1.0, 1.0]])
     assert np.isfinite(run.predict([[2.0, 1.0, 1.0]]).mean).all()
-
-
-def _observations(folder: Path) -> None:
-    read_observations(folder / "heard.csv", [Receiver(name, np.zeros(3), UP) for name in ("one", "other")])
 
 
 def _imported(folder: Path) -> None:
@@ -143,7 +138,7 @@ READERS: Mapping[str, Reader] = {
     "map: chunk of map.zarr": Reader("runs", "map.zarr/power_dbm/0.0.0", lambda folder: read_map(folder / "map.zarr")),
     "map: .zmetadata": Reader("runs", "map.zarr/.zmetadata", lambda folder: read_map(folder / "map.zarr")),
     "import: field.npz": Reader("runs", "field.npz", _imported),
-    "locate: heard.csv": Reader("files", "heard.csv", _observations),
+    **_each("locate", partial(read_observations, receivers=HEARD_BY), "heard.csv"),
     "predict: inputs.csv": Reader("files", "inputs.csv", lambda folder: read_inputs(folder / "inputs.csv", None)),
     "predict: inputs.npz": Reader("files", "inputs.npz", lambda folder: read_inputs(None, folder / "inputs.npz")),
 }

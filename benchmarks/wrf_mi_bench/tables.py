@@ -12,7 +12,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -53,7 +53,12 @@ KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb",
 def scene_of(part: Part, folder: Path) -> list[str]:
     """Arguments with the scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
-        return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
+        place = folder / f"open-{fit_key(FAR_M, PLATE_M)}"
+        if not place.exists():
+            plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
+            with atomic_folder(place, False) as made:
+                write_scene(made, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
+        return ["--scene", str(place)]
     if part.scene == "lidar":
         return ["--scene", str(meshed_scan(part.dataset, folder))]
     if part.scene == "floor":
@@ -85,19 +90,6 @@ def corrected_scene(row: Row, folder: Path) -> Path:
     if not made.exists():
         run_command(["correct", stated, row.part.dataset, *row.rows], made, resumes=False)
     return made
-
-
-def _once(place: Path, make: Callable[[Path], object]) -> Path:
-    """A folder, made completely or not at all."""
-    if not place.exists():
-        with atomic_folder(place, False) as part:
-            make(part)
-    return place
-
-
-def _open_scene(folder: Path) -> None:
-    plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
-    write_scene(folder, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
 
 
 def _scene(row: Row, runs: Path) -> list[str]:

@@ -17,7 +17,7 @@ from ..core.files import atomic_file
 from ..datasets.folder_files import CsvTable, read_csv, write_csv
 from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
 from ..tracing.options import stated_kinds, without_effect
-from .format import ExportOptions
+from .format import RUN, ExportOptions
 from .source import Source
 
 logger = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
 def _traced(source: Source, options: ExportOptions) -> TraceResult:
     """Stored paths of a run, or paths of a scene that are traced now."""
     ends = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
-    if source.is_run:
+    if source.kind == RUN:
         more = {"--material": options.material, "--paths": options.kinds, "--depth": options.depth}
         if stated := [name for name, value in (ends | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")

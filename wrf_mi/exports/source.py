@@ -29,11 +29,6 @@ class Source:
     kind: str  # what it is exported as: a run, a scene or a data set
 
     @property
-    def is_run(self) -> bool:
-        """Whether it is a run folder."""
-        return self.kind == RUN
-
-    @property
     def run(self) -> Run:
         """The run; its data set is not read."""
         return open_run(self.name)
@@ -58,7 +53,7 @@ class Source:
         Raises:
             InputError: a run without a scene.
         """
-        if not self.is_run:
+        if self.kind != RUN:
             return self.name, None
         corrected, config = Path(self.name) / CORRECTED, self.run.config
         if corrected.is_dir():
@@ -71,7 +66,7 @@ class Source:
         """Carrier of a run's data, Hz: the middle one where rows have several; None for a scene."""
         from ..tasks.conditions import scene_carrier
 
-        return scene_carrier(self.run.problem.record) if self.is_run else None
+        return scene_carrier(self.run.problem.record) if self.kind == RUN else None
 
 
 Write = Callable[[Source, Path, ExportOptions], dict[str, Any]]

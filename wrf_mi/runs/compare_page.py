@@ -65,7 +65,8 @@ class Section:
     @property
     def title(self) -> str:
         """Data set and task."""
-        return f"{_data_name(self.runs[0])}: {TASKS[self.runs[0].task].heading}"
+        name = Path(self.runs[0].dataset).name or "unknown data"
+        return f"{name}: {TASKS[self.runs[0].task].heading}"
 
 
 def page(sections: Sequence[Section], folder: Path) -> str:
@@ -104,6 +105,11 @@ def _section(section: Section) -> str:
     numeric = frozenset(("rows", "difference", "low", "high"))
     images = "\n".join(_image(path, title) for path, title in section.pictures)
     best = best_run(section.runs).name
+    configs = [known_config(run.path) for run in section.runs]
+    commands = "\n".join(
+        f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path)
+        for run, config in zip(section.runs, configs, strict=True)
+    )
     rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
     return f"""
 <h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
@@ -121,12 +127,8 @@ narrow.</p>
 {_table(DIFFERENCES, gains, numeric)}
 {images}
 <h3>Commands</h3>
-{_commands(section.runs)}
+<pre>{_text(commands)}</pre>
 """
-
-
-def _data_name(run: Results) -> str:
-    return Path(run.dataset).name or "unknown data"
 
 
 def _better(run: Results) -> str:
@@ -178,14 +180,6 @@ def _models(runs: Sequence[Results]) -> str:
         words = f"{config.model}: {model_words(config)}" + (", calibrated intervals" if config.intervals else "")
         rows.append({"run": run.name, "model": words, "settings": changed or "none", "scene": config.scene})
     return _table(columns, rows, frozenset())
-
-
-def _commands(runs: Sequence[Results]) -> str:
-    lines = []
-    for run in runs:
-        config = known_config(run.path)
-        lines.append(f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path))
-    return f"<pre>{_text(chr(10).join(lines))}</pre>"
 
 
 def _versions(runs: Sequence[Results]) -> str:

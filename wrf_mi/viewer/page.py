@@ -71,19 +71,15 @@ def page_data(content: ViewContent) -> dict[str, Any]:
     data: dict[str, Any] = plain(content)
     if content.rows is not None:
         data["rows"]["range"] = _range(content.rows.score, 2)
+    materials = set() if content.scene is None else {mesh.material for mesh in content.scene.meshes}
+    others = sorted(materials - MATERIALS.keys())
     return data | {
         "scales": {name: [to_hex(c) for c in colormaps[m](np.linspace(0, 1, STOPS))] for name, m in SCALES.items()},
         "span_db": SPAN_DB,
         "ends": {name: colour for name, _, colour in ENDS},
-        "colours": _material_colours(content),
+        "colours": MATERIALS | dict(zip(others, cycle(OTHER_MATERIALS), strict=False)),
         "quantities": _quantities(content.maps),
     }
-
-
-def _material_colours(content: ViewContent) -> dict[str, str]:
-    names = [] if content.scene is None else sorted({mesh.material for mesh in content.scene.meshes})
-    others = [name for name in names if name not in MATERIALS]
-    return MATERIALS | dict(zip(others, cycle(OTHER_MATERIALS), strict=False))
 
 
 def _quantities(maps: list[MapContent]) -> dict[str, Any]:
