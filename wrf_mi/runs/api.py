@@ -108,15 +108,10 @@ def plan_run(
     checked = with_intervals(model) if request.intervals else model
     if checked.check is not None:
         checked.check(problem, splits)
-    config = RunConfig(
-        request.model,
-        (record.source or record.name) if isinstance(dataset, Record) else str(dataset),
-        record.task,
-        request.split.name if isinstance(request.split, Split) else request.split,
-        **{name: getattr(request, name) for name in ("n_train", "material", "antennas", "intervals")},
-        **{"seed": seed, "scene": scene, "deterministic": deterministic, "settings": settings, "left_out": left_out},
-    )
-    return problem, config, splits
+    source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
+    name = request.split.name if isinstance(request.split, Split) else request.split
+    options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
+    return problem, RunConfig(request.model, source, record.task, name, request.n_train, *options), splits
 
 
 def _settings_of(model: Model, request: RunRequest) -> Any:
@@ -228,8 +223,9 @@ def train(
     check_new(folder)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
-    what = (model, scene, material, antennas, receiver, evaluation, split, n_train, seed, settings)
-    problem, config, splits = plan_run(dataset, RunRequest(*what, deterministic, intervals), progress)
+    what = RunRequest(model, scene, material, antennas, receiver, evaluation, split, n_train, seed, settings)
+    request = replace(what, deterministic=deterministic, intervals=intervals)
+    problem, config, splits = plan_run(dataset, request, progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out)
     _warn_of_known_rows(problem, splits)
