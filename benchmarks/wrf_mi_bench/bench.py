@@ -205,11 +205,11 @@ def _case(runs: Path, name: str) -> dict[str, Any]:
 
 def case_folder(runs: Path, name: str) -> Path:
     """Folder of a case or check: its name and a `fit_key` of arguments, source, data and versions."""
-    made: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
-    what = made.function if isinstance(made, Check) else made.arguments
+    entry: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
+    what = entry.function if isinstance(entry, Check) else entry.arguments
     # A check that goes on keys its parts itself.
-    source = {} if isinstance(made, Check) and made.resumes else source_digests(*modules_of(name))
-    return runs / f"{name}-{fit_key(what, source, [dataset_files(one) for one in made.data])}"
+    source = {} if isinstance(entry, Check) and entry.resumes else source_digests(*modules_of(name))
+    return runs / f"{name}-{fit_key(what, source, [dataset_files(dataset) for dataset in entry.data])}"
 
 
 def modules_of(name: str) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ BUDGETS: Mapping[str, Budget] = {
 
 
 def budgets(
-    record: Record, work: Path, schedule: Sequence[str] = (), given: Mapping[str, Budget] = BUDGETS
+    record: Record, work: Path, schedule: Sequence[str] = (), plan: Mapping[str, Budget] = BUDGETS
 ) -> dict[str, Any]:
     """Fit a field at each budget on the official split and measure them beside each other; by name:
 
@@ -61,7 +61,7 @@ def budgets(
     `wrf_mi.runs.compressed.spectrum_times`, and ``times_smaller`` and ``ssim_loss`` against the first.
     """
     fits, folders = dict[str, Path](), dict[str, Path]()
-    for number, (name, budget) in enumerate(given.items()):
+    for number, (name, budget) in enumerate(plan.items()):
         if not budget.of:
             config = with_settings(TrainConfig(), [*schedule, *budget.settings])
             fits[name] = train(record, work / f"fit{number}", config.model, settings=config).folder
@@ -73,29 +73,29 @@ def budgets(
     predictors = {name: open_run(folder, record).predictor() for name, folder in folders.items()}
     known = make_splits(record, "official")[0].all_train
     times = spectrum_times(predictors, record.tx_pos_m[known], REPEATS)
-    found, whole = {}, read_run(first).metrics["ssim"]["median"]
+    figures, full_ssim = {}, read_run(first).metrics["ssim"]["median"]
     for name, folder in folders.items():
         metrics, size = read_run(folder).metrics, (folder / FITTED).stat().st_size
-        found[name] = {
+        figures[name] = {
             **{key: metrics[key] for key in ("gaussians", "ssim", "train_seconds")},
             **times[name],
             "bytes": size,
             "times_smaller": (first / FITTED).stat().st_size / size,
-            "ssim_loss": whole - metrics["ssim"]["median"],
+            "ssim_loss": full_ssim - metrics["ssim"]["median"],
         }
-    return found
+    return figures
 
 
-def rows_of(found: Mapping[str, Mapping[str, Any]]) -> list[Row]:
+def rows_of(figures: Mapping[str, Mapping[str, Any]]) -> list[Row]:
     """Rows of the benchmark's table from what `budgets` returns."""
     asked = f">= {LEAST_FASTER:.0f} times faster, >= {LEAST_SMALLER:.0f} times smaller, SSIM loss <= {MOST_LOSS}"
     rows = []
-    for index, (name, one) in enumerate(found.items()):
-        value = f"{one['ssim']['median']:.3f} SSIM, {one['bytes'] / 1e3:.0f} kB, {one['ms']:.2f} ms"
-        what = f"{name}, 8 bits a weight" if index else f"{name}, {one['gaussians']} Gaussians"
+    for index, (name, fit) in enumerate(figures.items()):
+        value = f"{fit['ssim']['median']:.3f} SSIM, {fit['bytes'] / 1e3:.0f} kB, {fit['ms']:.2f} ms"
+        what = f"{name}, 8 bits a weight" if index else f"{name}, {fit['gaussians']} Gaussians"
         if index:
-            ratio, low, high = one["times_faster"]
-            value += f": {ratio:.1f} times faster ({low:.1f} to {high:.1f}), {one['times_smaller']:.0f} times smaller"
+            ratio, low, high = fit["times_faster"]
+            value += f": {ratio:.1f} times faster ({low:.1f} to {high:.1f}), {fit['times_smaller']:.0f} times smaller"
         rows.append(line(what, value, asked if index else ""))
     return rows
 
@@ -104,5 +104,5 @@ def main() -> dict[str, Any]:
     """Budgets on rfid-lab's official split, with rows for the table."""
     record = load_record("rfid-lab")
     with tempfile.TemporaryDirectory() as work:
-        found = budgets(record, Path(work), SCHEDULE)
-    return {"rows": rows_of(found), "budgets": found}
+        figures = budgets(record, Path(work), SCHEDULE)
+    return {"rows": rows_of(figures), "budgets": figures}

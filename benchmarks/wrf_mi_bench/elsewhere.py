@@ -60,11 +60,11 @@ def variants(threads: Sequence[int] = THREADS) -> Iterator[Variant]:
     same = {LLVM_VARIABLE: used.llvm_path or ""}
     for count in threads:
         yield Variant("threads", threads=count, environment=same)
-    seen = {used.llvm_version}
+    known = {used.llvm_version}
     for library in find_llvm(ignore_variable=True):
         verdict = try_llvm(library)
-        if verdict.usable and verdict.version not in seen:
-            seen.add(verdict.version)
+        if verdict.usable and verdict.version not in known:
+            known.add(verdict.version)
             yield Variant("llvm", environment={LLVM_VARIABLE: str(library.path)})
     for folder in filter(None, os.environ.get(NUMPY_FOLDERS, "").split(os.pathsep)):
         yield Variant("numpy", environment={**same, "PYTHONPATH": folder})
@@ -84,20 +84,20 @@ def computed(variant: Variant, small: bool) -> tuple[Arrays, dict[str, str]]:
         if done.returncode != 0:
             raise BenchFailed(f"bench elsewhere: {variant}: {done.stderr.strip().rpartition(chr(10))[2]}")
         with np.load(file) as arrays:
-            found = dict(arrays)
-    return found, json.loads(str(found.pop("versions")))
+            values = dict(arrays)
+    return values, json.loads(str(values.pop("versions")))
 
 
-def differences(one: Arrays, other: Arrays) -> dict[str, float]:
+def differences(first: Arrays, other: Arrays) -> dict[str, float]:
     """Largest differences by quantity, relative except for metrics; quantities that both have."""
-    found: dict[str, float] = {}
+    changes: dict[str, float] = {}
     for name in ("image", "traced", "metrics"):
-        if name in one and name in other:
-            largest = 1.0 if name == "metrics" else float(np.abs(one[name]).max())
-            found[name] = float(np.abs(one[name] - other[name]).max() / largest)
-    norms = [(one[name], other[name]) for name in one if name.startswith(GRADIENT)]
-    found["gradient"] = max(float(np.linalg.norm(a - b) / np.linalg.norm(a)) for a, b in norms if np.any(a))
-    return found
+        if name in first and name in other:
+            largest = 1.0 if name == "metrics" else float(np.abs(first[name]).max())
+            changes[name] = float(np.abs(first[name] - other[name]).max() / largest)
+    norms = [(first[name], other[name]) for name in first if name.startswith(GRADIENT)]
+    changes["gradient"] = max(float(np.linalg.norm(a - b) / np.linalg.norm(a)) for a, b in norms if np.any(a))
+    return changes
 
 
 def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any]:

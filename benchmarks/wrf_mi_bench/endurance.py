@@ -72,10 +72,10 @@ def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -
     }
     rng, rows, wrong = np.random.default_rng(0), [], []
     for name, run in runs.items():
-        kept = open_run(run)
+        opened_run = open_run(run)
 
-        def predict(kept: Any = kept) -> None:
-            kept.predict(rng.uniform(1, 4, (AT_ONCE, 3)))
+        def predict(opened_run: Any = opened_run) -> None:
+            opened_run.predict(rng.uniform(1, 4, (AT_ONCE, 3)))
 
         def open_again(run: Path = run) -> None:
             open_run(run).predict(rng.uniform(1, 4, (AT_ONCE, 3)))
@@ -103,9 +103,9 @@ def demo(folder: Path) -> dict[str, Any]:
     process = psutil.Process(started.pid)
     while started.poll() is None:
         now = 0
-        for one in _tree(process):
+        for member in _tree(process):
             with suppress(psutil.Error):
-                now += one.memory_info().rss
+                now += member.memory_info().rss
         most = max(most, now)
         time.sleep(POLL_S)
     gib = most / 2**30

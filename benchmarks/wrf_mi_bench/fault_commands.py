@@ -68,7 +68,7 @@ class Command(ABC):
         """Results in a folder, except dates and times."""
 
 
-def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+def differing(results: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Keys of results, from `Command.content`, that differ in a bit, or that one of them lacks."""
 
     def same(a: Any, b: Any) -> bool:
@@ -76,7 +76,7 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
             return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
         return type(a) is type(b) and bool(a == b)
 
-    return sorted(key for key in one.keys() | other.keys() if not same(one.get(key), other.get(key)))
+    return sorted(key for key in results.keys() | other.keys() if not same(results.get(key), other.get(key)))
 
 
 class Training(Command):

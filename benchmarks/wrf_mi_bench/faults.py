@@ -78,15 +78,15 @@ def forked(work: Callable[[], int], errors: Path, signals: Signals = ()) -> int:
         os._exit(status)
     os.close(write)
     os.set_blocking(read, False)
-    begun, left, found = time.monotonic(), [*sorted(signals), (MOST_S, int(signal.SIGKILL))], 0
+    begun, left, ended = time.monotonic(), [*sorted(signals), (MOST_S, int(signal.SIGKILL))], 0
     with errors.open("wb") as stream:
-        while not found:
+        while not ended:
             time.sleep(0.005)
-            found, status = os.waitpid(child, os.WNOHANG)
+            ended, status = os.waitpid(child, os.WNOHANG)
             with contextlib.suppress(BlockingIOError):
                 while piece := os.read(read, 1 << 16):
                     stream.write(piece)
-            if left and not found and time.monotonic() - begun > left[0][0]:
+            if left and not ended and time.monotonic() - begun > left[0][0]:
                 os.kill(child, left.pop(0)[1])
     os.close(read)
     return os.waitstatus_to_exitcode(status)
@@ -111,8 +111,8 @@ class Trial:
         changes = folder / "changes.json"
 
         def watch() -> Callable[[], object]:
-            found = watch_changes(self.whole)
-            return lambda: write_atomically(changes, json.dumps(found))
+            events = watch_changes(self.whole)
+            return lambda: write_atomically(changes, json.dumps(events))
 
         status = self.run(self.whole, watch)
         if status != 0:
@@ -281,7 +281,7 @@ def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, 
 
     ``kills`` are random kills, and kills at changes of files, of each command; None: 20, and all.
     """
-    found: dict[str, list[str]] = {}
+    outcomes: dict[str, list[str]] = {}
     for name in names:
         trial = Trial(COMMANDS[name](folder), folder / name.replace(" ", "-"))
         kinds: dict[str, Iterator[str]] = {
@@ -295,9 +295,9 @@ def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, 
         }
         for kind, cases in kinds.items():
             for wrong in cases:
-                found.setdefault(kind, []).append(wrong)
-                print(f"{name}: {kind} {len(found[kind])} {wrong}", file=sys.stderr, flush=True)
-    return {kind: {"cases": len(every), "failed": [one for one in every if one]} for kind, every in found.items()}
+                outcomes.setdefault(kind, []).append(wrong)
+                print(f"{name}: {kind} {len(outcomes[kind])} {wrong}", file=sys.stderr, flush=True)
+    return {kind: {"cases": len(every), "failed": [text for text in every if text]} for kind, every in outcomes.items()}
 
 
 def run(folder: Path, names: Sequence[str] = tuple(COMMANDS), kills: int | None = None) -> dict[str, Any]:

@@ -150,9 +150,9 @@ def render(
     """
     if (attenuation is None) == (opacity is None):
         raise TypeError("give either attenuation (WRF-GS) or opacity (WRF-GS+)")
-    seen = project(mean_m, scale_m, quaternion_xyzw, receiver)
-    footprints = np.array([footprint(seen, i, directions) for i in seen.order]).reshape(-1, *directions.shape[:-1])
-    sorted_signal = np.asarray(signal)[seen.order]
+    view = project(mean_m, scale_m, quaternion_xyzw, receiver)
+    footprints = np.array([footprint(view, i, directions) for i in view.order]).reshape(-1, *directions.shape[:-1])
+    sorted_signal = np.asarray(signal)[view.order]
     if opacity is not None:
-        return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[seen.order])
-    return blend_product(footprints, sorted_signal, np.asarray(attenuation)[seen.order])
+        return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[view.order])
+    return blend_product(footprints, sorted_signal, np.asarray(attenuation)[view.order])

@@ -27,10 +27,10 @@ def fit_key(*determining: Any) -> str:
 
 def source_files() -> dict[str, Path]:
     """Files of this package, its plugins and its scenes by name, except compiled files."""
-    found: dict[str, Path] = {}
+    by_name: dict[str, Path] = {}
     for name in PACKAGES:
         spec = find_spec(name)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             files = [path for path in files_below(Path(folder)) if COMPILED not in path.parts]
-            found |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in files}
-    return found
+            by_name |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in files}
+    return by_name

@@ -28,15 +28,15 @@ def main() -> dict[str, Any]:
         choose("cuda")
     except BackendError as error:
         raise InputError(f"bench gpu: {error}") from None
-    found = {backend: _measured(backend) for backend in ("cuda", "llvm")}
-    devices = {name: one["device"] for name, one in found.items()}
+    measured = {backend: _measured(backend) for backend in ("cuda", "llvm")}
+    devices = {name: of_backend["device"] for name, of_backend in measured.items()}
     devices["llvm"] += f", {os.cpu_count()} cores"
     rows = []
-    for gpu, cpu in zip(found["cuda"]["axes"], found["llvm"]["axes"], strict=True):
+    for gpu, cpu in zip(measured["cuda"]["axes"], measured["llvm"]["axes"], strict=True):
         for size, fast, slow in zip(gpu["sizes"], gpu["ms"], cpu["ms"], strict=False):
             row = {"what": f"{gpu['title']}, {size:,} {gpu['work']}", "value": f"{slow / fast:.2g}", "asked": ""}
             rows.append({**row, "gpu_ms": fast, "cpu_ms": slow, **devices})
-    return {"rows": rows, "axes": {name: one["axes"] for name, one in found.items()}}
+    return {"rows": rows, "axes": {name: of_backend["axes"] for name, of_backend in measured.items()}}
 
 
 def _measured(backend: str) -> dict[str, Any]:

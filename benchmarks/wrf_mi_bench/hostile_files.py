@@ -100,19 +100,19 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
         name, number = json.loads(last)["reader"], json.loads(last)["number"]
         failures[name][number] = reason
         place, first = names.index(name), number + 1
-    found: dict[str, dict[str, Any]] = {}
+    tallies: dict[str, dict[str, Any]] = {}
     for text in (folder / RESULTS).read_text().splitlines() if (folder / RESULTS).exists() else ():
-        one = json.loads(text)
-        del one["number"]
-        total = found.setdefault(one["reader"], one)
-        if total is not one:
-            total["failed"] |= one["failed"]
-            total |= {key: total[key] + one[key] for key in ("refused", "loaded")}
-            total |= {key: max(total[key], one[key]) for key in ("slowest_s", "largest_mb")}
+        tally = json.loads(text)
+        del tally["number"]
+        total = tallies.setdefault(tally["reader"], tally)
+        if total is not tally:
+            total["failed"] |= tally["failed"]
+            total |= {key: total[key] + tally[key] for key in ("refused", "loaded")}
+            total |= {key: max(total[key], tally[key]) for key in ("slowest_s", "largest_mb")}
     rows = []
     for name in names:
-        failed = found[name]["failed"] | {str(number): reason for number, reason in failures[name].items()}
-        rows.append({**found[name], "inputs": count, "failed": failed})
+        failed = tallies[name]["failed"] | {str(number): reason for number, reason in failures[name].items()}
+        rows.append({**tallies[name], "inputs": count, "failed": failed})
     return rows
 
 
@@ -131,13 +131,13 @@ class Tally:
 
 def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
     """Wait for a child; the reason why it ended in an input, or None."""
-    seen, since, started = "", time.monotonic(), False
+    last, since, started = "", time.monotonic(), False
     while child.poll() is None:
         time.sleep(0.2)
         now = state.read_text()
-        if now != seen:
-            started = started or seen != ""
-            seen, since = now, time.monotonic()
+        if now != last:
+            started = started or last != ""
+            last, since = now, time.monotonic()
         elif time.monotonic() - since > (HANG_S if started else START_S):
             child.kill()
             child.wait()
@@ -169,13 +169,13 @@ def forked_module(
                 sys.stderr.flush()
                 os._exit(status)
         until = time.monotonic() + (most_s or HANG_S)
-        while not (found := os.waitpid(child, os.WNOHANG))[0]:
+        while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             time.sleep(0.001)
             if time.monotonic() > until:
                 os.kill(child, signal.SIGKILL)
         errors.seek(0)
         lines = [line.strip() for line in errors if line.strip()]
-    return os.waitstatus_to_exitcode(found[1]), lines[-1] if lines else ""
+    return os.waitstatus_to_exitcode(waited[1]), lines[-1] if lines else ""
 
 
 def _read_one(reader: Any, sample: Path) -> str | None:
@@ -209,13 +209,13 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         reader, work, tally = READERS[name], place / "work", Tally(name, start)
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(place / SAMPLES / reader.group, work)
-        whole = (work / reader.file).read_bytes()
+        content = (work / reader.file).read_bytes()
         if (wrong := _read_one(reader, work)) is not None:
             tally.failed["whole"] = f"the whole file is not read: {wrong}"
         for number in range(start, int(count)):
             tally.number = number
             write_atomically(place / STATE, json.dumps(asdict(tally)))
-            (work / reader.file).write_bytes(mutated(whole, number, name))
+            (work / reader.file).write_bytes(mutated(content, number, name))
             before, peak = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             wrong = _read_one(reader, work)
             tally.slowest_s = max(tally.slowest_s, time.perf_counter() - before)

@@ -193,10 +193,10 @@ def prepare(folder: Path) -> None:
         return
     shutil.rmtree(folder, ignore_errors=True)
     rng = np.random.default_rng(0)
-    made = prepare_spectra(folder / "spectra")
-    positions = made.tx_pos_m
-    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
-    common["frequencies_hz"] = made.frequencies_hz
+    spectra = prepare_spectra(folder / "spectra")
+    positions = spectra.tx_pos_m
+    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": spectra.receivers, "official": spectra.official}
+    common["frequencies_hz"] = spectra.frequencies_hz
     prepare_strengths(folder / "ble")
     channels = (rng.normal(size=(1, 12, 2, 4)) + 1j * rng.normal(size=(1, 12, 2, 4))).astype(np.complex64)
     hz = CARRIER_HZ + 1e6 * np.arange(4)
@@ -293,9 +293,9 @@ def _write_runs(folder: Path) -> None:
     strengths = train(folder / "ble", folder / "runs" / "kriging", "kriging")
     where = ExportOptions(frequency_hz=CARRIER_HZ, tx_pos_m=np.array([[1.0, 2, 1]]), rx_pos_m=np.array([[3.0, 1, 2]]))
     export(folder / "scene", "paths", folder / "files" / "paths.csv", where)
-    made = radio_map(strengths, height_m=1.0, step_m=0.5)
-    write_map(made, folder / "runs" / "map.nc")
-    write_map(made, folder / "runs" / "map.zarr")
+    radio = radio_map(strengths, height_m=1.0, step_m=0.5)
+    write_map(radio, folder / "runs" / "map.nc")
+    write_map(radio, folder / "runs" / "map.zarr")
     write_map(radio_map(strengths, surface=folder / "files" / "box.ply"), folder / "runs" / "surface.nc")
     settings = (*SMALL, "network.static_geometry=true")
     run = train(folder / "spectra", folder / "runs" / "field", "wrf-gs+", settings=settings).folder

@@ -73,23 +73,23 @@ def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
     if not (folder / FINISHED).exists():
         shutil.rmtree(folder, ignore_errors=True)
         more: dict[str, Any] = {"scene": scene if cell.scene else None, "settings": cell.settings}
-        given: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
-        train(FLAT, folder, cell.model, **given, **more)
+        options: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
+        train(FLAT, folder, cell.model, **options, **more)
     run = open_run(folder)
     strengths_dbm, true_m = test_observations(run)
-    found = locate(run, strengths_dbm, on_progress=_show(cell.name))
+    located = locate(run, strengths_dbm, on_progress=_show(cell.name))
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
     best = best_neighbours(record, rows, strengths_dbm, true_m)
-    near = found.neighbours_error_m(true_m)
+    near = located.neighbours_error_m(true_m)
     assert near is not None
     return {
-        "error_m": found.error_m(true_m).tolist(),
+        "error_m": located.error_m(true_m).tolist(),
         "neighbours_error_m": near.tolist(),
         "best_neighbours_error_m": best.tolist(),
-        "inside": found.covers(true_m).tolist(),
-        "area_m2": found.area_m2.tolist(),
-        "radius_m": found.radius_m.tolist(),
-        "calibration": asdict(found.calibration),
+        "inside": located.covers(true_m).tolist(),
+        "area_m2": located.area_m2.tolist(),
+        "radius_m": located.radius_m.tolist(),
+        "calibration": asdict(located.calibration),
     }
 
 
@@ -100,7 +100,7 @@ def best_neighbours(record: Record, rows: IntArray, observed_dbm: FloatArray, tr
         for metric in METRICS
         for count in COUNTS
     ]
-    return np.asarray(min(errors, key=lambda one: float(one.mean())), float)
+    return np.asarray(min(errors, key=lambda error: float(error.mean())), float)
 
 
 def stretches(values: FloatArray) -> FloatArray:
@@ -163,24 +163,27 @@ def main() -> dict[str, Any]:
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
     scene = scene_of(next(part for part in PARTS if part.dataset == FLAT), place)[1]
-    found: dict[Cell, dict[str, Any]] = {}
+    measured: dict[Cell, dict[str, Any]] = {}
     for number, cell in enumerate(CELLS, 1):
         print(f"locate: {number} of {len(CELLS)}: {cell.name}", file=sys.stderr, flush=True)
-        found[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
-        row = row_of(cell, [found[cell]])
+        measured[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
+        row = row_of(cell, [measured[cell]])
         print(f"locate: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
-    return {"calibration": {cell.name: one["calibration"] for cell, one in found.items()}, **summary(found)}
+    return {
+        "calibration": {cell.name: result["calibration"] for cell, result in measured.items()},
+        **summary(measured),
+    }
 
 
-def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
+def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
     """Rows of the table, draws of the same kind pooled after them, and the verdict on pooled rows."""
     kinds: dict[Cell, list[Cell]] = {}
-    for cell in found:
+    for cell in measured:
         kinds.setdefault(replace(cell, seed=0), []).append(cell)
     rows, pooled = [], {}
     for kind, cells in kinds.items():
-        rows += [row_of(cell, [found[cell]]) for cell in cells]
-        pooled[kind] = row_of(kind, [found[cell] for cell in cells])
+        rows += [row_of(cell, [measured[cell]]) for cell in cells]
+        pooled[kind] = row_of(kind, [measured[cell] for cell in cells])
         if len(cells) > 1:
             rows.append(pooled[kind])
     worse = [row["what"] for kind, row in pooled.items() if kind.n_train and kind.scene and row["gain_m"][1] <= 0]

@@ -28,10 +28,10 @@ ASKED = "0.85 and 0.85"
 
 def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_M) -> tuple[float, float]:
     """Shares of true walls [m, 2, 2] near walls made [n, 2, 2], by length, and the reverse; end points in m."""
-    made, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
-    found = shapely.intersection(true, shapely.buffer(made, near_m)).length / true.length
-    right = shapely.intersection(made, shapely.buffer(true, near_m)).length / made.length
-    return float(found), float(right)
+    made_walls, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
+    share_found = shapely.intersection(true, shapely.buffer(made_walls, near_m)).length / true.length
+    right = shapely.intersection(made_walls, shapely.buffer(true, near_m)).length / made_walls.length
+    return float(share_found), float(right)
 
 
 def flat_plan() -> dict[str, Any]:
@@ -75,13 +75,13 @@ def _measured(grid: PlanGrid, true: FloatArray, register: bool = True) -> dict[s
         motion = register_walls(sample_walls(walls), true)
         walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
         scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
-    found, right = wall_agreement(walls, true)
+    share_found, right = wall_agreement(walls, true)
     line = shapely.unary_union(shapely.linestrings(true))
-    seen = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length
+    near_cells = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length
     return {
-        "layout_found": found,
+        "layout_found": share_found,
         "walls_right": right,
-        "layout_seen": float(seen),
+        "layout_seen": float(near_cells),
         "walls": len(walls),
         "length_m": float(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1).sum()),
         "scale": scale,

@@ -98,7 +98,7 @@ def _scan(xml: Path, poses_m: FloatArray, seed: int, survey: Survey) -> FloatArr
     middle = poses_m.mean(axis=0)
     for number, pose in enumerate(poses_m):
         points = simulate_scan(xml, pose[None], rays_per_pose=survey.rays, seed=seed * len(poses_m) + number)
-        own = Rotation.from_rotvec(rng.normal(0, POSE_RAD, 3))
-        points = own.apply(points - pose) + pose + rng.normal(0, POSE_M, 3)
+        turn = Rotation.from_rotvec(rng.normal(0, POSE_RAD, 3))
+        points = turn.apply(points - pose) + pose + rng.normal(0, POSE_M, 3)
         parts.append(common[1].apply(points - middle) + middle + common[0])
     return np.concatenate(parts)

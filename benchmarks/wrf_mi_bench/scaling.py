@@ -175,7 +175,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         logger.info("%s %d: %.1f ms, %.0f MB", axis.name, size, np.median(times[-1]), memory[-1])
         del call
         gc.collect()
-    found = exponent(sizes, times)
+    growth = exponent(sizes, times)
     return {
         "name": axis.name,
         "title": axis.title,
@@ -184,36 +184,36 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         "left_out": list(axis.sizes[len(sizes) :]),
         "ms": [float(np.median(ms)) for ms in times],
         "memory_mb": memory,
-        "exponent": vars(found),
+        "exponent": vars(growth),
         "limit": n_log_n(sizes),
     }
 
 
-def verdict(found: Interval, limit: float) -> str:
+def verdict(growth: Interval, limit: float) -> str:
     """Whether growth is at most that of the limit; it fails only where its whole interval lies above."""
-    if found.low > limit:
+    if growth.low > limit:
         return "does not hold"
-    return "holds" if found.high <= limit else "holds within its interval"
+    return "holds" if growth.high <= limit else "holds within its interval"
 
 
 def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     """Rows for the benchmark's table."""
-    made = []
-    for one in results:
-        found, sizes = Interval(**one["exponent"]), one["sizes"]
-        kept = sizes[larger_half(len(sizes))]
-        missing = f", {one['left_out'][0]:,} left out: too slow" if one["left_out"] else ""
-        growth = [f"{ms:.3g} ms" for ms in one["ms"]]
-        memory = [f"{mb:.0f}" for mb in one["memory_mb"]]
-        value = f"exponent {found.value:.2f} ({found.low:.2f} to {found.high:.2f}) from {kept[0]:,}"
-        made.append(
+    lines = []
+    for result in results:
+        slope, sizes = Interval(**result["exponent"]), result["sizes"]
+        larger = sizes[larger_half(len(sizes))]
+        missing = f", {result['left_out'][0]:,} left out: too slow" if result["left_out"] else ""
+        growth = [f"{ms:.3g} ms" for ms in result["ms"]]
+        memory = [f"{mb:.0f}" for mb in result["memory_mb"]]
+        value = f"exponent {slope.value:.2f} ({slope.low:.2f} to {slope.high:.2f}) from {larger[0]:,}"
+        lines.append(
             line(
-                f"{sizes[0]:,} to {sizes[-1]:,} {one['work']}, {one['title']}{missing}",
+                f"{sizes[0]:,} to {sizes[-1]:,} {result['work']}, {result['title']}{missing}",
                 f"{value}; {', '.join(growth)}; {', '.join(memory)} MB",
-                f"at most n log n ({one['limit']:.2f}): {verdict(found, one['limit'])}",
+                f"at most n log n ({result['limit']:.2f}): {verdict(slope, result['limit'])}",
             )
         )
-    return made
+    return lines
 
 
 def main() -> dict[str, Any]:

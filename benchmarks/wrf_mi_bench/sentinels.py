@@ -93,8 +93,8 @@ def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float
     section 3.2; `scipy.stats.quantile_test`.
     """
     scores = np.interp(np.linspace(0, 1, rows), np.linspace(0, 1, len(quantiles)), quantiles)
-    found = quantile_test(scores, p=0.5).confidence_interval(CONFIDENCE)
-    return float(found.low), float(found.high)
+    interval = quantile_test(scores, p=0.5).confidence_interval(CONFIDENCE)
+    return float(interval.low), float(interval.high)
 
 
 def _stored(name: str) -> dict[str, Any]:
@@ -114,10 +114,10 @@ def _of_table(row: Row) -> Group:
     figure = Figure(name, stored["score"]["median"], low, high, task.higher_is_better)
 
     def again(runs: Path) -> list[float]:
-        found = measure(runs, row)
-        if found["data"] != stored.get("data", found["data"]):
+        measured = measure(runs, row)
+        if measured["data"] != stored.get("data", measured["data"]):
             raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it again")
-        return [found["score"]["median"]]
+        return [measured["score"]["median"]]
 
     return Group(row.name, (figure,), again, available(row.part))
 
@@ -137,8 +137,8 @@ def _integrator() -> Group:
     from .traced import LARGEST_ERROR, LOWEST_SSIM, against_splatted, worst
 
     def again(_: Path) -> list[float]:
-        found = worst(against_splatted(FIELDS))
-        return [found["lowest_ssim"], found["largest_complex_error"]]
+        errors = worst(against_splatted(FIELDS))
+        return [errors["lowest_ssim"], errors["largest_complex_error"]]
 
     stored = _stored("traced-and-splatted")["figures"]["small"]
     words = "Mitsuba integrator against splatting"
@@ -187,9 +187,9 @@ def main() -> dict[str, Any]:
     for count, group in enumerate(known, 1):
         minutes = (time.perf_counter() - begun) / 60
         _say(f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
-        found = _rows(group, place)
-        rows += found
-        for row in found:
+        group_rows = _rows(group, place)
+        rows += group_rows
+        for row in group_rows:
             _say(f"{row['what']}: {row['value']}; stored {row['asked']}")
     return {"rows": rows, **_failure(rows)}
 
@@ -198,14 +198,14 @@ def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
     """Rows of a group, measured or read."""
     if not group.present:
         return [figure.row(None, ABSENT) for figure in group.figures]
-    kept = place / f"{group.name}.json"
+    file = place / f"{group.name}.json"
     try:
-        if not kept.exists():
+        if not file.exists():
             begun = time.perf_counter()
             values = [float(value) for value in group.measure(place)]
             measured = {"values": values, "date": time.strftime("%Y-%m-%d"), "seconds": time.perf_counter() - begun}
-            write_atomically(kept, json.dumps(measured))
-        content = json.loads(kept.read_text())
+            write_atomically(file, json.dumps(measured))
+        content = json.loads(file.read_text())
         more = {"date": content["date"], "seconds": content["seconds"]}
         pairs = zip(group.figures, content["values"], strict=True)
         return [figure.row(value, figure.verdict(value)) | more for figure, value in pairs]

@@ -137,15 +137,15 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
     block = TASKS[hybrid.task].block
     figures = []
     for name, run in {HYBRID: hybrid, **others}.items():
-        one = {"model": name, "score": run.metrics[block], "block": block}
+        figure = {"model": name, "score": run.metrics[block], "block": block}
         keys = ("train_seconds", "inside_90", "crps", "ms_per_sample")
-        one |= {key: run.metrics.get(key) for key in keys}
+        figure |= {key: run.metrics.get(key) for key in keys}
         if name == HYBRID:
-            one["stages"] = run.metrics["stages"]
+            figure["stages"] = run.metrics["stages"]
         else:
             gain = bootstrap(differences(hybrid, run), statistic=np.mean)
-            one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
-        figures.append(one)
+            figure |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
+        figures.append(figure)
     return figures
 
 
@@ -186,16 +186,18 @@ def measured(cell: Cell, folder: Path) -> dict[str, Any]:
 def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the table: the hybrid, then each part with the hybrid's gain over it."""
     rows = []
-    for one in figures:
-        score, inside = one["score"], one["inside_90"]
+    for part in figures:
+        score, inside = part["score"], part["inside_90"]
         value = f"median {score['median']:.4g}, mean {score['mean']:.4g}"
-        value += "" if inside is None else f", {inside:.0%} inside, CRPS {one['crps']:.3g}"
+        value += "" if inside is None else f", {inside:.0%} inside, CRPS {part['crps']:.3g}"
         asked = "85 to 95 % inside"
-        if "gain" in one:
-            limit = LIMITS[one["block"]]
-            interval = f"{one['gain_low']:.3g} to {one['gain_high']:.3g}"
-            asked = f"hybrid better by {one['gain']:.3g} ({interval}), at most {limit} worse"
-        rows.append({"what": f"{cell.title}: {one['model']}", "value": value, "asked": asked, **one, "cell": cell.name})
+        if "gain" in part:
+            limit = LIMITS[part["block"]]
+            interval = f"{part['gain_low']:.3g} to {part['gain_high']:.3g}"
+            asked = f"hybrid better by {part['gain']:.3g} ({interval}), at most {limit} worse"
+        rows.append(
+            {"what": f"{cell.title}: {part['model']}", "value": value, "asked": asked, **part, "cell": cell.name}
+        )
     return rows
 
 
@@ -304,10 +306,10 @@ def intervals() -> dict[str, Any]:
             rows.append({**row, **known, "cell": cell.title, "model": name})
             print(f"intervals: {row['what']}: {value}", file=sys.stderr, flush=True)
     inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
-    found = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
+    result = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
     if inside < len(rows):
-        found["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
-    return found
+        result["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
+    return result
 
 
 def interval_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -163,21 +163,21 @@ PARTS: Sequence[tuple[Callable[..., list[Row]], tuple[Any, ...], tuple[Any, ...]
 
 def main() -> dict[str, Any]:
     """All rows at full size, and a picture of error curves."""
-    rows = [one for part, full, _ in PARTS for one in part(*full)]
-    found = curves()
+    rows = [row for part, full, _ in PARTS for row in part(*full)]
+    errors = curves()
     if PICTURE.parent.is_dir():
-        draw(found, PICTURE)
-    return {"rows": rows, "curves": found}
+        draw(errors, PICTURE)
+    return {"rows": rows, "curves": errors}
 
 
 def quick_rows() -> list[Row]:
     """A few cases of each row."""
-    return [one for part, _, few in PARTS for one in part(*few)]
+    return [row for part, _, few in PARTS for row in part(*few)]
 
 
 def quick() -> dict[str, Any]:
     """`quick_rows`; `BenchFailed` where a bound is not kept."""
     rows = quick_rows()
-    if missed := [f"{one['what']}: {one['value']}, asked {one['asked']}" for one in rows if not held(one)]:
+    if missed := [f"{row['what']}: {row['value']}, asked {row['asked']}" for row in rows if not held(row)]:
         raise BenchFailed(f"bench stress --quick: {'; '.join(missed)}")
     return {"rows": rows}

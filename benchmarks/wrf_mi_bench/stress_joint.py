@@ -161,8 +161,8 @@ class _Joint:
 
     def _cancel(self) -> None:
         name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
-        here = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
-        factor = -wave / here * (1 + LEFT)
+        traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
+        factor = -wave / traced_wave * (1 + LEFT)
         gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
         self._values = _rounded({**self._values, name: gain})
 
@@ -181,9 +181,9 @@ class _Joint:
         steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
         of_paths = slopes(functionals, self._values, steps)
         for number, (kind, reference) in enumerate(references.items()):
-            found, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
+            report, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
             _, double = self._by_graph(MODELS[kind], weights[kind], DOUBLE, learned_alone=True)
-            value.add(reference.error(found, paths), kind)
+            value.add(reference.error(report, paths), kind)
             truth = {key: part + (of_paths[key][number] if key in steps else 0) for key, part in double.items()}
             slope.add(single, truth, {key: self._felt(key) for key in truth}, kind)
         what = f"{name}, {int(self._traced.exists.sum())} paths, {len(references)} cases"
@@ -219,8 +219,8 @@ class _Joint:
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
         report = model(paths, self._learned(model, params, kind))
         dr.backward(dr.sum(report * on_device(weight, kind)))
-        found = dr.detach(report).numpy().astype(float)
-        return found, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
+        values = dr.detach(report).numpy().astype(float)
+        return values, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
 
 
 class _Reference:
@@ -236,10 +236,10 @@ class _Reference:
             ports = np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz)
         return ORACLE.report(model, paths.at(*ports), self._there)
 
-    def error(self, found: FloatArray, paths: OraclePaths) -> float:
+    def error(self, report: FloatArray, paths: OraclePaths) -> float:
         """Error of a report."""
         waves = np.abs(paths.gain).reshape(len(self._there), -1).sum(axis=1) + np.abs(self._there).max(axis=1)
-        return report_error(self._model, found, self.report(paths), waves)
+        return report_error(self._model, report, self.report(paths), waves)
 
 
 def _natural(name: str) -> float:
@@ -285,9 +285,9 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     worst, single, delay = Worst(), Worst(), Worst()
     metres, counted = 0.0, 0
     for index, position_m in enumerate(tx):
-        found, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(position_m, rx, np.array(size_m))
+        lengths_m, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(position_m, rx, np.array(size_m))
         theirs = speed_of_light * delays_s[index]
-        for lengths, errors in ((found, worst), (found.astype(np.float32), single)):
+        for lengths, errors in ((lengths_m, worst), (lengths_m.astype(np.float32), single)):
             errors.add(np.abs(lengths - exact).max() if len(lengths) == len(exact) else np.inf)
         # Sionna RT finds some paths of large halls two or three times, by both triangles of a wall.
         off = np.abs(theirs[:, None] - exact) if len(theirs) else np.full((1, len(exact)), np.inf)

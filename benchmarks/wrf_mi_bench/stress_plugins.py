@@ -89,9 +89,9 @@ def plugin_gradients(of_each: int, names: Iterable[str] = tuple(fields.HARD)) ->
     forward = Worst()
 
     def single(field: fields.Field, blending: str, seed: int) -> dict[str, FloatArray]:
-        found, error = _through_render(field, blending, seed)
+        slopes, error = _through_render(field, blending, seed)
         forward.add(error)
-        return found
+        return slopes
 
     row = fields.gradient_row("plugin: derivatives", fields.cases(families, of_each), _summed, single)
     count = row["what"].rpartition(", ")[2]

@@ -85,21 +85,21 @@ class GradientWorst:
         least = max(least, UNFELT * max(felt.values(), default=0.0))
         for key in double:
             name = f"{key}, {where}" if where else key
-            found, truth = single[key] * values[key], double[key] * values[key]
-            if not np.isfinite(found).all():
+            derivative, truth = single[key] * values[key], double[key] * values[key]
+            if not np.isfinite(derivative).all():
                 self.error.add(np.nan, name)
                 continue
             # Where the true derivative is zero the error is absolute.
-            self.error.add(np.linalg.norm(found - truth) / (max(felt[key], least) or 1.0), name)
+            self.error.add(np.linalg.norm(derivative - truth) / (max(felt[key], least) or 1.0), name)
             if felt[key] <= least or not felt[key]:
                 continue
-            size = float(np.linalg.norm(found))
+            size = float(np.linalg.norm(derivative))
             # 1 - cosine of nearly equal vectors from their difference: the scalar product has no digits left for it.
-            unlike = np.linalg.norm(found / size - truth / felt[key]) ** 2 / 2 if size else 1.0
+            unlike = np.linalg.norm(derivative / size - truth / felt[key]) ** 2 / 2 if size else 1.0
             self.cosine.add(unlike, name)
             self.norm.add(abs(size / felt[key] - 1), name)
             plain = np.abs(truth) > PLAIN * np.abs(truth).max()
-            self.signs += int((np.sign(found) != np.sign(truth))[plain].sum())
+            self.signs += int((np.sign(derivative) != np.sign(truth))[plain].sum())
             self.compared += int(plain.sum())
 
     def row(self, what: str, bound: float = GRADIENT) -> Row:
@@ -135,11 +135,11 @@ def relative(error: Any, truth: Any) -> float:
 
 def stages(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, int, float, float]]:
     """Title, number of cases, worst error and widest bound of each of `STAGES`; NaN for a stage without rows."""
-    found = []
+    titled = []
     for title, begins in STAGES:
         members = [row for row in rows if re.match(begins, row["what"])]
         # Where a row states paths and cases, the cases come last.
         counts = [re.findall(r"(\d+) (?:cases|paths)", row["what"]) for row in members]
         worst, bound = zip(*map(worst_of, members), strict=True) if members else ((float("nan"),), (float("nan"),))
-        found.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
-    return found
+        titled.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
+    return titled

@@ -44,10 +44,12 @@ def write_tables(place: Path, quick: bool = False) -> None:
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
         text += [f"## {title}", part_table(part, groups)]
         most = max(share for share, _ in groups)
-        whole = {method: found[0] for (share, method), found in groups.items() if share == most}
+        first = {method: rows[0] for (share, method), rows in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
-            {part.entries[method].label: one["quantiles"] for method, one in whole.items()}, {}, TASKS[part.task].label
+            {part.entries[method].label: row["quantiles"] for method, row in first.items()},
+            {},
+            TASKS[part.task].label,
         )
         write_figure(place / picture, figure)
         text.append(f"![Distribution of the scores of each method]({picture})")
@@ -99,7 +101,7 @@ def is_former(part: Part, rows: Sequence[Mapping[str, Any]], newest: str | None)
 
 def newest_data(groups: Groups) -> str | None:
     """Digest of the data of most of the newest rows."""
-    rows = [row for found in groups.values() for row in found]
+    rows = [row for of_method in groups.values() for row in of_method]
     last = max(row["date"] for row in rows)
     return Counter(row.get("data") for row in rows if row["date"] == last).most_common(1)[0][0]
 
@@ -162,24 +164,24 @@ def part_table(part: Part, groups: Groups) -> str:
     sign = -1 if task.higher_is_better else 1
 
     def median(key: tuple[float, str]) -> float:
-        return float(np.mean([one["score"]["median"] for one in groups[key]]))
+        return float(np.mean([row["score"]["median"] for row in groups[key]]))
 
     head = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
     lines = []
     digits, newest = task.digits, newest_data(groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
-        found = groups[share, method]
-        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
-        medians = [one["score"]["median"] for one in found]
-        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
+        rows = groups[share, method]
+        each = {key: float(np.mean([row["score"][key] for row in rows])) for key in ("median", "mean", "p10", "p90")}
+        medians = [row["score"]["median"] for row in rows]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(rows) > 1 else ""
         cells = [
-            str(found[0]["n_train"]),
-            part.entries[method].label + (f" {FORMER}" if is_former(part, found, newest) else ""),
+            str(rows[0]["n_train"]),
+            part.entries[method].label + (f" {FORMER}" if is_former(part, rows, newest) else ""),
             f"**{each['median']:.{digits}f}**{spread}",
             *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
-            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
-            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
-            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
+            f"{np.median([row['train_seconds'] for row in rows]):.0f} s",
+            f"{np.median([row['ms_per_sample'] for row in rows]):.2g} ms",
+            f"{max(row['peak_memory_mb'] for row in rows):.0f} MB",
             part.entries[method].published if share == max(share for share, _ in groups) else "",
         ]
         lines.append(cells)
@@ -191,9 +193,9 @@ def _reference_rows(part: Part, groups: Groups) -> list[list[str]]:
     if "idw" in part.entries:
         return []
     digits, share = 2, max(share for share, _ in groups)
-    one = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
+    row = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
     words, lines = TASKS[part.task].references, []
-    for key, block in one["reference"].items():
+    for key, block in row["reference"].items():
         scores = (f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
-        lines.append([str(one["n_train"]), words[key], f"**{block['median']:.{digits}f}**", *scores, *[""] * 4])
+        lines.append([str(row["n_train"]), words[key], f"**{block['median']:.{digits}f}**", *scores, *[""] * 4])
     return lines

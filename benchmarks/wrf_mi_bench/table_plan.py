@@ -27,7 +27,7 @@ class Entry:
 
 
 def _set(*settings: str) -> tuple[str, ...]:
-    return tuple(word for one in settings for word in ("--set", one))
+    return tuple(word for setting in settings for word in ("--set", setting))
 
 
 def _model(name: str, *more: str) -> tuple[str, ...]:

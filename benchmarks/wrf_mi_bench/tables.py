@@ -77,19 +77,19 @@ def meshed_scan(dataset: str, folder: Path) -> Path:
     """Scene in ``folder`` from the scan of a data set, which is made where needed."""
     load_record(dataset)
     scan = data_folder(dataset) / SCAN
-    made = folder / f"{dataset}-{fit_key(scan)}"
-    if not made.exists():
-        make_scene(scan, made)
-    return made
+    scene = folder / f"{dataset}-{fit_key(scan)}"
+    if not scene.exists():
+        make_scene(scan, scene)
+    return scene
 
 
 def corrected_scene(row: Row, folder: Path) -> Path:
     """Scene of a row in ``folder``, corrected by its training rows."""
     stated = scene_of(row.part, folder)[1]
-    made = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
-    if not made.exists():
-        run_command(["correct", stated, row.part.dataset, *row.rows], made, resumes=False)
-    return made
+    scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
+    if not scene.exists():
+        run_command(["correct", stated, row.part.dataset, *row.rows], scene, resumes=False)
+    return scene
 
 
 def _scene(row: Row, runs: Path) -> list[str]:
@@ -149,7 +149,7 @@ def tables(
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:
         print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
-    stored, digests = {one["row"]: one for one in read_rows(place)}, dict[str, str]()
+    stored, digests = {row["row"]: row for row in read_rows(place)}, dict[str, str]()
     left = [row for row in rows if available(row.part) and not _holds(stored.get(row.name), row, digests)]
     print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
     _report_versions([stored[row.name] for row in rows if row.name in stored and row not in left])
@@ -199,14 +199,14 @@ def _holds(stored: Mapping[str, Any] | None, row: Row, digests: dict[str, str]) 
     return stored["data"] == digests[dataset]
 
 
-def _report_versions(kept: Sequence[Mapping[str, Any]]) -> None:
+def _report_versions(rows: Sequence[Mapping[str, Any]]) -> None:
     """Report how many kept rows have other versions of packages or do not state their data."""
     now = package_versions()
-    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in kept)
-    silent = sum("data" not in row for row in kept)
+    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in rows)
+    silent = sum("data" not in row for row in rows)
     for count, what in ((others, "were measured by other versions of packages"), (silent, "do not state their data")):
         if count:
-            text = f"tables: {count} of {len(kept)} stored rows {what} and are kept; delete their files to measure them"
+            text = f"tables: {count} of {len(rows)} stored rows {what} and are kept; delete their files to measure them"
             print(text, file=sys.stderr)
 
 

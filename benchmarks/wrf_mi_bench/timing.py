@@ -137,18 +137,18 @@ def history_of(call: Call, again: bool = False) -> tuple[float, list[dict[str, A
             call()
         dr.sync_thread()
         dr.kernel_history_clear()
-        whole = 1e3 * seconds(call)
-        return whole, dr.kernel_history()
+        total_ms = 1e3 * seconds(call)
+        return total_ms, dr.kernel_history()
 
 
 def split(call: Call) -> Split:
     """Shares of the time of a call, see `history_of`."""
-    whole, history = history_of(call)
+    total_ms, history = history_of(call)
     generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
     # Kernels may run concurrently with each other and with the recording of the next.
-    executed = min(sum(entry["execution_time"] for entry in history), max(whole - generated, 0.0))
+    executed = min(sum(entry["execution_time"] for entry in history), max(total_ms - generated, 0.0))
     compiled = sum(not entry.get("cache_hit", 1) for entry in history)
-    return Split(max(whole - generated - executed, 0.0), generated, executed, len(history), compiled)
+    return Split(max(total_ms - generated - executed, 0.0), generated, executed, len(history), compiled)
 
 
 def memory_mb(call: Call) -> float:
@@ -164,7 +164,7 @@ def memory_mb(call: Call) -> float:
     if RESET_PEAK.exists():
         RESET_PEAK.write_text("5")  # proc(5): resets the peak resident set size
         settle(call())
-        line = next(one for one in STATUS.read_text().splitlines() if one.startswith("VmHWM:"))
+        line = next(entry for entry in STATUS.read_text().splitlines() if entry.startswith("VmHWM:"))
         peak = 1024 * int(line.split()[1])
     else:
         peak = _watched(call)
@@ -199,14 +199,14 @@ def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) 
     """
     if len(sizes) != len(times) or len(sizes) < 2:
         raise ValueError(f"exponent: {len(sizes)} sizes and {len(times)} sets of times; give two or more of both")
-    kept = larger_half(len(sizes))
-    x = np.log(np.asarray(sizes, float)[kept])
+    larger = larger_half(len(sizes))
+    x = np.log(np.asarray(sizes, float)[larger])
     x -= x.mean()
 
     def slope(*samples: FloatArray, axis: int) -> Any:
         return np.tensordot(x, np.log([np.median(values, axis=axis) for values in samples]), 1) / (x @ x)
 
-    return bootstrap(*list(times)[kept], statistic=slope, seed=seed)
+    return bootstrap(*list(times)[larger], statistic=slope, seed=seed)
 
 
 def larger_half(count: int) -> slice:

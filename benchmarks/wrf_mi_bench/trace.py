@@ -121,8 +121,8 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
         apart = np.stack(distances(a, b))
         same = apart.max(axis=0) < 1
         rows, columns = linear_sum_assignment(np.where(same, apart.sum(axis=0), 1e3))
-        kept = same[rows, columns]
-        pairs.append(np.stack([a[rows[kept]], b[columns[kept]]]))
+        matched = same[rows, columns]
+        pairs.append(np.stack([a[rows[matched]], b[columns[matched]]]))
     first, second = np.concatenate(pairs, axis=1)
     return first, second
 
@@ -145,13 +145,13 @@ def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, tria
         u, v = (np.cross(s, second[which]) * n).sum(axis=1), (np.cross(first[which], s) * n).sum(axis=1)
         return np.asarray((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack))
 
-    def obstructed(here: FloatArray, there: FloatArray) -> bool:
-        length = float(np.linalg.norm(there - here))
-        way = (there - here) / length
+    def obstructed(start: FloatArray, end: FloatArray) -> bool:
+        length = float(np.linalg.norm(end - start))
+        way = (end - start) / length
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (offset - normal @ here) / (normal @ way)
+            t = (offset - normal @ start) / (normal @ way)
         which = np.flatnonzero((t > ON_SURFACE_M) & (t < length - ON_SURFACE_M))
-        return bool(inside(here + t[which, None] * way, which, 0.0).any())
+        return bool(inside(start + t[which, None] * way, which, 0.0).any())
 
     def mirrored(before: FloatArray, at: FloatArray, after: FloatArray) -> bool:
         which = np.flatnonzero(np.abs(normal @ at - offset) < ON_SURFACE_M)
@@ -171,14 +171,12 @@ def newrf() -> dict[str, Any]:
     """Both rooms of the NeWRF data compared with MATLAB's image method, with rows for the table."""
     figures = {name: image_method_agreement(room_file(name)) for name in ROOMS}
     rows = []
-    for name, found in figures.items():
-        lacking = (
-            f"MATLAB lacks {found['paths_matlab_lacks']} more, of which {found['of_these_confirmed']} are confirmed"
-        )
-        value = f"{100 * found['share_found']:.2f} %, lengths within {1e3 * found['length_error_m']:.2f} mm"
-        cea = f"{found['cea_db']['median']:.0f} dB (p10 {found['cea_db']['p10']:.0f} dB)"
+    for name, room in figures.items():
+        lacking = f"MATLAB lacks {room['paths_matlab_lacks']} more, of which {room['of_these_confirmed']} are confirmed"
+        value = f"{100 * room['share_found']:.2f} %, lengths within {1e3 * room['length_error_m']:.2f} mm"
+        cea = f"{room['cea_db']['median']:.0f} dB (p10 {room['cea_db']['p10']:.0f} dB)"
         rows += [
             line(f"{name}, paths found ({lacking})", value, "99 %, 1 mm"),
-            line(f"{name}, channel of all {found['receivers']} positions, median CEA", cea, "30 dB"),
+            line(f"{name}, channel of all {room['receivers']} positions, median CEA", cea, "30 dB"),
         ]
     return {"rows": rows, "rooms": figures}

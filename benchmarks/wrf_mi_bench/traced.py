@@ -134,12 +134,12 @@ def against_splatted(fields: int = 20, **field: Any) -> list[dict[str, float]]:
     return result
 
 
-def worst(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def worst(differences: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The worst of several `difference`."""
     return {
-        "lowest_ssim": min(f["ssim"] for f in found),
-        "largest_magnitude_error": max(f["magnitude_error"] for f in found),
-        "largest_complex_error": max(f["complex_error"] for f in found),
+        "lowest_ssim": min(f["ssim"] for f in differences),
+        "largest_magnitude_error": max(f["magnitude_error"] for f in differences),
+        "largest_complex_error": max(f["complex_error"] for f in differences),
     }
 
 
@@ -154,8 +154,8 @@ def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int
         for axes in (1.0, 2.0):
             # The overlap is that of 300 Gaussians of 2 degrees, except at the largest sizes.
             count = max(30, int(300 * (2 / size) ** 2))
-            found = against_splatted(fields, size_deg=size, ratio=axes, count=min(count, 1000))
-            means = {name: float(np.mean([f[name] for f in found])) for name in found[0]}
+            differences = against_splatted(fields, size_deg=size, ratio=axes, count=min(count, 1000))
+            means = {name: float(np.mean([f[name] for f in differences])) for name in differences[0]}
             rows.append({"size_deg": float(size), "ratio": axes} | means)
     return rows
 
@@ -308,7 +308,7 @@ def main() -> dict[str, Any]:
     what = f"traced against splatted, worst of {len(small)} renders of random fields of small Gaussians"
     asked = f"{LOWEST_SSIM:g}, {100 * LARGEST_ERROR:g} %"
     rows = [line(what, f"SSIM {least:.4f}, L2 error {most:.2f} %", asked)]
-    for found in figures["pace"]:
-        what = f"10,000 Gaussians of {found['size_deg']:g}°, 360 x 90: `volprim_rf_basic`'s time over ours"
-        rows.append(line(what, f"{found['stock_over_traced']:.1f} ({found['traced_ms']:.0f} ms)", "1"))
+    for times in figures["pace"]:
+        what = f"10,000 Gaussians of {times['size_deg']:g}°, 360 x 90: `volprim_rf_basic`'s time over ours"
+        rows.append(line(what, f"{times['stock_over_traced']:.1f} ({times['traced_ms']:.0f} ms)", "1"))
     return {"rows": rows, **figures}

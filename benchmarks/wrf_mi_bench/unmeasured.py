@@ -83,9 +83,9 @@ def _run(place: Path, record: str | Record, split: Split | str, seed: int, model
 
 def _scores(run: Results, prediction: Observations | None = None) -> list[float]:
     """Scores of a run, or of another prediction of its rows, receiver by receiver where the truth is known."""
-    found = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
-    found = np.asarray(found, float)[:, np.argsort(run.row)]
-    return [round(float(one), SCORE_DIGITS) for one in found[np.isfinite(found)]]
+    scores = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
+    scores = np.asarray(scores, float)[:, np.argsort(run.row)]
+    return [round(float(score), SCORE_DIGITS) for score in scores[np.isfinite(scores)]]
 
 
 def _facts(hybrid: Results) -> dict[str, Any]:
@@ -101,11 +101,11 @@ def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
     split = f"{held.kind}:{fold}"
     (rows,) = make_splits(record, split, seed, held.n_train)
     better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
-    given: dict[str, Any] = {"n_train": held.n_train}
-    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **given)
-    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **given)
-    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **given)
-    kriging = _run(folder, held.dataset, split, seed, "kriging", **given)
+    rows_used: dict[str, Any] = {"n_train": held.n_train}
+    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **rows_used)
+    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **rows_used)
+    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **rows_used)
+    kriging = _run(folder, held.dataset, split, seed, "kriging", **rows_used)
     return {
         HYBRID: _scores(hybrid),
         TRACED: _scores(traced),
@@ -129,17 +129,17 @@ def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> d
     split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
     (rows,) = make_splits(record, split, seed, held.n_train)
     hybrid = _run(folder, record, rows, seed, "hybrid", scene=scene)
-    found: dict[str, Any] = {HYBRID: _scores(hybrid)}
+    scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
         alone, these = only(record, rows)
-        found[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
-        found[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
-        found[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
+        scores[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
+        scores[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
+        scores[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
     else:
-        for name, given in ((TRACED, scene), (CORRECTED, better)):
-            found[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=given, settings=TRANSMISSION))
-        found[LAW] = _scores(hybrid, hybrid.references["law"])
-    return found | _facts(hybrid)
+        for name, where in ((TRACED, scene), (CORRECTED, better)):
+            scores[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=where, settings=TRANSMISSION))
+        scores[LAW] = _scores(hybrid, hybrid.references["law"])
+    return scores | _facts(hybrid)
 
 
 def only(record: Record, split: Split) -> tuple[Record, Split]:
@@ -157,20 +157,20 @@ def _scene(held: Held, folder: Path) -> str:
     return str(meshed_scan(held.dataset, folder))
 
 
-def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
+def gains(measurements: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
     """Median and mean of each method, pooled, and the hybrid's mean gain over it with its interval, by name.
 
     Seeds score the same pairs of receiver and row, whose mean counts once.
     """
-    task = TASKS[found[0]["task"]]
+    task = TASKS[measurements[0]["task"]]
     sign = 1 if task.higher_is_better else -1
-    names = [name for name in found[0] if name not in FACTS]
-    pairs = [tuple(pair) for one in found for pair in one[PAIRS]]
+    names = [name for name in measurements[0] if name not in FACTS]
+    pairs = [tuple(pair) for measurement in measurements for pair in measurement[PAIRS]]
     place = {pair: k for k, pair in enumerate(dict.fromkeys(pairs))}
     number = np.array([place[pair] for pair in pairs])
     pooled = {}
     for name in names:
-        scores = np.clip(np.concatenate([one[name] for one in found]), *task.limits)
+        scores = np.clip(np.concatenate([measurement[name] for measurement in measurements]), *task.limits)
         pooled[name] = np.bincount(number, scores) / np.bincount(number)
     return {
         name: (
@@ -182,11 +182,11 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
     }
 
 
-def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    digits = TASKS[found[0]["task"]].digits
-    inside = float(np.mean([one["inside_90"] for one in found]))
+def _rows(what: str, measurements: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    digits = TASKS[measurements[0]["task"]].digits
+    inside = float(np.mean([measurement["inside_90"] for measurement in measurements]))
     rows = []
-    for name, (median, mean, gain) in gains(found).items():
+    for name, (median, mean, gain) in gains(measurements).items():
         value = f"median {median:.{digits}f}, mean {mean:.{digits}f}"
         asked = f"{inside:.0%} inside (80 to 97 %)" if gain is None else f"hybrid better by {gain}"
         figures = {"at": what, "method": name, "median": median, "mean": mean, "inside": inside, "digits": digits}
@@ -203,7 +203,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     places = dict.fromkeys(row["at"] for row in rows)
     by_place = [[row for row in rows if row["at"] == at] for at in places]
     methods = [row["method"] for row in by_place[0]][1:]
-    shared = any([row["method"] for row in found][1:] != methods for found in by_place)
+    shared = any([row["method"] for row in of_place][1:] != methods for of_place in by_place)
     columns = ["held out", HYBRID, "inside", *(["others"] if shared else methods)]
     lines = []
     for at, (hybrid, *others) in zip(places, by_place, strict=True):

@@ -21,7 +21,7 @@ def test_budgets_are_compared_with_the_first(folder: Path, one_gateway: Record, 
         "fewer": Budget((), Compression(budget=5), of="large"),
     }
     schedule = (*QUICK, "steps=10", "holdout_steps_fraction=0")
-    found = budgets(record, tmp_path, schedule, given=given)
+    found = budgets(record, tmp_path, schedule, given)
     assert found["large"]["times_smaller"] == 1
     assert found["small, 8"]["times_smaller"] > 10
     assert found["small, 8"]["ssim_loss"] == found["large"]["ssim"]["median"] - found["small, 8"]["ssim"]["median"]
