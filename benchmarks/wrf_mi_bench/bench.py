@@ -24,7 +24,7 @@ from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
 from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
-from wrf_mi.runs.sweep import dataset_files
+from wrf_mi.runs.sweep import dataset_files, markdown_table
 
 from .fit_key import fit_key
 from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
@@ -39,12 +39,9 @@ class BenchFailed(RuntimeError):
     exit_status = 1
 
 
-REFUSED = 2
-"""Exit status of bad input."""
-ENTRY_POINTS = "wrf_mi.benchmarks"
-"""Group of entry points by which other packages add checks."""
-MEASURED, STORED_CHECK = "bench.json", "check.json"
-"""Files in the folder of a finished case, and of a finished check."""
+REFUSED = 2  # exit status of bad input
+ENTRY_POINTS = "wrf_mi.benchmarks"  # group of entry points by which other packages add checks
+MEASURED, STORED_CHECK = "bench.json", "check.json"  # files in the folder of a finished case, and of a finished check
 
 
 class CheckRefused(InputError):
@@ -110,7 +107,9 @@ _OWN: Mapping[str, Check] = {
     "operator": _here("prediction by operator", "operator:main"),
     "training": _here("training", "training:main", RFID),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
-    "intervals": _here("intervals of three models", "coverage:main", RFID, FLAT, resumes=True, table="coverage:table"),
+    "intervals": _here(
+        "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
+    ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "new-carriers": _here(
         "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
@@ -140,8 +139,7 @@ _OWN: Mapping[str, Check] = {
     ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
-CHECKS: Mapping[str, Check] = _CHECKS
-"""All checks by name."""
+CHECKS: Mapping[str, Check] = _CHECKS  # all checks by name
 
 
 def register(name: str, check: Check) -> None:
@@ -159,10 +157,7 @@ def bench(names: Sequence[str], out: Path, runs: Path, scheduler: Scheduler | No
     """Measure cases and checks, each in a subprocess, and write ``<case>.json`` and ``README.md`` to ``out``.
 
     A case that is finished in ``runs`` for the same arguments, source, data and versions is used again; a stopped one
-    is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths.
-
-    Returns:
-        Content of the JSON file of each case.
+    is resumed. Workers of a scheduler must have ``runs`` and the data under the same paths. Content of each JSON file.
     """
     for name in names:
         if name not in CASES and name not in CHECKS:
@@ -209,11 +204,11 @@ def _case(runs: Path, name: str) -> dict[str, Any]:
 
 def case_folder(runs: Path, name: str) -> Path:
     """Folder of a case or check: its name and a `fit_key` of arguments, source, data and versions."""
-    made: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
-    what = made.function if isinstance(made, Check) else made.arguments
+    entry: Case | Check = CHECKS[name] if name in CHECKS else CASES[name]
+    what = entry.function if isinstance(entry, Check) else entry.arguments
     # A check that goes on keys its parts itself.
-    source = {} if isinstance(made, Check) and made.resumes else source_digests(*modules_of(name))
-    return runs / f"{name}-{fit_key(what, source, [dataset_files(one) for one in made.data])}"
+    source = {} if isinstance(entry, Check) and entry.resumes else source_digests(*modules_of(name))
+    return runs / f"{name}-{fit_key(what, source, [dataset_files(dataset) for dataset in entry.data])}"
 
 
 def modules_of(name: str) -> tuple[str, ...]:
@@ -238,11 +233,7 @@ def _measure(name: str, folder: Path) -> dict[str, Any]:
 
 
 def run_command(arguments: Sequence[str], folder: Path, where: str = "", resumes: bool = True) -> float | None:
-    """Run ``wrf-mi`` into a run folder, or resume it there.
-
-    Returns:
-        Elapsed seconds; None where the run was resumed.
-    """
+    """Run ``wrf-mi`` into a run folder, or resume it there; elapsed seconds, None where it was resumed."""
     resumed = resumes and (folder / CONFIG).exists()
     call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
     start = time.perf_counter()
@@ -274,8 +265,7 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
 def provenance(*modules: str) -> dict[str, Any]:
     """Date, machine, versions of packages, digests of the source and, in a worker, its number of threads.
 
-    Args:
-        modules: modules that made the result; what they import counts too.
+    ``modules`` made the result; what they import counts too.
     """
     count, known = worker_threads(), versions()
     machine = {
@@ -314,20 +304,15 @@ NOTE = (
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of results."""
-    lines = [
-        "| what | SSIM median | mean | p10 | p90 | IDW median | steps | training | ms per spectrum | peak memory |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    head = ("what", "SSIM median", "mean", "p10", "p90", "IDW median")
+    rows = []
     for result in results:
         m = result["metrics"]
-        score, idw = m["ssim"], m["reference"]["idw4"]["median"]
-        minutes = f"{m['train_seconds'] / 60:.1f} min"
-        quantiles = " | ".join(f"{score[key]:.3f}" for key in ("mean", "p10", "p90"))
-        lines.append(
-            f"| {result['title']} | **{score['median']:.3f}** | {quantiles} "
-            f"| {idw:.3f} | {m['steps']:,} | {minutes} | {m['ms_per_sample']:.1f} | {m['peak_memory_mb']:.0f} MB |"
-        )
-    return "\n".join(lines)
+        scores = [f"**{m['ssim']['median']:.3f}**", *(f"{m['ssim'][key]:.3f}" for key in ("mean", "p10", "p90"))]
+        costs = f"{m['steps']:,}", f"{m['train_seconds'] / 60:.1f} min", f"{m['ms_per_sample']:.1f}"
+        idw, memory = f"{m['reference']['idw4']['median']:.3f}", f"{m['peak_memory_mb']:.0f} MB"
+        rows.append([result["title"], *scores, idw, *costs, memory])
+    return markdown_table([*head, "steps", "training", "ms per spectrum", "peak memory"], rows)
 
 
 def own_table(result: Mapping[str, Any]) -> str:
@@ -338,8 +323,6 @@ def own_table(result: Mapping[str, Any]) -> str:
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of checks."""
-    lines = ["| what | measured | asked |", "| --- | --- | --- |"]
-    for result in results:
-        rows = result["figures"]["rows"]
-        lines += [f"| {result['title']}: {r['what']} | **{r['value']}** | {r['asked']} |" for r in rows]
-    return "\n".join(lines)
+    pairs = [(result["title"], row) for result in results for row in result["figures"]["rows"]]
+    cells = ([f"{title}: {row['what']}", f"**{row['value']}**", row["asked"]] for title, row in pairs)
+    return markdown_table(["what", "measured", "asked"], cells)

@@ -15,8 +15,7 @@ from wrf_mi.core.registry import resolve
 def main(function: str, out: str) -> int:
     """Call ``function`` (``module:name``) and write its result as JSON.
 
-    Returns:
-        Exit status: 2 with one line where data are missing, 130 where it was interrupted.
+    The exit status is 2 with one line where data are missing, 130 where it was interrupted.
     """
     init()
     try:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,8 @@ from wrf_mi.datasets.registry import locate
 from .bench import modules_of, provenance
 
 Row = dict[str, str]
-STORED = Path("benchmarks/results")
-"""Stored results, in a checkout."""
-MEASURED = "measured"
-"""Machine, versions and date of a stored part."""
+STORED = Path("benchmarks/results")  # stored results, in a checkout
+MEASURED = "measured"  # machine, versions and date of a stored part
 
 
 def line(what: str, value: str, asked: str = "") -> Row:
@@ -30,6 +30,15 @@ def kept(file: Path, measure: Callable[[], Any]) -> Any:
     if not file.exists():
         write_atomically(file, json.dumps(measure(), indent=1))
     return json.loads(file.read_text(encoding="utf-8"))
+
+
+def kept_work(place: Path, name: str, measure: Callable[[Path], Any]) -> Any:
+    """As `kept`, of a measurement in a folder below ``place``, which is removed after it."""
+    folder = place / name
+    shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
+    result = kept(place / f"{name}.json", partial(measure, folder))
+    shutil.rmtree(folder, ignore_errors=True)
+    return result
 
 
 def stored_part(benchmark: str, name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from wrf_mi.backend import choose, find_cuda, find_llvm
 from wrf_mi.backend.libraries import LLVM_VARIABLE
 from wrf_mi.backend.probe import try_cuda, try_llvm
+from wrf_mi.runs.sweep import markdown_table
 
 from .bench import BenchFailed
 
@@ -37,12 +38,8 @@ a fit as between two seeds."""
 EXACT = ("image", "traced", "metrics")
 """Quantities that are bit-identical on any number of threads: pixels are sums of one thread each, a deterministic fit
 has one thread."""
-HEADS = {
-    "image": "image of Gaussians",
-    "traced": "traced spectrum",
-    "gradient": "gradients",
-    "metrics": "metrics of a fit",
-}
+HEADS = {"image": "image of Gaussians", "traced": "traced spectrum"}
+HEADS |= {"gradient": "gradients", "metrics": "metrics of a fit"}
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -63,11 +60,11 @@ def variants(threads: Sequence[int] = THREADS) -> Iterator[Variant]:
     same = {LLVM_VARIABLE: used.llvm_path or ""}
     for count in threads:
         yield Variant("threads", threads=count, environment=same)
-    seen = {used.llvm_version}
+    known = {used.llvm_version}
     for library in find_llvm(ignore_variable=True):
         verdict = try_llvm(library)
-        if verdict.usable and verdict.version not in seen:
-            seen.add(verdict.version)
+        if verdict.usable and verdict.version not in known:
+            known.add(verdict.version)
             yield Variant("llvm", environment={LLVM_VARIABLE: str(library.path)})
     for folder in filter(None, os.environ.get(NUMPY_FOLDERS, "").split(os.pathsep)):
         yield Variant("numpy", environment={**same, "PYTHONPATH": folder})
@@ -87,20 +84,20 @@ def computed(variant: Variant, small: bool) -> tuple[Arrays, dict[str, str]]:
         if done.returncode != 0:
             raise BenchFailed(f"bench elsewhere: {variant}: {done.stderr.strip().rpartition(chr(10))[2]}")
         with np.load(file) as arrays:
-            found = dict(arrays)
-    return found, json.loads(str(found.pop("versions")))
+            values = dict(arrays)
+    return values, json.loads(str(values.pop("versions")))
 
 
-def differences(one: Arrays, other: Arrays) -> dict[str, float]:
+def differences(first: Arrays, other: Arrays) -> dict[str, float]:
     """Largest differences by quantity, relative except for metrics; quantities that both have."""
-    found: dict[str, float] = {}
+    changes: dict[str, float] = {}
     for name in ("image", "traced", "metrics"):
-        if name in one and name in other:
-            largest = 1.0 if name == "metrics" else float(np.abs(one[name]).max())
-            found[name] = float(np.abs(one[name] - other[name]).max() / largest)
-    norms = [(one[name], other[name]) for name in one if name.startswith(GRADIENT)]
-    found["gradient"] = max(float(np.linalg.norm(a - b) / np.linalg.norm(a)) for a, b in norms if np.any(a))
-    return found
+        if name in first and name in other:
+            largest = 1.0 if name == "metrics" else float(np.abs(first[name]).max())
+            changes[name] = float(np.abs(first[name] - other[name]).max() / largest)
+    norms = [(first[name], other[name]) for name in first if name.startswith(GRADIENT)]
+    changes["gradient"] = max(float(np.linalg.norm(a - b) / np.linalg.norm(a)) for a, b in norms if np.any(a))
+    return changes
 
 
 def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any]:
@@ -117,16 +114,8 @@ def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any
             bound = 0.0 if variant.kind == "threads" and quantity in EXACT else BOUNDS[quantity]
             asked = f"at most {bound:g}" if bound else "bit-identical"
             row = {"what": f"{name}: {HEADS[quantity]}", "value": f"{value:.1e}" if value else "0", "asked": asked}
-            rows.append(
-                {
-                    **row,
-                    "variant": name,
-                    "compared_with": first[1],
-                    "quantity": quantity,
-                    "difference": value,
-                    "bound": bound,
-                }
-            )
+            row |= {"variant": name, "compared_with": first[1], "quantity": quantity}
+            rows.append({**row, "difference": value, "bound": bound})
     above = [row["what"] for row in rows if not row["difference"] <= row["bound"]]
     failed = {"failed": f"beyond its bound: {'; '.join(above)}"} if above else {}
     return {"rows": rows, **failed}
@@ -143,11 +132,8 @@ def _name(variant: Variant, versions: Mapping[str, str]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: a line for each variant, difference and promise of each quantity."""
-    lines = [
-        f"| against {rows[0]['compared_with']} | {' | '.join(HEADS.values())} |",
-        "| --- |" + " --- |" * len(HEADS),
-    ]
+    lines = []
     for name in dict.fromkeys(row["variant"] for row in rows):
         cells = {row["quantity"]: f"**{row['value']}** ({row['asked']})" for row in rows if row["variant"] == name}
-        lines.append(f"| {name} | {' | '.join(cells.get(quantity, '') for quantity in HEADS)} |")
-    return "\n".join(lines)
+        lines.append([name, *(cells.get(quantity, "") for quantity in HEADS)])
+    return markdown_table([f"against {rows[0]['compared_with']}", *HEADS.values()], lines)

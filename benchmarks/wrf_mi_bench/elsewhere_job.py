@@ -17,13 +17,9 @@ SETTINGS = ("deterministic=true", "density.every=10", "density.start=0", "valida
 
 
 def main(file: str, backend: str, threads: str, small: str) -> None:
-    """Compute images, gradients and metrics, and store them as ``.npz``.
+    """Compute images, gradients and metrics, and store them as ``.npz``; ``small`` is "1" for few rows and steps.
 
-    Args:
-        file: file to write.
-        backend: ``llvm`` or ``cuda``; a deterministic training is only made on ``llvm``.
-        threads: number of threads of the CPU.
-        small: ``1``: few rows, Gaussians and steps.
+    A deterministic training, with one thread, is only made on ``llvm``.
     """
     known = init(backend, int(threads))
     import drjit as dr
@@ -47,30 +43,30 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
 
     few = small == "1"
     rows, gaussians, steps = (8, 20, 5) if few else (40, 200, 200)
-    found: dict[str, Any] = {"image": np.abs(splatted(*random_field(0, "alpha", gaussians)))}
+    arrays: dict[str, Any] = {"image": np.abs(splatted(*random_field(0, "alpha", gaussians)))}
     ordered = np.arange(rows)
     traced = tracer(TraceOptions())(transmitter_path(rows)).astype(np.float32)
-    found["traced"] = traced
-    made = replace(record(rows, official=(ordered[: -rows // 4], ordered[-rows // 4 :])), observation=traced)
+    arrays["traced"] = traced
+    spectra = replace(record(rows, official=(ordered[: -rows // 4], ordered[-rows // 4 :])), observation=traced)
     config = with_settings(TrainConfig(), [f"initial.gaussians={gaussians}", f"steps={steps}"])
-    split = make_splits(made, "official")[0]
-    trainer = Trainer(made, split, config)
+    split = make_splits(spectra, "official")[0]
+    trainer = Trainer(spectra, split, config)
     params = {name: to_tensor(values) for name, values in trainer.state.params().items()}
     dr.enable_grad(params)
-    plane, pose = perception_plane(*made.observation.shape[-2:], mi.Float), device_pose(RECEIVER)
-    data = TrainingData(to_tensor(made.tx_pos_m.T), to_float(made.observation), to_float([1.0]))
+    plane, pose = perception_plane(*spectra.observation.shape[-2:], mi.Float), device_pose(RECEIVER)
+    data = TrainingData(to_tensor(spectra.tx_pos_m.T), to_float(spectra.observation), to_float([1.0]))
     batch = config.batch
     tx, truth, _ = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
     shown = trainer.graph.report(0, None)(params, Batch(tx, None, None, pose, plane))
     dr.backward(spectrum_loss(shown, truth, batch, plane.height, plane.width, config.loss.ssim_weight)[0])
-    found |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
+    arrays |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
     if backend == "llvm":
         with tempfile.TemporaryDirectory() as folder:
             words = [*SETTINGS, f"initial.gaussians={gaussians}", f"steps={steps}"]
-            score = train(made, Path(folder) / "run", "wrf-gs+", settings=words).metrics["ssim"]
-        found["metrics"] = np.array([score[name] for name in ("median", "mean", "p10", "p90")])
+            score = train(spectra, Path(folder) / "run", "wrf-gs+", settings=words).metrics["ssim"]
+        arrays["metrics"] = np.array([score[name] for name in ("median", "mean", "p10", "p90")])
     versions = {"numpy": np.__version__, "llvm": known.llvm_version or "", "device": known.device}
-    np.savez(file, versions=json.dumps(versions), **found)
+    np.savez(file, versions=json.dumps(versions), **arrays)
 
 
 if __name__ == "__main__":

@@ -33,10 +33,8 @@ from .bench import FLAT
 from .comparison import line
 from .fault_commands import FIELD, HOME, SPECTRA, Tables, differing, prepare_data, small_plan
 
-PREDICTIONS, OPENED = 10_000, 1000
-"""Predictions of a run, and runs that are opened, in one process."""
-WARM = 10
-"""One call in so many precedes the first measurement, for kernels, caches and arenas of the allocator."""
+PREDICTIONS, OPENED = 10_000, 1000  # predictions of a run, and runs that are opened, in one process
+WARM = 10  # one call in so many precedes the first measurement, for kernels, caches and arenas of the allocator
 AT_ONCE, GROWTH_MB = 16, 3.0
 """Positions of a prediction, and growth of the resident memory. 300 results of 16 spectra of 9 x 36 are 6 MB, and an
 opened run keeps more than 100 kB; the allocator alone moves the memory by less than 1 MB."""
@@ -62,15 +60,9 @@ def growth_mb(work: Callable[[], object], calls: int) -> float:
 
 
 def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -> dict[str, Any]:
-    """Growth of memory by predictions and by opened runs, of kriging and of Gaussians.
+    """Growth of memory by predictions and by opened runs, of kriging and of Gaussians: ``rows`` and ``wrong``.
 
-    Args:
-        folder: folder for data and runs.
-        predictions: predictions of each run.
-        opened: number of times that each run is opened, and its results are read.
-
-    Returns:
-        ``rows`` and ``wrong``.
+    Each run predicts ``predictions`` times, and is opened and its results read ``opened`` times.
     """
     prepare_data(folder)
     field = with_settings(default_config("spectrum", False), FIELD)
@@ -80,10 +72,10 @@ def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -
     }
     rng, rows, wrong = np.random.default_rng(0), [], []
     for name, run in runs.items():
-        kept = open_run(run)
+        opened_run = open_run(run)
 
-        def predict(kept: Any = kept) -> None:
-            kept.predict(rng.uniform(1, 4, (AT_ONCE, 3)))
+        def predict(opened_run: Any = opened_run) -> None:
+            opened_run.predict(rng.uniform(1, 4, (AT_ONCE, 3)))
 
         def open_again(run: Path = run) -> None:
             open_run(run).predict(rng.uniform(1, 4, (AT_ONCE, 3)))
@@ -105,19 +97,15 @@ def _tree(process: psutil.Process) -> Iterator[psutil.Process]:
 
 
 def demo(folder: Path) -> dict[str, Any]:
-    """Largest resident memory of ``wrf-mi demo`` and its child processes, together.
-
-    Returns:
-        ``rows`` and ``wrong``.
-    """
+    """Largest resident memory of ``wrf-mi demo`` and its child processes together: ``rows`` and ``wrong``."""
     call = [sys.executable, "-m", "wrf_mi.cli", "demo", "--out", str(folder / "demo")]
     started, most = subprocess.Popen(call, stdout=subprocess.DEVNULL), 0
     process = psutil.Process(started.pid)
     while started.poll() is None:
         now = 0
-        for one in _tree(process):
+        for member in _tree(process):
             with suppress(psutil.Error):
-                now += one.memory_info().rss
+                now += member.memory_info().rss
         most = max(most, now)
         time.sleep(POLL_S)
     gib = most / 2**30
@@ -127,11 +115,7 @@ def demo(folder: Path) -> dict[str, Any]:
 
 
 def lost_worker(folder: Path) -> dict[str, Any]:
-    """Tables on two workers, one of which is killed while it works, against tables of one process.
-
-    Returns:
-        ``rows`` and ``wrong``.
-    """
+    """Tables on two workers, one of which is killed at work, against one process: ``rows`` and ``wrong``."""
     stored = folder / "lost.json"
     status, _ = run_module("wrf_mi_bench.endurance", [str(folder), str(stored)])
     wrong = json.loads(stored.read_text()) if status == 0 else [f"lost worker: ended with status {status}"]

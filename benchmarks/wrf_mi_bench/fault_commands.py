@@ -35,37 +35,27 @@ SETTINGS: Mapping[str, tuple[str, ...]] = {
     "wrf-gs+ joint": (*FIELD, "traced.depth=1", "traced.reflections=1", "traced.rays=256"),
 }
 """Settings of short trainings by model and, after a space, ``joint`` in a scene."""
-TIMES = ("train_seconds", "trace_seconds", "ms_per_sample", "peak_memory_mb")
-"""Metrics that differ from run to run."""
+TIMES = ("train_seconds", "trace_seconds", "ms_per_sample", "peak_memory_mb")  # metrics that differ from run to run
 WHEN = (*TIMES, "date", "wall_seconds", "worker_threads")
 """Entries of a row of the tables that state when and how it was measured."""
 SPECTRA, HOME, ROOM = "spectra", "home", "room"
 """Folders of the data: spectra, signal strengths as a known data set, and a closed room around both."""
-STRENGTHS, SIDES_M = 24, (-1.0, 5.0)
-"""Number of signal strengths, and extent of the room along each axis."""
+STRENGTHS, SIDES_M = 24, (-1.0, 5.0)  # number of signal strengths, and extent of the room along each axis
 
 
 class Command(ABC):
-    """A command of ``wrf-mi`` with its results below a folder.
+    """A command of ``wrf-mi`` with its results below a folder."""
 
-    Attributes:
-        name: name in reports.
-        file_bytes: limits of the size of files, in place of a full disk.
-        refused: exit statuses where results cannot be written.
-        locked: folders that one process at a time writes into.
-    """
-
-    name: str
-    file_bytes: Sequence[int] = (250, 400, 1500, 6000)
-    refused: Sequence[int] = (2,)
-    locked: Sequence[str] = ()
+    name: str  # name in reports
+    file_bytes: Sequence[int] = (250, 400, 1500, 6000)  # limits of the size of files, in place of a full disk
+    refused: Sequence[int] = (2,)  # exit statuses where results cannot be written
+    locked: Sequence[str] = ()  # folders that one process at a time writes into
 
     def prepare(self, children: bool) -> None:
         """Prepare this process, in which the command is called.
 
-        Args:
-            children: False: what the command starts as a child process is called in this one, so that its writes
-                count, and it ends with it.
+        Without ``children`` what the command starts as a child process is called in this one, so that its writes count,
+        and it ends with it.
         """
         return
 
@@ -78,15 +68,15 @@ class Command(ABC):
         """Results in a folder, except dates and times."""
 
 
-def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+def differing(results: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Keys of results, from `Command.content`, that differ in a bit, or that one of them lacks."""
-    return sorted(key for key in one.keys() | other.keys() if not _same(one.get(key), other.get(key)))
 
+    def same(a: Any, b: Any) -> bool:
+        if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+            return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+        return type(a) is type(b) and bool(a == b)
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    return type(one) is type(other) and bool(one == other)
+    return sorted(key for key in results.keys() | other.keys() if not same(results.get(key), other.get(key)))
 
 
 class Training(Command):
@@ -98,7 +88,6 @@ class Training(Command):
         self.name, self._data = name, data
 
     def call(self, place: Path) -> list[str]:
-        """Arguments, see `Command`."""
         out = place / "run"
         if (out / CONFIG).exists():
             return ["train", "--resume", str(out)]
@@ -108,7 +97,6 @@ class Training(Command):
         return [*call, *scene, *(part for setting in SETTINGS[self.name] for part in ("--set", setting))]
 
     def content(self, place: Path) -> dict[str, Any]:
-        """Metrics, fitted arrays and predictions."""
         return _run_content(place / "run")
 
 
@@ -139,7 +127,6 @@ class Correction(Command):
         init("llvm", threads=1)
 
     def call(self, place: Path) -> list[str] | None:
-        """Arguments, see `Command`."""
         out = place / "scene"
         if out.exists():
             return None
@@ -188,11 +175,9 @@ class Tables(Command):
             setattr(bench, "run_module", run_module)  # noqa: B010
 
     def call(self, place: Path) -> list[str]:
-        """Arguments, see `Command`."""
         return ["bench", "tables", "--out", str(place / "results"), "--runs", str(place / "runs")]
 
     def content(self, place: Path) -> dict[str, Any]:
-        """Rows, pages and pictures, scenes, and runs."""
         content = _file_content(place / "results") | _file_content(place / "runs" / "tables" / "scenes")
         for name in [name for name in content if name.endswith("-seed0.json")]:
             content[name] = {key: value for key, value in json.loads(content[name]).items() if key not in WHEN}

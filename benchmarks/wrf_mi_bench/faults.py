@@ -47,11 +47,8 @@ Signals = Sequence[tuple[float, int]]
 def watch_changes(folder: Path, at: int = 0, number: int = signal.SIGKILL, times: int = 1) -> list[str]:
     """Audit events of the changes of files below a folder that this process makes, kept up to date.
 
-    Args:
-        folder: the folder.
-        at: change that a signal precedes, counted from 1; 0: none.
-        number: number of the signal, which this process sends to itself.
-        times: signals, one at each of so many changes.
+    A signal, which this process sends to itself, precedes the change ``at``, counted from 1, and the next ones, as many
+    ``times`` in all; 0: none.
     """
     changes, below = list[str](), str(folder)
 
@@ -81,15 +78,15 @@ def forked(work: Callable[[], int], errors: Path, signals: Signals = ()) -> int:
         os._exit(status)
     os.close(write)
     os.set_blocking(read, False)
-    begun, left, found = time.monotonic(), [*sorted(signals), (MOST_S, int(signal.SIGKILL))], 0
+    begun, left, ended = time.monotonic(), [*sorted(signals), (MOST_S, int(signal.SIGKILL))], 0
     with errors.open("wb") as stream:
-        while not found:
+        while not ended:
             time.sleep(0.005)
-            found, status = os.waitpid(child, os.WNOHANG)
+            ended, status = os.waitpid(child, os.WNOHANG)
             with contextlib.suppress(BlockingIOError):
                 while piece := os.read(read, 1 << 16):
                     stream.write(piece)
-            if left and not found and time.monotonic() - begun > left[0][0]:
+            if left and not ended and time.monotonic() - begun > left[0][0]:
                 os.kill(child, left.pop(0)[1])
     os.close(read)
     return os.waitstatus_to_exitcode(status)
@@ -105,12 +102,7 @@ def obey_permissions() -> None:
 
 
 class Trial:
-    """A command, and its results without faults.
-
-    Args:
-        command: the command.
-        folder: folder for data and results.
-    """
+    """A command, and its results without faults, in a folder for data and results."""
 
     def __init__(self, command: Command, folder: Path) -> None:
         self.command, self.folder = command, folder
@@ -119,8 +111,8 @@ class Trial:
         changes = folder / "changes.json"
 
         def watch() -> Callable[[], object]:
-            found = watch_changes(self.whole)
-            return lambda: write_atomically(changes, json.dumps(found))
+            events = watch_changes(self.whole)
+            return lambda: write_atomically(changes, json.dumps(events))
 
         status = self.run(self.whole, watch)
         if status != 0:
@@ -142,11 +134,8 @@ class Trial:
     ) -> int:
         """Status of the command with its results in a folder, where it goes on if it was begun.
 
-        Args:
-            place: folder for the results.
-            before: called in the fork before the command; what it returns, if callable, is called after it.
-            signals: signals to the fork.
-            children: leave the processes that the command starts processes, see `Command.prepare`.
+        ``before`` is called in the fork before the command; what it returns, if callable, is called after it. With
+        ``children`` the processes that the command starts stay processes, see `Command.prepare`.
         """
         place.mkdir(exist_ok=True)
         call = self.command.call(place)
@@ -184,6 +173,12 @@ class Trial:
         wrong = differing(self.content, content)
         return f"other results: {', '.join(wrong)}" if wrong else ""
 
+    def judged(self, place: Path, how: str, wrong: str = "") -> str:
+        """What is wrong after a fault, or with the results of going on, which are removed; "" if nothing is."""
+        wrong = wrong or self.finished(place)
+        shutil.rmtree(place, ignore_errors=True)
+        return wrong and f"{self.command.name}, {how}: {wrong}"
+
     def message(self) -> str:
         """Last line of the standard error of the last call."""
         lines = self.errors.read_text(errors="replace").strip().splitlines()
@@ -202,9 +197,8 @@ def killed_at_changes(trial: Trial, most: int | None) -> Iterator[str]:
     for number in trial.numbers(most):
         place = trial.folder / f"change{number}"
         status = trial.run(place, partial(watch_changes, place, number))
-        wrong = trial.finished(place) if status == -signal.SIGKILL else f"status {status} for a kill"
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, killed at change {number} of {len(trial.changes)}: {wrong}"
+        wrong = "" if status == -signal.SIGKILL else f"status {status} for a kill"
+        yield trial.judged(place, f"killed at change {number} of {len(trial.changes)}", wrong)
 
 
 def killed_at_random(trial: Trial, count: int) -> Iterator[str]:
@@ -215,9 +209,7 @@ def killed_at_random(trial: Trial, count: int) -> Iterator[str]:
         while rng.random() < 0.7 or not kills:
             trial.run(place, signals=[(rng.uniform(0, trial.seconds), signal.SIGKILL)])
             kills += 1
-        wrong = trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, killed at {kills} random moments: {wrong}"
+        yield trial.judged(place, f"killed at {kills} random moments")
 
 
 def full_disk(trial: Trial, most: int | None) -> Iterator[str]:
@@ -228,9 +220,7 @@ def full_disk(trial: Trial, most: int | None) -> Iterator[str]:
         limits = (size, resource.RLIM_INFINITY)
         status = trial.run(place, partial(resource.setrlimit, resource.RLIMIT_FSIZE, limits))
         wrong = trial.one_line(status, *trial.command.refused) if status else ""
-        wrong = wrong or trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        yield wrong and f"{trial.command.name}, files of {size} bytes at most: {wrong}"
+        yield trial.judged(place, f"files of {size} bytes at most", wrong)
 
 
 def no_permission(trial: Trial) -> Iterator[str]:
@@ -240,29 +230,25 @@ def no_permission(trial: Trial) -> Iterator[str]:
     place.chmod(0o500)
     wrong = trial.one_line(trial.run(place, obey_permissions), REFUSED)
     place.chmod(0o700)
-    wrong = wrong or trial.finished(place)
-    shutil.rmtree(place)
-    yield wrong and f"{trial.command.name}, no write permission: {wrong}"
+    yield trial.judged(place, "no write permission", wrong)
 
 
 def interrupted(trial: Trial, most: int | None) -> Iterator[str]:
     """Ctrl-C twice: at a change of files and the next one, which may be the cleaning up, and at random moments."""
     rng = random.Random(trial.command.name)
 
-    def judged(place: Path, status: int, when: str) -> str:
+    def stopped(place: Path, status: int, when: str) -> str:
         wrong = trial.one_line(status, INTERRUPTED) if status else ""  # it may have been about to end
-        wrong = wrong or trial.finished(place)
-        shutil.rmtree(place, ignore_errors=True)
-        return wrong and f"{trial.command.name}, Ctrl-C twice {when}: {wrong}"
+        return trial.judged(place, f"Ctrl-C twice {when}", wrong)
 
     for number in trial.numbers(5 if most is None else 2):
         place = trial.folder / f"stopped{number}"
         twice = partial(watch_changes, place, number, signal.SIGINT, 2)
-        yield judged(place, trial.run(place, twice, children=True), f"at change {number} of {len(trial.changes)}")
+        yield stopped(place, trial.run(place, twice, children=True), f"at change {number} of {len(trial.changes)}")
     for number in range(5 if most is None else 1):
         place, first_s = trial.folder / f"impatient{number}", rng.uniform(0.1, trial.seconds)
         signals = [(first_s, signal.SIGINT), (first_s + rng.uniform(0, 0.5), signal.SIGINT)]
-        yield judged(place, trial.run(place, signals=signals, children=True), f"after {first_s:.2f} s")
+        yield stopped(place, trial.run(place, signals=signals, children=True), f"after {first_s:.2f} s")
 
 
 def closed_pipe(trial: Trial) -> Iterator[str]:
@@ -276,9 +262,7 @@ def closed_pipe(trial: Trial) -> Iterator[str]:
 
     status, text = trial.run(place, closed), trial.errors.read_text()
     silent = status in (0, CLOSED) and "Traceback" not in text and "wrf-mi: " not in text
-    wrong = trial.finished(place) if silent else f"status {status}, {trial.message()[:200]!r}"
-    shutil.rmtree(place)
-    yield wrong and f"{trial.command.name}, a closed pipe: {wrong}"
+    yield trial.judged(place, "a closed pipe", "" if silent else f"status {status}, {trial.message()[:200]!r}")
 
 
 def locked(trial: Trial) -> Iterator[str]:
@@ -293,14 +277,11 @@ def locked(trial: Trial) -> Iterator[str]:
 
 
 def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, Any]:
-    """Cases and failures of all faults, by their kind.
+    """Cases and failures of all faults of commands (`wrf_mi_bench.fault_commands.COMMANDS`), by their kind.
 
-    Args:
-        folder: folder for data and results.
-        names: keys of `wrf_mi_bench.fault_commands.COMMANDS`.
-        kills: random kills, and kills at changes of files, of each command; None: 20, and all.
+    ``kills`` are random kills, and kills at changes of files, of each command; None: 20, and all.
     """
-    found: dict[str, list[str]] = {}
+    outcomes: dict[str, list[str]] = {}
     for name in names:
         trial = Trial(COMMANDS[name](folder), folder / name.replace(" ", "-"))
         kinds: dict[str, Iterator[str]] = {
@@ -314,9 +295,9 @@ def measure(folder: Path, names: Sequence[str], kills: int | None) -> dict[str, 
         }
         for kind, cases in kinds.items():
             for wrong in cases:
-                found.setdefault(kind, []).append(wrong)
-                print(f"{name}: {kind} {len(found[kind])} {wrong}", file=sys.stderr, flush=True)
-    return {kind: {"cases": len(every), "failed": [one for one in every if one]} for kind, every in found.items()}
+                outcomes.setdefault(kind, []).append(wrong)
+                print(f"{name}: {kind} {len(outcomes[kind])} {wrong}", file=sys.stderr, flush=True)
+    return {kind: {"cases": len(every), "failed": [text for text in every if text]} for kind, every in outcomes.items()}
 
 
 def run(folder: Path, names: Sequence[str] = tuple(COMMANDS), kills: int | None = None) -> dict[str, Any]:

@@ -26,23 +26,14 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Projection:
-    """Gaussians in a receiver's frame and on its sphere of directions.
+    """Gaussians in a receiver's frame and on its sphere of directions."""
 
-    Attributes:
-        centre_m: shape [n, 3], metres.
-        depth_m: shape [n], distance of the centre.
-        direction: shape [n, 3], unit vector to the centre.
-        basis: shape [n, 2, 3], orthonormal vectors of the tangent plane: eastwards and towards the zenith.
-        covariance: shape [n, 2, 2], in that basis, radians squared, low-pass included.
-        order: the Gaussians that have a footprint, near to far.
-    """
-
-    centre_m: FloatArray
-    depth_m: FloatArray
-    direction: FloatArray
-    basis: FloatArray
-    covariance: FloatArray
-    order: IntArray
+    centre_m: FloatArray  # shape [n, 3], metres
+    depth_m: FloatArray  # shape [n], distance of the centre
+    direction: FloatArray  # shape [n, 3], unit vector to the centre
+    basis: FloatArray  # shape [n, 2, 3], orthonormal vectors of the tangent plane: eastwards and towards the zenith
+    covariance: FloatArray  # shape [n, 2, 2], in that basis, radians squared, low-pass included
+    order: IntArray  # the Gaussians that have a footprint, near to far
 
 
 def covariance_matrix(scale_m: ArrayLike, quaternion_xyzw: ArrayLike) -> FloatArray:
@@ -66,16 +57,10 @@ def tangent_basis(direction: ArrayLike) -> FloatArray:
 
 
 def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, receiver: Receiver) -> Projection:
-    """Project Gaussians onto a receiver's sphere of directions.
+    """Project Gaussians onto a receiver's sphere of directions; the order omits Gaussians nearer than ``NEAR_M``.
 
-    Args:
-        mean_m: shape [n, 3], world frame, metres.
-        scale_m: shape [n, 3], standard deviations along the Gaussian's axes, metres.
-        quaternion_xyzw: shape [n, 4], the Gaussian's axes to world.
-        receiver: pose of the receiver.
-
-    Returns:
-        The projection; its order omits Gaussians nearer than ``NEAR_M``.
+    Means [n, 3] in the world frame and standard deviations [n, 3] along the Gaussians' axes are in metres, quaternions
+    [n, 4] turn these axes to the world.
     """
     mean = np.asarray(mean_m, float)
     to_world = receiver.to_world
@@ -98,31 +83,32 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
     )
 
 
+def reach(projection: Projection, index: int, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared Mahalanobis distances of Gaussian ``index`` at unit vectors [..., 3], and cosines to its direction.
+
+    The distance is taken in the tangent plane, where the pixel's ray meets it (central projection).
+    """
+    cosine = directions @ projection.direction[index]
+    # Behind the receiver there is no such point; the divisor only avoids warnings.
+    point = directions @ projection.basis[index].T / np.where(cosine > MIN_COSINE, cosine, 1.0)[..., None]
+    return np.einsum("...i,ij,...j->...", point, np.linalg.inv(projection.covariance[index]), point), cosine
+
+
 def footprint(projection: Projection, index: int, directions: FloatArray) -> FloatArray:
     """Footprint G' in 0..1 of Gaussian ``index`` at unit vectors [..., 3] in the receiver's frame.
 
-    exp(-m^2 / 2) for a Mahalanobis distance m below ``CUTOFF``, else 0; m is taken in the tangent plane at
-    the point where the pixel's ray meets it (central projection).
+    exp(-m^2 / 2) for a Mahalanobis distance m (`reach`) below ``CUTOFF``, else 0.
     """
     if projection.depth_m[index] < NEAR_M:
         return np.zeros(directions.shape[:-1])
-    cosine = directions @ projection.direction[index]
-    in_front = cosine > MIN_COSINE
-    point = directions @ projection.basis[index].T / np.where(in_front, cosine, 1.0)[..., None]
-    squared = np.einsum("...i,ij,...j->...", point, np.linalg.inv(projection.covariance[index]), point)
-    return np.where(in_front & (squared < CUTOFF**2), np.exp(-squared / 2), 0.0)
+    squared, cosine = reach(projection, index, directions)
+    return np.where((cosine > MIN_COSINE) & (squared < CUTOFF**2), np.exp(-squared / 2), 0.0)
 
 
 def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLike) -> ComplexArray:
-    """WRF-GS: R = sum_i G'_i S_i prod_{j<i} (1 - G'_j (1 - delta_j)).
+    """WRF-GS: R = sum_i G'_i S_i prod_{j<i} (1 - G'_j (1 - delta_j)), the complex field [...] at each direction.
 
-    Args:
-        footprints: shape [n, ...], near to far.
-        signal: complex S, shape [n].
-        attenuation: complex delta, shape [n], magnitude at most 1.
-
-    Returns:
-        Complex, shape [...]: the received field at each direction.
+    Footprints [n, ...] are near to far, signals S [n] complex, attenuations delta [n] complex with magnitude at most 1.
 
     Source: WRF-GS, eq. 12 and 13, where footprints are 0 or 1; G' interpolates between passing a Gaussian
     by (factor 1) and crossing its centre (factor delta).
@@ -136,15 +122,9 @@ def blend_product(footprints: ArrayLike, signal: ArrayLike, attenuation: ArrayLi
 
 
 def blend_alpha(footprints: ArrayLike, signal: ArrayLike, opacity: ArrayLike) -> ComplexArray:
-    """WRF-GS+: R = sum_i S_i alpha_i prod_{j<i} (1 - alpha_j) with alpha_i = o_i G'_i.
+    """WRF-GS+: R = sum_i S_i alpha_i prod_{j<i} (1 - alpha_j) with alpha_i = o_i G'_i, as `blend_product`.
 
-    Args:
-        footprints: shape [n, ...], near to far.
-        signal: complex S, static part and deviation together, shape [n].
-        opacity: real o, shape [n], in 0..1.
-
-    Returns:
-        Complex, shape [...]: the received field at each direction.
+    Signals S [n] are static part and deviation together, opacities o [n] are in 0..1.
 
     Source: WRF-GS+, complex-valued alpha blending.
     """
@@ -163,29 +143,16 @@ def render(
     attenuation: ArrayLike | None = None,
     opacity: ArrayLike | None = None,
 ) -> ComplexArray:
-    """Complex field at a receiver; give ``attenuation`` for WRF-GS or ``opacity`` for WRF-GS+.
+    """Complex field [H, W] at a receiver; give ``attenuation`` for WRF-GS or ``opacity`` for WRF-GS+.
 
-    Args:
-        mean_m: shape [n, 3], world frame, metres.
-        scale_m: shape [n, 3], metres.
-        quaternion_xyzw: shape [n, 4].
-        signal: complex, shape [n].
-        receiver: pose of the receiver.
-        directions: unit vectors in the receiver's frame, [H, W, 3] as of ``core.pixel_directions``.
-        attenuation: complex delta, shape [n].
-        opacity: real, shape [n].
-
-    Returns:
-        Complex, shape [H, W].
-
-    Raises:
-        TypeError: neither or both of ``attenuation`` and ``opacity``.
+    Gaussians are as of `project`, signals as of `blend_product` and `blend_alpha`; directions [H, W, 3] are unit
+    vectors in the receiver's frame, as of ``core.pixel_directions``. `TypeError` for neither or both.
     """
     if (attenuation is None) == (opacity is None):
         raise TypeError("give either attenuation (WRF-GS) or opacity (WRF-GS+)")
-    seen = project(mean_m, scale_m, quaternion_xyzw, receiver)
-    footprints = np.array([footprint(seen, i, directions) for i in seen.order]).reshape(-1, *directions.shape[:-1])
-    sorted_signal = np.asarray(signal)[seen.order]
+    view = project(mean_m, scale_m, quaternion_xyzw, receiver)
+    footprints = np.array([footprint(view, i, directions) for i in view.order]).reshape(-1, *directions.shape[:-1])
+    sorted_signal = np.asarray(signal)[view.order]
     if opacity is not None:
-        return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[seen.order])
-    return blend_product(footprints, sorted_signal, np.asarray(attenuation)[seen.order])
+        return blend_alpha(footprints, sorted_signal, np.asarray(opacity)[view.order])
+    return blend_product(footprints, sorted_signal, np.asarray(attenuation)[view.order])

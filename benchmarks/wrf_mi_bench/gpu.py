@@ -15,6 +15,7 @@ from typing import Any
 from wrf_mi.backend import BackendError, choose
 from wrf_mi.core import InputError
 from wrf_mi.parallel import run_module
+from wrf_mi.runs.sweep import markdown_table
 
 from .bench import BenchFailed
 
@@ -22,24 +23,20 @@ JOB = "wrf_mi_bench.gpu_job"
 
 
 def main() -> dict[str, Any]:
-    """Both backends of this machine.
-
-    Raises:
-        InputError: no GPU works here.
-    """
+    """Both backends of this machine; `InputError` where no GPU works."""
     try:
         choose("cuda")
     except BackendError as error:
         raise InputError(f"bench gpu: {error}") from None
-    found = {backend: _measured(backend) for backend in ("cuda", "llvm")}
-    devices = {name: one["device"] for name, one in found.items()}
+    measured = {backend: _measured(backend) for backend in ("cuda", "llvm")}
+    devices = {name: of_backend["device"] for name, of_backend in measured.items()}
     devices["llvm"] += f", {os.cpu_count()} cores"
     rows = []
-    for gpu, cpu in zip(found["cuda"]["axes"], found["llvm"]["axes"], strict=True):
+    for gpu, cpu in zip(measured["cuda"]["axes"], measured["llvm"]["axes"], strict=True):
         for size, fast, slow in zip(gpu["sizes"], gpu["ms"], cpu["ms"], strict=False):
             row = {"what": f"{gpu['title']}, {size:,} {gpu['work']}", "value": f"{slow / fast:.2g}", "asked": ""}
             rows.append({**row, "gpu_ms": fast, "cpu_ms": slow, **devices})
-    return {"rows": rows, "axes": {name: one["axes"] for name, one in found.items()}}
+    return {"rows": rows, "axes": {name: of_backend["axes"] for name, of_backend in measured.items()}}
 
 
 def _measured(backend: str) -> dict[str, Any]:
@@ -54,9 +51,6 @@ def _measured(backend: str) -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: times on both, and how many times faster the GPU is."""
-    lines = [
-        f"| what | {rows[0]['cuda']} | {rows[0]['llvm']} | times faster |",
-        "| --- | --- | --- | --- |",
-        *(f"| {row['what']} | {row['gpu_ms']:.3g} ms | {row['cpu_ms']:.3g} ms | **{row['value']}** |" for row in rows),
-    ]
-    return "\n".join(lines)
+    times = ((f"{row['gpu_ms']:.3g} ms", f"{row['cpu_ms']:.3g} ms") for row in rows)
+    lines = ([row["what"], *of_row, f"**{row['value']}**"] for row, of_row in zip(rows, times, strict=True))
+    return markdown_table(["what", rows[0]["cuda"], rows[0]["llvm"], "times faster"], lines)

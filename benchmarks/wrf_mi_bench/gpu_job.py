@@ -15,8 +15,7 @@ from wrf_mi.backend import init
 STEPS_OF = {"wrf-gs": "WRF-GS", "wrf-gs+": "WRF-GS+"}
 STEP_SIZES = (270, 3000, 10_000, 30_000)
 ROWS = 32
-MOST_S, CALL_S = 3.0, 20.0
-"""Seconds of calls of a size, and expected seconds of a call beyond which a size is left out."""
+MOST_S, CALL_S = 3.0, 20.0  # seconds of calls of a size, and expected seconds of a call beyond which a size is left out
 SIZES = {
     "gaussians-splat": (1000, 10_000, 100_000, 1_000_000),
     "gaussians-integrator": (1000, 10_000, 100_000),
@@ -42,8 +41,8 @@ def job(file: str, backend: str) -> None:
         for model, title in STEPS_OF.items()
     ]
     with threadpool_limits(1, "blas"):
-        found = [scale(axis, most_s=MOST_S, call_s=CALL_S) for axis in axes]
-    Path(file).write_text(json.dumps({"device": known.device, "axes": found}))
+        measured = [scale(axis, most_s=MOST_S, call_s=CALL_S) for axis in axes]
+    Path(file).write_text(json.dumps({"device": known.device, "axes": measured}))
 
 
 def step(model: str, gaussians: int) -> Any:
@@ -56,9 +55,14 @@ def step(model: str, gaussians: int) -> Any:
     from .training import QUIET, some_steps
     from .workloads import record, size_deg
 
-    made = record(ROWS)
-    given = (*QUIET, f"initial.gaussians={gaussians}", f"initial.size_deg={size_deg(gaussians):.3g}", "steps=1000000")
-    of = Trainer(made, make_splits(made, "random")[0], with_settings(TrainConfig(model=model), given))
+    spectra = record(ROWS)
+    options = (
+        *QUIET,
+        f"initial.gaussians={gaussians}",
+        f"initial.size_deg={size_deg(gaussians):.3g}",
+        "steps=1000000",
+    )
+    of = Trainer(spectra, make_splits(spectra, "random")[0], with_settings(TrainConfig(model=model), options))
     return some_steps(of, 1)
 
 

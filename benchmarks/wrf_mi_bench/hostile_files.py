@@ -18,7 +18,8 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,11 @@ from unittest import mock
 from wrf_mi.core import InputError
 from wrf_mi.core.files import append_line, one_line, write_atomically
 
-HANG_S = 10.0
-"""Time after which an input counts as a hang."""
-START_S = 180.0
-"""Time for a child to start and to compile its first kernels."""
+HANG_S = 10.0  # time after which an input counts as a hang
+START_S = 180.0  # time for a child to start and to compile its first kernels
 MEMORY_BYTES = 3 << 30
 """Address space that readers may take beyond that of the process: Python raises `MemoryError` past it."""
-LARGEST_TEXT = 300
-"""Characters of a message."""
+LARGEST_TEXT = 300  # characters of a message
 STATE, RESULTS, SAMPLES = "state", "results.jsonl", "samples"
 NUMBERS = (0, -1, 1, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1)
 TEXTS = (
@@ -76,16 +74,11 @@ def mutated(content: bytes, number: int, name: str) -> bytes:
 
 
 def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str, Any]]:
-    """Give each reader ``count`` inputs, in child processes.
+    """Give each reader (`wrf_mi_bench.hostile_samples.READERS`) ``count`` inputs, in child processes.
 
-    Args:
-        folder: folder for samples and results, which are used again.
-        names: readers (`wrf_mi_bench.hostile_samples.READERS`).
-        count: inputs of each.
-
-    Returns:
-        For each reader: ``reader``, ``inputs``, ``refused``, ``loaded``, ``failed`` (messages by number of the input),
-        ``slowest_s`` and ``largest_mb``, growth of the resident memory by one input.
+    Samples and results in ``folder`` are used again. Each reader has ``reader``, ``inputs``, ``refused``, ``loaded``,
+    ``failed`` (messages by number of the input), ``slowest_s`` and ``largest_mb``, growth of the resident memory by one
+    input.
     """
     from .hostile_samples import prepare
 
@@ -94,7 +87,7 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
     failures: dict[str, dict[int, str]] = {name: {} for name in names}
     place, first = 0, 0
     while place < len(names):
-        write_atomically(folder / STATE, _tally(names[place], first))
+        write_atomically(folder / STATE, json.dumps(asdict(Tally(names[place], first))))
         call = [sys.executable, "-m", __name__ if __name__ != "__main__" else "wrf_mi_bench.hostile_files"]
         call += [str(folder), ",".join(names[place:]), str(first), str(count)]
         with (folder / "errors.txt").open("w") as errors:
@@ -107,45 +100,44 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
         name, number = json.loads(last)["reader"], json.loads(last)["number"]
         failures[name][number] = reason
         place, first = names.index(name), number + 1
-    found: dict[str, dict[str, Any]] = {}
+    tallies: dict[str, dict[str, Any]] = {}
     for text in (folder / RESULTS).read_text().splitlines() if (folder / RESULTS).exists() else ():
-        one = json.loads(text)
-        del one["number"]
-        total = found.setdefault(one["reader"], one)
-        if total is not one:
-            total["failed"] |= one["failed"]
-            total |= {key: total[key] + one[key] for key in ("refused", "loaded")}
-            total |= {key: max(total[key], one[key]) for key in ("slowest_s", "largest_mb")}
+        tally = json.loads(text)
+        del tally["number"]
+        total = tallies.setdefault(tally["reader"], tally)
+        if total is not tally:
+            total["failed"] |= tally["failed"]
+            total |= {key: total[key] + tally[key] for key in ("refused", "loaded")}
+            total |= {key: max(total[key], tally[key]) for key in ("slowest_s", "largest_mb")}
     rows = []
     for name in names:
-        failed = found[name]["failed"] | {str(number): reason for number, reason in failures[name].items()}
-        rows.append({**found[name], "inputs": count, "failed": failed})
+        failed = tallies[name]["failed"] | {str(number): reason for number, reason in failures[name].items()}
+        rows.append({**tallies[name], "inputs": count, "failed": failed})
     return rows
 
 
-def _tally(
-    reader: str,
-    number: int,
-    refused: int = 0,
-    loaded: int = 0,
-    failed: Mapping[str, str] | None = None,
-    slowest_s: float = 0.0,
-    largest_mb: float = 0.0,
-) -> str:
-    """Results of a reader before an input, as JSON."""
-    counts = {"reader": reader, "number": number, "refused": refused, "loaded": loaded, "failed": failed or {}}
-    return json.dumps({**counts, "slowest_s": slowest_s, "largest_mb": largest_mb})
+@dataclass
+class Tally:
+    """Results of a reader before the input of a number."""
+
+    reader: str
+    number: int
+    refused: int = 0
+    loaded: int = 0
+    failed: dict[str, str] = field(default_factory=dict)  # messages by number of the input
+    slowest_s: float = 0.0
+    largest_mb: float = 0.0  # growth of the resident memory by one input
 
 
 def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
     """Wait for a child; the reason why it ended in an input, or None."""
-    seen, since, started = "", time.monotonic(), False
+    last, since, started = "", time.monotonic(), False
     while child.poll() is None:
         time.sleep(0.2)
         now = state.read_text()
-        if now != seen:
-            started = started or seen != ""
-            seen, since = now, time.monotonic()
+        if now != last:
+            started = started or last != ""
+            last, since = now, time.monotonic()
         elif time.monotonic() - since > (HANG_S if started else START_S):
             child.kill()
             child.wait()
@@ -177,13 +169,13 @@ def forked_module(
                 sys.stderr.flush()
                 os._exit(status)
         until = time.monotonic() + (most_s or HANG_S)
-        while not (found := os.waitpid(child, os.WNOHANG))[0]:
+        while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             time.sleep(0.001)
             if time.monotonic() > until:
                 os.kill(child, signal.SIGKILL)
         errors.seek(0)
         lines = [line.strip() for line in errors if line.strip()]
-    return os.waitstatus_to_exitcode(found[1]), lines[-1] if lines else ""
+    return os.waitstatus_to_exitcode(waited[1]), lines[-1] if lines else ""
 
 
 def _read_one(reader: Any, sample: Path) -> str | None:
@@ -214,26 +206,25 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):
-        reader, work = READERS[name], place / "work"
-        refused = loaded = 0
-        failed: dict[str, str] = {}
-        slowest = largest = 0.0
+        reader, work, tally = READERS[name], place / "work", Tally(name, start)
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(place / SAMPLES / reader.group, work)
-        whole = (work / reader.file).read_bytes()
+        content = (work / reader.file).read_bytes()
         if (wrong := _read_one(reader, work)) is not None:
-            failed["whole"] = f"the whole file is not read: {wrong}"
+            tally.failed["whole"] = f"the whole file is not read: {wrong}"
         for number in range(start, int(count)):
-            write_atomically(place / STATE, _tally(name, number, refused, loaded, failed, slowest, largest))
-            (work / reader.file).write_bytes(mutated(whole, number, name))
+            tally.number = number
+            write_atomically(place / STATE, json.dumps(asdict(tally)))
+            (work / reader.file).write_bytes(mutated(content, number, name))
             before, peak = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             wrong = _read_one(reader, work)
-            slowest = max(slowest, time.perf_counter() - before)
-            largest = max(largest, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1e3)
-            refused, loaded = refused + (wrong == ""), loaded + (wrong is None)
+            tally.slowest_s = max(tally.slowest_s, time.perf_counter() - before)
+            growth_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1e3
+            tally.largest_mb = max(tally.largest_mb, growth_mb)
+            tally.refused, tally.loaded = tally.refused + (wrong == ""), tally.loaded + (wrong is None)
             if wrong:
-                failed[str(number)] = wrong
-        append_line(place / RESULTS, _tally(name, int(count), refused, loaded, failed, slowest, largest))
+                tally.failed[str(number)] = wrong
+        append_line(place / RESULTS, json.dumps(asdict(tally) | {"number": int(count)}))
         start = 0
     shutil.rmtree(place / "work", ignore_errors=True)
 

@@ -49,6 +49,7 @@ from wrf_mi.viewer.map_layer import read_map
 
 UP = np.array([0.0, 0, 0, 1])
 CARRIER_HZ = 2.4e9
+HEARD_BY = [Receiver(name, np.zeros(3), UP) for name in ("one", "other")]
 # A table of pandas 3.1 with columns of numbers and of arrays, by Python's pickle, protocol 5.
 PICKLE = (
     "c-oy)O>fgc5RLOi+7zfjgd(AGLZp{eTo4DKX%m6c2vfDaR;#tMj;+{hYrR$zi3&J0w9?)f`a9vq4Q4lqk|1(n59_f#@9mq}H=j%2Ul(&`sd7SjkE"
@@ -71,40 +72,31 @@ class Reader:
     read: Callable[[Path], Any]
 
 
-def _load(folder: Path) -> None:
-    check_parts(load(folder))
+def _whole(kind: str, *files: str) -> dict[str, Reader]:
+    """Files of a data set, which is read as a whole."""
+    return {
+        f"{kind}: {Path(file).name}": Reader(kind, file, lambda folder: check_parts(load(folder))) for file in files
+    }
 
 
-def _of(reader: Callable[..., Any], group: str, *files: str) -> dict[str, Reader]:
-    return {file: Reader(group, file, partial(_read_file, reader, file)) for file in files}
+def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "files") -> dict[str, Reader]:
+    """Files that a reader reads one by one."""
 
+    def read(file: str, folder: Path) -> Any:
+        return reader(folder / file)
 
-def _read_file(reader: Callable[..., Any], file: str, folder: Path) -> Any:
-    return reader(folder / file)
+    return {f"{kind}: {file}": Reader(group, file, partial(read, file)) for file in files}
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
     """Read a run folder and predict."""
-
-    def read(folder: Path) -> None:
-        run = open_run(folder / name)
-        run.predict([[2.0, 1.0, 1.0]])
-
-    return read
+    return lambda folder: open_run(folder / name).predict([[2.0, 1.0, 1.0]])
 
 
 def _predicted_by_operator(folder: Path) -> None:
     run = open_run(folder / "field")
     run.predict([[2.0, 1.0, 1.0]])
     assert np.isfinite(run.predict([[2.0, 1.0, 1.0]]).mean).all()
-
-
-def _inputs(folder: Path) -> None:
-    read_inputs(folder / "inputs.csv", None)
-
-
-def _observations(folder: Path) -> None:
-    read_observations(folder / "heard.csv", [Receiver(name, np.zeros(3), UP) for name in ("one", "other")])
 
 
 def _imported(folder: Path) -> None:
@@ -114,25 +106,18 @@ def _imported(folder: Path) -> None:
 
 
 READERS: Mapping[str, Reader] = {
-    "spectra: gateway_info.yml": Reader("spectra", "gateway_info.yml", _load),
-    "spectra: tx_pos.csv": Reader("spectra", "tx_pos.csv", _load),
-    "spectra: train_index.txt": Reader("spectra", "train_index.txt", _load),
-    "spectra: 00001.png": Reader("spectra", "spectrum/00001.png", _load),
-    "ble: anchors.csv": Reader("ble", "anchors.csv", _load),
-    "ble: calibration_df.csv": Reader("ble", "calibration_df.csv", _load),
-    "nerf2-ble: gateway_position.yml": Reader("nerf2-ble", "gateway_position.yml", _load),
-    "nerf2-ble: gateway_rssi.csv": Reader("nerf2-ble", "gateway_rssi.csv", _load),
-    "nerf2-csi: base-station.yml": Reader("nerf2-csi", "base-station.yml", _load),
-    "nerf2-csi: csidata.npy": Reader("nerf2-csi", "csidata.npy", _load),
-    **{f"newrf: {k}": v for k, v in _of(read_newrf, "files", "room.npz").items()},
-    **{f"newrf: {k}": v for k, v in _of(read_pickled_table, "files", "table.pkl").items()},
-    **{f"argos: {k}": v for k, v in _of(read_argos, "files", "capture.hdf5").items()},
+    **_whole("spectra", "gateway_info.yml", "tx_pos.csv", "train_index.txt", "spectrum/00001.png"),
+    **_whole("ble", "anchors.csv", "calibration_df.csv"),
+    **_whole("nerf2-ble", "gateway_position.yml", "gateway_rssi.csv"),
+    **_whole("nerf2-csi", "base-station.yml", "csidata.npy"),
+    **_each("newrf", read_newrf, "room.npz"),
+    **_each("newrf", read_pickled_table, "table.pkl"),
+    **_each("argos", read_argos, "capture.hdf5"),
     "deepmimo: params.json": Reader("deepmimo", "params.json", read_deepmimo),
     "deepmimo: power.mat": Reader("deepmimo", "power_t000_tx000_r001.mat", read_deepmimo),
-    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.ply", "cloud.las", "cloud.laz").items()},
-    **{f"points: {k}": v for k, v in _of(read_points, "files", "cloud.xyz", "cloud.npz").items()},
-    **{f"mesh: {k}": v for k, v in _of(read_mesh, "files", "box.ply", "box.stl", "box.obj", "box.glb").items()},
-    **{f"plan: {k}": v for k, v in _of(read_plan, "files", "plan.npz", "plan.yaml", "plan.png", "plan.csv").items()},
+    **_each("points", read_points, "cloud.ply", "cloud.las", "cloud.laz", "cloud.xyz", "cloud.npz"),
+    **_each("mesh", read_mesh, "box.ply", "box.stl", "box.obj", "box.glb"),
+    **_each("plan", read_plan, "plan.npz", "plan.yaml", "plan.png", "plan.csv"),
     "scene: scene.xml": Reader("scene", "scene.xml", lambda folder: open_scene(folder / "scene.xml", CARRIER_HZ)),
     "scene: floor.ply": Reader("scene", "meshes/floor.ply", lambda folder: open_scene(folder, CARRIER_HZ)),
     "scene: scene.yml": Reader("scene", "scene.yml", read_scene_folder),
@@ -146,15 +131,15 @@ READERS: Mapping[str, Reader] = {
     "run: log.jsonl": Reader("runs", "stopped/log.jsonl", lambda folder: cut_log(folder / "stopped", 2)),
     "run: predictions.npz": Reader("runs", "kriging/predictions.npz", lambda folder: read_run(folder / "kriging")),
     "run: metrics.json": Reader("runs", "kriging/metrics.json", lambda folder: read_run(folder / "kriging")),
-    **{f"run: {k}": v for k, v in _of(load_paths, "files", "paths.npz").items()},
-    **{f"split: {k}": v for k, v in _of(load_split, "files", "split.npz").items()},
-    **{f"paths: {k}": v for k, v in _of(read_paths, "files", "paths.csv").items()},
-    **{f"map: {k}": v for k, v in _of(read_map, "runs", "map.nc", "surface.nc").items()},
+    **_each("run", load_paths, "paths.npz"),
+    **_each("split", load_split, "split.npz"),
+    **_each("paths", read_paths, "paths.csv"),
+    **_each("map", read_map, "map.nc", "surface.nc", group="runs"),
     "map: chunk of map.zarr": Reader("runs", "map.zarr/power_dbm/0.0.0", lambda folder: read_map(folder / "map.zarr")),
     "map: .zmetadata": Reader("runs", "map.zarr/.zmetadata", lambda folder: read_map(folder / "map.zarr")),
     "import: field.npz": Reader("runs", "field.npz", _imported),
-    "locate: heard.csv": Reader("files", "heard.csv", _observations),
-    "predict: inputs.csv": Reader("files", "inputs.csv", _inputs),
+    **_each("locate", partial(read_observations, receivers=HEARD_BY), "heard.csv"),
+    "predict: inputs.csv": Reader("files", "inputs.csv", lambda folder: read_inputs(folder / "inputs.csv", None)),
     "predict: inputs.npz": Reader("files", "inputs.npz", lambda folder: read_inputs(None, folder / "inputs.npz")),
 }
 """All readers by name."""
@@ -208,10 +193,10 @@ def prepare(folder: Path) -> None:
         return
     shutil.rmtree(folder, ignore_errors=True)
     rng = np.random.default_rng(0)
-    made = prepare_spectra(folder / "spectra")
-    positions = made.tx_pos_m
-    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": made.receivers, "official": made.official}
-    common["frequencies_hz"] = made.frequencies_hz
+    spectra = prepare_spectra(folder / "spectra")
+    positions = spectra.tx_pos_m
+    common: dict[str, Any] = {"tx_pos_m": positions, "receivers": spectra.receivers, "official": spectra.official}
+    common["frequencies_hz"] = spectra.frequencies_hz
     prepare_strengths(folder / "ble")
     channels = (rng.normal(size=(1, 12, 2, 4)) + 1j * rng.normal(size=(1, 12, 2, 4))).astype(np.complex64)
     hz = CARRIER_HZ + 1e6 * np.arange(4)
@@ -308,9 +293,9 @@ def _write_runs(folder: Path) -> None:
     strengths = train(folder / "ble", folder / "runs" / "kriging", "kriging")
     where = ExportOptions(frequency_hz=CARRIER_HZ, tx_pos_m=np.array([[1.0, 2, 1]]), rx_pos_m=np.array([[3.0, 1, 2]]))
     export(folder / "scene", "paths", folder / "files" / "paths.csv", where)
-    made = radio_map(strengths, height_m=1.0, step_m=0.5)
-    write_map(made, folder / "runs" / "map.nc")
-    write_map(made, folder / "runs" / "map.zarr")
+    radio = radio_map(strengths, height_m=1.0, step_m=0.5)
+    write_map(radio, folder / "runs" / "map.nc")
+    write_map(radio, folder / "runs" / "map.zarr")
     write_map(radio_map(strengths, surface=folder / "files" / "box.ply"), folder / "runs" / "surface.nc")
     settings = (*SMALL, "network.static_geometry=true")
     run = train(folder / "spectra", folder / "runs" / "field", "wrf-gs+", settings=settings).folder

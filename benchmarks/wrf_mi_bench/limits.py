@@ -126,7 +126,7 @@ def rows() -> Iterator[tuple[str, str]]:
     yield "the same behind a wall of 0.2 m", f"{len(traced(opened(wall), [BEFORE], BEHIND))} paths"
     scene, tx_pos_m, rx_pos_m = room()
     pairs = [[traced(scene, [a], b), traced(scene, [b], a)] for a, b in zip(tx_pos_m, rx_pos_m, strict=True)]
-    change_db = np.array([abs(level_db(there) - level_db(back)) for there, back in pairs if len(there) and len(back)])
+    change_db = np.array([abs(level_db(forth) - level_db(back)) for forth, back in pairs if len(forth) and len(back)])
     share = f"{np.mean(change_db > 1):.0%} of {len(change_db)} pairs by more than 1 dB"
     yield "diffracted power from A to B against that from B to A, concrete room with three boxes", f"{share} apart"
     with tempfile.TemporaryDirectory() as folder:
@@ -146,8 +146,8 @@ def rows() -> Iterator[tuple[str, str]]:
     for rays in (1 << 12, 1 << 17):
         options = [TraceOptions(**{**vars(DIFFRACTED), "rays": rays, "seed": seed}) for seed in range(1, 9)]
         counts = [len(traced(divided, [(-5.0, 0.0, -1.0)], (5.0, 0.0, -1.0), each)) for each in options]
-        found = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
-        yield f"edges of the half plane of 512 triangles, {rays} rays, eight seeds", f"{found} found"
+        numbers = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else str(counts[0])
+        yield f"edges of the half plane of 512 triangles, {rays} rays, eight seeds", f"{numbers} found"
     tx = np.random.default_rng(1).uniform([0.5, -3, -3], [4, 3, 3], (200, 3))
     for count in (10, 50, 100):
         paths = traced(opened(facets(count, 1.0)), tx, (3.0, 0.3, 0.2), REFLECTED)

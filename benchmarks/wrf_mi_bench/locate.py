@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,10 +22,11 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_file import test_observations
-from wrf_mi.maps.locate_knn import COUNTS, METRICS, Neighbours
+from wrf_mi.maps.locate_likelihood import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
@@ -35,34 +36,22 @@ from .table_plan import PARTS
 from .tables import scene_of
 
 RUNS = Path("runs/bench/locate")
-STRETCH = 20
-"""Consecutive test rows that are resampled together: the robot moves 3 m in them."""
-INSIDE = (0.85, 0.95)
-"""Limits of the share of true positions inside the 90 % regions."""
+STRETCH = 20  # consecutive test rows that are resampled together: the robot moves 3 m in them
+INSIDE = (0.85, 0.95)  # limits of the share of true positions inside the 90 % regions
 ROWS = 64
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes:
-        title: label in the table.
-        model: name of the model.
-        n_train: number of training rows; None: all.
-        seed: seed of their draw and of the fit.
-        scene: whether the model knows the walls.
-        settings: ``key=value`` of the model.
-        intervals: whether its standard deviations are calibrated by held-out rows, as it states none.
-    """
-
-    title: str
-    model: str
-    n_train: int | None
-    seed: int = 0
-    scene: bool = True
-    settings: tuple[str, ...] = ()
-    intervals: bool = False
+    title: str  # label in the table
+    model: str  # name of the model
+    n_train: int | None  # number of training rows; None: all
+    seed: int = 0  # seed of their draw and of the fit
+    scene: bool = True  # whether the model knows the walls
+    settings: tuple[str, ...] = ()  # ``key=value`` of the model
+    intervals: bool = False  # whether its standard deviations are calibrated by held-out rows, as it states none
 
     @property
     def name(self) -> str:
@@ -84,23 +73,23 @@ def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
     if not (folder / FINISHED).exists():
         shutil.rmtree(folder, ignore_errors=True)
         more: dict[str, Any] = {"scene": scene if cell.scene else None, "settings": cell.settings}
-        given: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
-        train(FLAT, folder, cell.model, **given, **more)
+        options: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
+        train(FLAT, folder, cell.model, **options, **more)
     run = open_run(folder)
     strengths_dbm, true_m = test_observations(run)
-    found = locate(run, strengths_dbm, on_progress=_show(cell.name))
+    located = locate(run, strengths_dbm, on_progress=_show(cell.name))
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
     best = best_neighbours(record, rows, strengths_dbm, true_m)
-    near = found.neighbours_error_m(true_m)
+    near = located.neighbours_error_m(true_m)
     assert near is not None
     return {
-        "error_m": found.error_m(true_m).tolist(),
+        "error_m": located.error_m(true_m).tolist(),
         "neighbours_error_m": near.tolist(),
         "best_neighbours_error_m": best.tolist(),
-        "inside": found.covers(true_m).tolist(),
-        "area_m2": found.area_m2.tolist(),
-        "radius_m": found.radius_m.tolist(),
-        "calibration": asdict(found.calibration),
+        "inside": located.covers(true_m).tolist(),
+        "area_m2": located.area_m2.tolist(),
+        "radius_m": located.radius_m.tolist(),
+        "calibration": asdict(located.calibration),
     }
 
 
@@ -111,7 +100,7 @@ def best_neighbours(record: Record, rows: IntArray, observed_dbm: FloatArray, tr
         for metric in METRICS
         for count in COUNTS
     ]
-    return np.asarray(min(errors, key=lambda one: float(one.mean())), float)
+    return np.asarray(min(errors, key=lambda error: float(error.mean())), float)
 
 
 def stretches(values: FloatArray) -> FloatArray:
@@ -124,20 +113,23 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Row of the table: one draw of the training rows, or all draws pooled, which score the same test rows."""
 
     def of(key: str) -> FloatArray:
-        return np.array([found[key] for found in draws], float)
+        return np.array([draw[key] for draw in draws], float)
+
+    def interval(values: FloatArray) -> list[float]:
+        mean = bootstrap(stretches(values), statistic=np.mean)
+        return [mean.value, mean.low, mean.high]
 
     error, near, best = of("error_m"), of("neighbours_error_m"), of("best_neighbours_error_m")
-    gain, over_best = (bootstrap(stretches(other - error), statistic=np.mean) for other in (near, best))
-    inside = bootstrap(stretches(of("inside")), statistic=np.mean)
+    gain, inside = interval(near - error), interval(of("inside"))
     figures = {
         "median_m": float(np.median(error)),
         "mean_m": float(error.mean()),
         "neighbours_median_m": float(np.median(near)),
         "neighbours_mean_m": float(near.mean()),
         "best_neighbours_mean_m": float(best.mean()),
-        "gain_m": [gain.value, gain.low, gain.high],
-        "gain_over_best_m": [over_best.value, over_best.low, over_best.high],
-        "inside": [inside.value, inside.low, inside.high],
+        "gain_m": gain,
+        "gain_over_best_m": interval(best - error),
+        "inside": inside,
         "area_m2": float(np.median(of("area_m2"))),
         "radius_m": float(np.median(of("radius_m"))),
     }
@@ -146,8 +138,8 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     value = (
         f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN {figures['neighbours_median_m']:.2f} m "
     )
-    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside.value:.0%} inside"
-    asked = f"gain {gain.value:.2f} m ({gain.low:.2f} to {gain.high:.2f}), 85 to 95 % inside"
+    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside[0]:.0%} inside"
+    asked = f"gain {gain[0]:.2f} m ({gain[1]:.2f} to {gain[2]:.2f}), 85 to 95 % inside"
     return {**line(what, value, asked), **figures}
 
 
@@ -165,31 +157,33 @@ def _show(name: str) -> Any:
 def main() -> dict[str, Any]:
     """Measure all cells, those that this code has measured before excepted; `InputError` where data are missing.
 
-    Returns:
-        ``rows``; ``calibration`` of each cell; ``failed`` where nearest neighbours are not clearly worse with `ROWS`
-        rows and the walls, or regions do not hold 85 to 95 % of the true positions, draws pooled.
+    ``failed`` is there where nearest neighbours are not clearly worse with `ROWS` rows and the walls, or regions do not
+    hold 85 to 95 % of the true positions, draws pooled; ``calibration`` is that of each cell.
     """
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
     scene = scene_of(next(part for part in PARTS if part.dataset == FLAT), place)[1]
-    found: dict[Cell, dict[str, Any]] = {}
+    measured: dict[Cell, dict[str, Any]] = {}
     for number, cell in enumerate(CELLS, 1):
         print(f"locate: {number} of {len(CELLS)}: {cell.name}", file=sys.stderr, flush=True)
-        found[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
-        row = row_of(cell, [found[cell]])
+        measured[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
+        row = row_of(cell, [measured[cell]])
         print(f"locate: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
-    return {"calibration": {cell.name: one["calibration"] for cell, one in found.items()}, **summary(found)}
+    return {
+        "calibration": {cell.name: result["calibration"] for cell, result in measured.items()},
+        **summary(measured),
+    }
 
 
-def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
+def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
     """Rows of the table, draws of the same kind pooled after them, and the verdict on pooled rows."""
     kinds: dict[Cell, list[Cell]] = {}
-    for cell in found:
+    for cell in measured:
         kinds.setdefault(replace(cell, seed=0), []).append(cell)
     rows, pooled = [], {}
     for kind, cells in kinds.items():
-        rows += [row_of(cell, [found[cell]]) for cell in cells]
-        pooled[kind] = row_of(kind, [found[cell] for cell in cells])
+        rows += [row_of(cell, [measured[cell]]) for cell in cells]
+        pooled[kind] = row_of(kind, [measured[cell] for cell in cells])
         if len(cells) > 1:
             rows.append(pooled[kind])
     worse = [row["what"] for kind, row in pooled.items() if kind.n_train and kind.scene and row["gain_m"][1] <= 0]
@@ -204,28 +198,14 @@ def summary(found: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: error, gain over nearest neighbours with its 95 % interval, and regions."""
-    head = (
-        "training rows, model, seed",
-        "error, median (mean), m",
-        "kNN, median (mean), m",
-        "gain on kNN, m",
-        "gain on kNN of the best k, m",
-        "inside 90 % regions",
-        "region, m²",
-        "radius, m",
-    )
-    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
-    for row in rows:
-        gain, best = ("{:.2f} ({:.2f} to {:.2f})".format(*row[key]) for key in ("gain_m", "gain_over_best_m"))
-        cells = (
-            row["what"],
-            f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
-            f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
-            gain,
-            best,
-            "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
-            f"{row['area_m2']:.1f}",
-            f"{row['radius_m']:.1f}",
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
+        "training rows, model, seed": lambda row: row["what"],
+        "error, median (mean), m": lambda row: f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
+        "kNN, median (mean), m": lambda row: f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
+        "gain on kNN, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_m"]),
+        "gain on kNN of the best k, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_over_best_m"]),
+        "inside 90 % regions": lambda row: "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
+        "region, m²": lambda row: f"{row['area_m2']:.1f}",
+        "radius, m": lambda row: f"{row['radius_m']:.1f}",
+    }
+    return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in rows))

@@ -29,10 +29,8 @@ from .timing import Call, interleaved, memory_mb, ratio
 from .workloads import HEIGHT, WIDTH, parameters
 
 GAUSSIANS, BATCH = 10_000, 64
-SIZE_DEG = 3.0
-"""Angular standard deviation of each Gaussian: 115 weights a pixel."""
-SMALL = 270
-"""Gaussians of the default fit."""
+SIZE_DEG = 3.0  # angular standard deviation of each Gaussian: 115 weights a pixel
+SMALL = 270  # Gaussians of the default fit
 REPEATS = 15
 
 
@@ -87,14 +85,14 @@ def difference(field: Any, params: Mapping[str, NDArray[np.float32]], tx_pos_m: 
     direct = Direct(field, params)
     gaussians = direct.gaussians(direct.parts(tx_pos_m))
     signal = (gaussians.signal[0].numpy() + 1j * gaussians.signal[1].numpy())[None]
-    found = direct.operator(gaussians).magnitude(signal, SQUARED_MAGNITUDE_EPS)
+    magnitudes = direct.operator(gaussians).magnitude(signal, SQUARED_MAGNITUDE_EPS)
     pixels = direct.pixels(tx_pos_m)
-    return relative(found.ravel() - pixels, pixels)
+    return relative(magnitudes.ravel() - pixels, pixels)
 
 
 def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Times of a prediction, ms: network, splatting, both, and by operator."""
-    found = {}
+    times_of = {}
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     cases: dict[str, tuple[Any, int, float]] = {
         "WRF-GS, 270 Gaussians": (WrfGs(), SMALL, 7.0),
@@ -114,8 +112,8 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             predictor = Predictor.of_field(field, params, [RECEIVER], HEIGHT, WIDTH, operator=True)
             calls |= {"operator": partial(predictor, tx[:1]), f"operator, {BATCH}": partial(predictor, tx)}
         times = interleaved(calls, REPEATS, most_s=30)
-        found[name] = {key: bootstrap(t / (BATCH if key.endswith(str(BATCH)) else 1)) for key, t in times.items()}
-    return found
+        times_of[name] = {key: bootstrap(t / (BATCH if key.endswith(str(BATCH)) else 1)) for key, t in times.items()}
+    return times_of
 
 
 def main() -> dict[str, Any]:
@@ -135,7 +133,7 @@ def main() -> dict[str, Any]:
     assert factors is not None
     images, weights = pixels.composed(factors), pixels.weights
     weights_parts = weights.data, weights.indices, weights.indptr
-    given = (coefficients(tx) @ factors.T).astype(np.complex64)
+    signals = (coefficients(tx) @ factors.T).astype(np.complex64)
 
     def spectra(tx_pos_m: NDArray[Any]) -> NDArray[Any]:
         return images.magnitude(coefficients(tx_pos_m), SQUARED_MAGNITUDE_EPS)
@@ -143,7 +141,7 @@ def main() -> dict[str, Any]:
     calls: dict[str, tuple[Call, int]] = {"direct, pixels": (partial(direct.pixels, tx[0]), 1)}
     for count, many in (("one transmitter", 1), (f"each of {BATCH}", BATCH)):
         calls[f"pixels, {count}"] = partial(spectra, tx[:many]), many
-        stated = partial(pixels.magnitude, given[:many], SQUARED_MAGNITUDE_EPS)
+        stated = partial(pixels.magnitude, signals[:many], SQUARED_MAGNITUDE_EPS)
         calls[f"pixels, signals of {GAUSSIANS:,} given, {count}"] = stated, many
     alone = {name: call for name, (call, _) in calls.items()}
     raw, processor = interleaved(alone, REPEATS, most_s=120), interleaved(alone, REPEATS, most_s=60, processor=True)

@@ -21,8 +21,7 @@ STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.pn
 """Stored rows, and the picture, which is written only in a checkout of the project."""
 COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("training", "s")}
 """Key, title and unit of each cost."""
-LEAST = 1e-3
-"""Smallest cost on the logarithmic axes."""
+LEAST = 1e-3  # smallest cost on the logarithmic axes
 
 Points = Mapping[str, Mapping[str, float]]
 """Score and costs of each method by name."""
@@ -42,18 +41,18 @@ def points_of(part: Part, stored: Mapping[str, Mapping[str, Any]]) -> Points:
 def front(points: Points, cost: str, higher_is_better: bool) -> list[str]:
     """Names of the Pareto-optimal methods in a cost and the score, from cheap to costly."""
     sign = 1 if higher_is_better else -1
-    kept, best = [], -np.inf
+    optimal, best = [], -np.inf
     for name in sorted(points, key=lambda name: (points[name][cost], -sign * points[name]["score"])):
         if sign * points[name]["score"] > best:
             best = sign * points[name]["score"]
-            kept.append(name)
-    return kept
+            optimal.append(name)
+    return optimal
 
 
-def fronts(found: Mapping[Part, Points]) -> list[Row]:
+def fronts(by_part: Mapping[Part, Points]) -> list[Row]:
     """Rows for the benchmark's table: the methods on each front with their scores and costs."""
     rows = []
-    for part, points in found.items():
+    for part, points in by_part.items():
         task = TASKS[part.task]
         for cost, (title, unit) in COSTS.items():
             shown = [
@@ -64,13 +63,13 @@ def fronts(found: Mapping[Part, Points]) -> list[Row]:
     return rows
 
 
-def pareto_figure(found: Mapping[Part, Points]) -> Figure:
+def pareto_figure(by_part: Mapping[Part, Points]) -> Figure:
     """Picture of costs against scores: a row for each part, a colour for each method, the fronts as grey steps."""
-    figure = Figure(figsize=(9, 2.3 * len(found) + 1), layout="constrained", facecolor="white")
-    names = list(dict.fromkeys(name for points in found.values() for name in points))
+    figure = Figure(figsize=(9, 2.3 * len(by_part) + 1), layout="constrained", facecolor="white")
+    names = list(dict.fromkeys(name for points in by_part.values() for name in points))
     shown: dict[str, Any] = {}
-    panels = figure.subplots(len(found), 2, sharey="row", squeeze=False)
-    for row, (part, points) in zip(panels, found.items(), strict=True):
+    panels = figure.subplots(len(by_part), 2, sharey="row", squeeze=False)
+    for row, (part, points) in zip(panels, by_part.items(), strict=True):
         task = TASKS[part.task]
         for axes, (cost, (title, unit)) in zip(row, COSTS.items(), strict=True):
             at = {name: (max(points[name][cost], LEAST), points[name]["score"]) for name in points}
@@ -96,7 +95,7 @@ def read_points(place: Path = STORED) -> dict[Part, Points]:
 
 def main() -> dict[str, Sequence[Any]]:
     """Fronts of all parts in both costs, and their picture."""
-    found = read_points()
+    by_part = read_points()
     if PICTURE.parent.is_dir():
-        write_figure(PICTURE, pareto_figure(found))
-    return {"rows": fronts(found)}
+        write_figure(PICTURE, pareto_figure(by_part))
+    return {"rows": fronts(by_part)}

@@ -6,7 +6,6 @@ figure uses the seeds of these rooms.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,27 +18,24 @@ from scipy.constants import speed_of_light
 from wrf_mi.core import Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import Survey, random_room_record
 
-from .comparison import kept, line
+from .comparison import kept_work, line
 from .fit_key import fit_key, source_files
 
 SEEDS = range(101, 105)
 CARRIERS_HZ = 0.92e9, 2.4e9, 5.0e9
 PHASE_ERRORS_RAD = 0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.5
 RUNS = Path("runs/bench/phase-error")
-SURVEY = Survey(train=40, test=5)
-"""Rows are positions of transmitters here; no model is fitted."""
-SIZE = 45, 180
-"""Elevations and azimuths of a spectrum."""
-ELEMENTS = 4
-"""Elements along each side of the square array, half a wavelength apart."""
+SURVEY = Survey(train=40, test=5)  # rows are positions of transmitters here; no model is fitted
+SIZE = 45, 180  # elevations and azimuths of a spectrum
+ELEMENTS = 4  # elements along each side of the square array, half a wavelength apart
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
-CEILING_M = 1.8
-"""Height above which an array looks down, metres; one below looks up."""
+CEILING_M = 1.8  # height above which an array looks down, metres; one below looks up
 TRUTH = TraceOptions(transmission=True, diffraction=True, scattering=True, depth=3, rays=1 << 13)
 """Search for the true paths, with diffuse reflection and diffraction."""
 PREDICTION = TraceOptions(transmission=True, depth=3, rays=1 << 16)
@@ -63,23 +59,18 @@ def measure_room(seed: int, folder: Path) -> list[list[float]]:
         tracer = RayTracer(true, instrument, TRUTH)
         truth = tracer.observe(tracer.trace(record.tx_pos_m))[0]
         paths = RayTracer(scan, instrument, PREDICTION).trace(record.tx_pos_m).paths
-        found = [replace(instrument, phase_error=rad).observe(paths)[0] for rad in PHASE_ERRORS_RAD]
-        means.append([float(np.mean(TASKS["spectrum"].score(one, truth))) for one in found])
+        spectra = [replace(instrument, phase_error=rad).observe(paths)[0] for rad in PHASE_ERRORS_RAD]
+        means.append([float(np.mean(TASKS["spectrum"].score(predicted, truth))) for predicted in spectra])
     return means
 
 
 def main() -> dict[str, Any]:
     """Measure all rooms; a room that this code has measured before is not measured again.
 
-    Returns:
-        ``rows``: of each carrier, ``ssim`` by phase error, the mean over rooms.
+    Rows have, of each carrier, ``ssim`` by phase error, the mean over rooms.
     """
-    place, rooms = RUNS / fit_key(source_files()), []
-    for seed in SEEDS:
-        folder = place / str(seed)
-        shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
-        rooms.append(kept(place / f"{seed}.json", partial(measure_room, seed, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+    place = RUNS / fit_key(source_files())
+    rooms = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]
     rows = []
     for hz, means in zip(CARRIERS_HZ, np.mean(rooms, axis=0).tolist(), strict=True):
         best = PHASE_ERRORS_RAD[int(np.argmax(means))]
@@ -91,9 +82,8 @@ def main() -> dict[str, Any]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the mean SSIM by phase error; the best of each carrier is bold."""
-    head = ["phase error, rad", *(f"{rad:g}" for rad in PHASE_ERRORS_RAD)]
-    lines = [f"| {' | '.join(head)} |", "| --- |" + " --- |" * len(PHASE_ERRORS_RAD)]
+    lines = []
     for row in rows:
-        cells = [f"**{one:.3f}**" if one == max(row["ssim"]) else f"{one:.3f}" for one in row["ssim"]]
-        lines.append(f"| {row['what']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = (f"**{ssim:.3f}**" if ssim == max(row["ssim"]) else f"{ssim:.3f}" for ssim in row["ssim"])
+        lines.append([row["what"], *cells])
+    return markdown_table(["phase error, rad", *(f"{rad:g}" for rad in PHASE_ERRORS_RAD)], lines)

@@ -18,35 +18,27 @@ from wrf_mi.scene.register import best_scale, register_walls, sample_walls
 
 from .comparison import data_folder, line
 
-NEAR_M = 0.2
-"""Distance within which walls agree: the blur of the robot's poses."""
+NEAR_M = 0.2  # distance within which walls agree: the blur of the robot's poses
 GRID_RESOLUTION_M = 0.04
 """Resolution of the SLAM map: ``size = 20, res = 0.04``, so 500 cells, in the notebook of its author
 (github.com/marckolak/graphSLAM, examples/Mapping.ipynb); registration to the layout finds the same."""
-GRID_ROW_0: Row0 = "top"
-"""Side of the map's first row; registration to the layout refuses the mirror image."""
+GRID_ROW_0: Row0 = "top"  # side of the map's first row; registration to the layout refuses the mirror image
 ASKED = "0.85 and 0.85"
 
 
 def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_M) -> tuple[float, float]:
-    """Agreement of walls [n, 2, 2] made with true ones [m, 2, 2], end points in m.
-
-    Returns:
-        Share of the true walls' length that lies near a made wall, and the reverse.
-    """
-    made, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
-    found = shapely.intersection(true, shapely.buffer(made, near_m)).length / true.length
-    right = shapely.intersection(made, shapely.buffer(true, near_m)).length / made.length
-    return float(found), float(right)
+    """Shares of true walls [m, 2, 2] near walls made [n, 2, 2], by length, and the reverse; end points in m."""
+    made_walls, true = (shapely.unary_union(shapely.linestrings(walls)) for walls in (made_m, true_m))
+    share_found = shapely.intersection(true, shapely.buffer(made_walls, near_m)).length / true.length
+    right = shapely.intersection(made_walls, shapely.buffer(true, near_m)).length / made_walls.length
+    return float(share_found), float(right)
 
 
 def flat_plan() -> dict[str, Any]:
     """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv``.
 
-    An upper bound for any method is the share of the layout near an occupied cell.
-
-    Returns:
-        ``rows`` for the table, and per source: shares, what can be seen, walls, scale of the registration, seconds.
+    An upper bound for any method is the share of the layout near an occupied cell. Each source has shares, what can be
+    seen, walls, scale of the registration, seconds.
     """
     home = data_folder("flat-ble")
     true = layout_walls(read_layout(home / "layout.csv"))
@@ -83,13 +75,13 @@ def _measured(grid: PlanGrid, true: FloatArray, register: bool = True) -> dict[s
         motion = register_walls(sample_walls(walls), true)
         walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
         scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
-    found, right = wall_agreement(walls, true)
+    share_found, right = wall_agreement(walls, true)
     line = shapely.unary_union(shapely.linestrings(true))
-    seen = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length
+    near_cells = shapely.intersection(line, shapely.buffer(shapely.multipoints(cells), NEAR_M)).length / line.length
     return {
-        "layout_found": found,
+        "layout_found": share_found,
         "walls_right": right,
-        "layout_seen": float(seen),
+        "layout_seen": float(near_cells),
         "walls": len(walls),
         "length_m": float(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1).sum()),
         "scale": scale,

@@ -34,6 +34,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.graph import Batch
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
@@ -42,21 +43,18 @@ from wrf_mi.training.step import TrainingData, device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
-from .stock import StockRenderer, rgb_variant
 from .timing import Call, Within, interleaved, ratio
+from .traced import StockRenderer, rgb_variant
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
 
 FILE = "quick.json"
-WORSE = 2.0
-"""Allowed ratio of a measured to a stored ratio; machines and their load change ratios by less."""
-REPEATS, MOST_S = 15, 5.0
-"""Rounds of a pair, and seconds after which no further round begins."""
+WORSE = 2.0  # allowed ratio of a measured to a stored ratio; machines and their load change ratios by less
+REPEATS, MOST_S = 15, 5.0  # rounds of a pair, and seconds after which no further round begins
 OPTIONS = TraceOptions(rays=1 << 14)
 ONLY_STEPS = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
 """Settings of a fit of nothing but steps."""
 
-STEPS = 25
-"""Steps of a call, where the end of a run of one step would count."""
+STEPS = 25  # steps of a call, where the end of a run of one step would count
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,8 @@ class Pair:
 
 
 def _splatting() -> tuple[Call, Call]:
-    given = field(500, 5.0, opacity=0.3)
-    return splatting(*given), Within(_stock(*given).render, rgb_variant)
+    scene = field(500, 5.0, opacity=0.3)
+    return splatting(*scene), Within(_stock(*scene).render, rgb_variant)
 
 
 def _integrator() -> tuple[Call, Call]:
@@ -120,7 +118,7 @@ def _batch() -> tuple[Call, Call]:
         return together(params, to_tensor(positions.T), pose, plane)
 
     def theirs() -> Any:
-        return [dr.eval(alone(params, to_tensor(one[:, None]), pose, plane)) for one in positions]
+        return [dr.eval(alone(params, to_tensor(position[:, None]), pose, plane)) for position in positions]
 
     return ours, theirs
 
@@ -131,13 +129,13 @@ def _new_rays() -> Iterator[TraceOptions]:
 
 
 def _kept_rays() -> tuple[Call, Call]:
-    kept, tx_pos_m, new = tracer(OPTIONS), transmitter_path(1), _new_rays()
+    laboratory, tx_pos_m, new = tracer(OPTIONS), transmitter_path(1), _new_rays()
 
     def theirs() -> Any:
-        paths = trace_paths(kept.scene, tx_pos_m, kept.instrument.receivers, next(new)).paths
-        return kept.instrument.observe(paths)
+        paths = trace_paths(laboratory.scene, tx_pos_m, laboratory.instrument.receivers, next(new)).paths
+        return laboratory.instrument.observe(paths)
 
-    return lambda: kept(tx_pos_m), theirs
+    return lambda: laboratory(tx_pos_m), theirs
 
 
 def _gains() -> tuple[Call, Call]:
@@ -163,11 +161,11 @@ def _paths_alone() -> tuple[Call, Call]:
 
     def step(adam: Any, data: TrainingData, rows: Any, receiver: Any) -> Any:
         truth = data.select(rows, receiver, HEIGHT * WIDTH)[1]
-        found = loss_of(model(side({name: adam[name] for name in names}, rows), None), truth, len(batch), *size)
-        dr.backward(found)
+        loss = loss_of(model(side({name: adam[name] for name in names}, rows), None), truth, len(batch), *size)
+        dr.backward(loss)
         adam.step(eval=False)
-        dr.eval(adam, found)
-        return dr.detach(found)
+        dr.eval(adam, loss)
+        return dr.detach(loss)
 
     recorded = Recorded(step, lambda: graph.arrays(0, side))
     data = TrainingData.of(targets)
@@ -216,25 +214,25 @@ def measure_pairs(
     pairs: Sequence[Pair] = PAIRS, repeats: int = REPEATS, most_s: float = MOST_S
 ) -> dict[str, dict[str, Any]]:
     """Ratio of each pair with its interval, and the median times in ms."""
-    found = {}
+    ratios = {}
     for pair in pairs:
         ours, theirs = pair.make()
         with one_thread():
             calls, processor = {"ours": ours, "theirs": theirs}, init().name != "cuda"
             times = interleaved(calls, repeats, most_s=most_s, processor=processor)
         interval = ratio(times["ours"], times["theirs"])
-        found[pair.name] = vars(interval) | {f"{name}_ms": float(np.median(ms)) for name, ms in times.items()}
+        ratios[pair.name] = vars(interval) | {f"{name}_ms": float(np.median(ms)) for name, ms in times.items()}
         print(f"{pair.title}: {interval}", file=sys.stderr)
-    return found
+    return ratios
 
 
 def worse(measured: Mapping[str, Mapping[str, float]], stored: Mapping[str, Mapping[str, float]]) -> list[str]:
     """A line for each ratio whose whole interval is above `WORSE` times the stored one; those not stored yet pass."""
     return [
-        f"{name} {Interval(one['value'], one['low'], one['high'])} is above {WORSE:g} times the stored "
+        f"{name} {Interval(interval['value'], interval['low'], interval['high'])} is above {WORSE:g} times the stored "
         f"{stored[name]['value']:.3g}"
-        for name, one in measured.items()
-        if name in stored and one["low"] > WORSE * stored[name]["value"]
+        for name, interval in measured.items()
+        if name in stored and interval["low"] > WORSE * stored[name]["value"]
     ]
 
 
@@ -244,19 +242,19 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     stored = None if store else read_stored(file)
     start = time.perf_counter()
     with threadpool_limits(1, "blas"):
-        found = measure_pairs(pairs)
+        ratios = measure_pairs(pairs)
     result = {
         "case": "quick",
         "title": "interleaved pairs",
         "command": f"wrf-mi bench --quick --backend {init().name} --store",
         "wall_seconds": time.perf_counter() - start,
         **provenance(__name__),
-        "figures": {"ratios": found},
+        "figures": {"ratios": ratios},
     }
     if stored is None:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(file, json.dumps(result, indent=1) + "\n")
-    elif lines := worse(found, stored):
+    elif lines := worse(ratios, stored):
         raise BenchFailed(f"bench --quick: {'; '.join(lines)}")
     return result
 
@@ -284,10 +282,8 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
     """Markdown table of measured ratios."""
     titles = {pair.name: pair.title for pair in PAIRS}
-    lines = ["| ratio | measured (95 % interval) | medians |", "| --- | --- | --- |"]
+    lines = []
     for name, one in ratios.items():
-        lines.append(
-            f"| {titles[name]} | **{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g}) "
-            f"| {one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms |"
-        )
-    return "\n".join(lines)
+        interval = f"**{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g})"
+        lines.append([titles[name], interval, f"{one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms"])
+    return markdown_table(["ratio", "measured (95 % interval)", "medians"], lines)

@@ -31,19 +31,14 @@ from wrf_mi.tracing.tracer import RayTracer
 
 CARRIER_HZ = 2.44e9
 SUBCARRIERS_HZ: FloatArray = CARRIER_HZ + np.linspace(-40e6, 40e6, 8)
-OPTIONS = TraceOptions(transmission=True, depth=3, rays=1 << 18, seed=1)
-"""Paths of the true channels."""
+OPTIONS = TraceOptions(transmission=True, depth=3, rays=1 << 18, seed=1)  # paths of the true channels
 
 
-LOW_M, HIGH_M = 0.5, 2.0
-"""Bounds of the transmitters' height."""
-CLEAR_M, FROM_STATION_M = 0.1, 0.5
-"""Least distances of transmitters from surfaces and from the access point."""
+LOW_M, HIGH_M = 0.5, 2.0  # bounds of the transmitters' height
+CLEAR_M, FROM_STATION_M = 0.1, 0.5  # least distances of transmitters from surfaces and from the access point
 SNR_DB = 30.0
-POSES = 4
-"""Number of the LiDAR's positions."""
-FRAME_M, FRAME_RAD = 0.055, 0.009
-"""Length of the scan's displacement and angle of its rotation, in random directions."""
+POSES = 4  # number of the LiDAR's positions
+FRAME_M, FRAME_RAD = 0.055, 0.009  # length of the scan's displacement and angle of its rotation, in random directions
 POSE_M, POSE_RAD = 0.01, 0.001
 """Standard deviations, along and about each axis, of the errors of each position of the LiDAR."""
 
@@ -58,19 +53,13 @@ class Survey:
 
 
 DEFAULT = Survey()
-SCANNER_CLEAR_M = 0.35
-"""Least distance of the LiDAR from surfaces, metres."""
+SCANNER_CLEAR_M = 0.35  # least distance of the LiDAR from surfaces, metres
 
 
 def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) -> tuple[Record, Path, Path]:
-    """Measure the room of a seed: its channels, and a scene made from a scan of it.
+    """Measure the room of a seed: its channels, and a scene made from a scan of it; all files go into ``folder``.
 
     The official split is the first ``train`` rows and the rest; positions are drawn independently.
-
-    Args:
-        seed: seed of the room and of all that is drawn in it.
-        folder: folder for both scenes and the scan.
-        survey: parameters.
 
     Returns:
         The record, with ``task="csi"`` and `Record.truth`; the scene file of the true room, for comparison only; and
@@ -109,7 +98,7 @@ def _scan(xml: Path, poses_m: FloatArray, seed: int, survey: Survey) -> FloatArr
     middle = poses_m.mean(axis=0)
     for number, pose in enumerate(poses_m):
         points = simulate_scan(xml, pose[None], rays_per_pose=survey.rays, seed=seed * len(poses_m) + number)
-        own = Rotation.from_rotvec(rng.normal(0, POSE_RAD, 3))
-        points = own.apply(points - pose) + pose + rng.normal(0, POSE_M, 3)
+        turn = Rotation.from_rotvec(rng.normal(0, POSE_RAD, 3))
+        points = turn.apply(points - pose) + pose + rng.normal(0, POSE_M, 3)
         parts.append(common[1].apply(points - middle) + middle + common[0])
     return np.concatenate(parts)

@@ -11,14 +11,13 @@ from typing import Any
 
 from . import endurance, faults
 from .bench import BenchFailed
-from .comparison import Row, kept, line
+from .comparison import Row, kept, kept_work, line
 from .fault_commands import COMMANDS
 from .fit_key import fit_key, source_files
 from .hostile_files import run_readers
 from .hostile_samples import READERS
 
-INPUTS, QUICK_INPUTS = 2000, 50
-"""Inputs of each reader."""
+INPUTS, QUICK_INPUTS = 2000, 50  # inputs of each reader
 QUICK_KILLS, TOGETHER = 3, 8
 """Kills of each kind of a quick measurement, and readers of one process, whose start takes seconds."""
 RUNS = Path("runs/bench/robustness")
@@ -27,74 +26,68 @@ QUICK_COMMANDS, QUICK_CALLS = ("wrf-gs+", "correct", "tables"), (300, 30)
 """Commands of a quick measurement, and its predictions and opened runs."""
 
 
-def _rows(found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]) -> list[Row]:
-    rows = [line(kind, f"{one['cases']} cases, {len(one['failed'])} wrong", NEVER) for kind, one in found.items()]
-    for one in files:
-        counts = f"{one['inputs']} inputs, {one['refused']} refused, {one['loaded']} read, {len(one['failed'])} wrong"
-        most = f"longest {one['slowest_s']:.1f} s, memory +{one['largest_mb']:.0f} MB"
-        rows.append(line(one["reader"], f"{counts}; {most}", NEVER))
-    return [*rows, *(row for one in long for row in one["rows"])]
+def _rows(kinds: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]) -> list[Row]:
+    rows = [line(kind, f"{part['cases']} cases, {len(part['failed'])} wrong", NEVER) for kind, part in kinds.items()]
+    for part in files:
+        counts = (
+            f"{part['inputs']} inputs, {part['refused']} refused, {part['loaded']} read, {len(part['failed'])} wrong"
+        )
+        most = f"longest {part['slowest_s']:.1f} s, memory +{part['largest_mb']:.0f} MB"
+        rows.append(line(part["reader"], f"{counts}; {most}", NEVER))
+    return [*rows, *(row for part in long for row in part["rows"])]
 
 
-def _summary(found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], wrong: Sequence[str]) -> Row:
+def _summary(kinds: Mapping[str, Any], files: Sequence[Mapping[str, Any]], wrong: Sequence[str]) -> Row:
     """All cases and the worst one."""
-    cases = sum(one["cases"] for one in found.values()) + sum(one["inputs"] for one in files)
-    slowest = max(files, key=lambda one: float(one["slowest_s"]))
-    largest = max(files, key=lambda one: float(one["largest_mb"]))
+    cases = sum(part["cases"] for part in kinds.values()) + sum(part["inputs"] for part in files)
+    slowest = max(files, key=lambda part: float(part["slowest_s"]))
+    largest = max(files, key=lambda part: float(part["largest_mb"]))
     worst = f"longest {slowest['slowest_s']:.1f} s ({slowest['reader']}), most memory +{largest['largest_mb']:.0f} MB "
     worst += f"({largest['reader']})"
     return line("all", f"{cases} cases, {len(wrong)} wrong; {worst}", NEVER)
 
 
 def _result(
-    found: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]
+    kinds: Mapping[str, Any], files: Sequence[Mapping[str, Any]], long: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    wrong = [text for one in found.values() for text in one["failed"]]
-    wrong += [f"{one['reader']}, input {k}: {text}" for one in files for k, text in one["failed"].items()]
-    wrong += [text for one in long for text in one["wrong"]]
-    rows = [*_rows(found, files, long), _summary(found, files, wrong)]
-    figures = {"rows": rows, "faults": found, "readers": list(files), "wrong": wrong}
+    wrong = [text for part in kinds.values() for text in part["failed"]]
+    wrong += [f"{part['reader']}, input {k}: {text}" for part in files for k, text in part["failed"].items()]
+    wrong += [text for part in long for text in part["wrong"]]
+    rows = [*_rows(kinds, files, long), _summary(kinds, files, wrong)]
+    figures = {"rows": rows, "faults": kinds, "readers": list(files), "wrong": wrong}
     return figures | ({"failed": f"{len(wrong)} cases wrong, first {wrong[0]}"} if wrong else {})
 
 
 def main() -> dict[str, Any]:
     """All faults, long use, and `INPUTS` changed files of every reader; what this code has measured is kept."""
     place = RUNS / fit_key(source_files())
-    found: dict[str, Any] = {}
+    kinds: dict[str, Any] = {}
     for name in COMMANDS:
-        folder = place / f"faults-{name}"
-        for kind, one in kept(place / f"faults-{name}.json", partial(faults.run, folder, [name])).items():
-            total = found.setdefault(kind, {"cases": 0, "failed": []})
-            total["cases"] += one["cases"]
-            total["failed"] += one["failed"]
-        shutil.rmtree(folder, ignore_errors=True)
-    long = []
-    for work in (endurance.lost_worker, endurance.memory, endurance.demo):
-        folder = place / work.__name__
-        long.append(kept(place / f"{work.__name__}.json", partial(work, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+        of_command = kept_work(place, f"faults-{name}", partial(faults.run, names=[name]))
+        for kind, counts in of_command.items():
+            total = kinds.setdefault(kind, {"cases": 0, "failed": []})
+            total["cases"] += counts["cases"]
+            total["failed"] += counts["failed"]
+    works = (endurance.lost_worker, endurance.memory, endurance.demo)
+    long = [kept_work(place, work.__name__, work) for work in works]
     files = []
     groups = [list(READERS)[k : k + TOGETHER] for k in range(0, len(READERS), TOGETHER)]
     for number, names in enumerate(groups):
         files += kept(place / f"readers{number}.json", partial(run_readers, place / "files", names, INPUTS))
     shutil.rmtree(place / "files", ignore_errors=True)
-    return _result(found, files, long)
+    return _result(kinds, files, long)
 
 
 def quick(
     inputs: int = QUICK_INPUTS, names: Sequence[str] = QUICK_COMMANDS, kills: int = QUICK_KILLS
 ) -> dict[str, Any]:
-    """Few cases of each kind.
-
-    Raises:
-        BenchFailed: one is wrong.
-    """
+    """Few cases of each kind; `BenchFailed` where one is wrong."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        found = faults.run(place / "faults", names, kills)
+        kinds = faults.run(place / "faults", names, kills)
         files = run_readers(place / "files", list(READERS), inputs)
         long = [endurance.lost_worker(place / "lost"), endurance.memory(place / "memory", *QUICK_CALLS)]
-    figures = _result(found, files, long)
+    figures = _result(kinds, files, long)
     if "failed" in figures:
         raise BenchFailed(f"bench robustness: {figures['failed']}")
     return figures

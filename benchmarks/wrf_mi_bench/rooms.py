@@ -7,7 +7,6 @@ nothing was tuned on them.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
 
-from .comparison import kept, line
+from .comparison import kept_work, line
 from .fit_key import fit_key, source_files
 from .scene import match
 
@@ -41,8 +40,7 @@ MODELS: Mapping[str, tuple[str, str]] = {
 }
 """Model, and the scene that it is given or "", by the column of the table."""
 COLUMNS = (SCAN, CORRECTED, *MODELS)
-ASKED_DB = 3.0
-"""Least median gain of the corrected scene."""
+ASKED_DB = 3.0  # least median gain of the corrected scene
 
 
 def clipped_cea_db(prediction: NDArray[Any], truth: NDArray[Any], record: Record) -> float:
@@ -55,10 +53,8 @@ def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
 
     Paths are the same where directions at both ends and lengths agree (`wrf_mi_bench.scene.match`); the scan's are
     right where the length is, too, within a quarter of the wavelength, as other phases add up to another channel.
-
-    Returns:
-        ``missing``, the share of the true paths that the scan lacks; ``wrong``, the share of the scan's paths that are
-        not there or not right; and the root mean square ``phase_error_rad`` of reflected paths that are the same.
+    ``missing`` is the share of the true paths that the scan lacks; ``wrong`` that of the scan's paths that are not
+    there or not right; ``phase_error_rad`` the root mean square error of reflected paths that are the same.
     """
     ours, theirs = match(truth.paths, scan.paths)
     longer = np.abs(truth.paths.length_m[ours] - scan.paths.length_m[theirs])
@@ -86,10 +82,10 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
         traced[name] = tracer.trace(record.tx_pos_m[rows])
         scores[name] = clipped_cea_db(tracer.observe(traced[name])[0], truth, record)
     scenes = {"": None, "scan": scan, "corrected": corrected}
-    for column, (model, given) in MODELS.items():
-        run = wrf_mi.train(record, folder / "runs" / column.replace(", ", "-"), model, scene=scenes[given])
-        found = wrf_mi.open_run(run.folder, record).predict(record.tx_pos_m[rows]).mean
-        scores[column] = clipped_cea_db(np.asarray(found), truth, record)
+    for column, (model, scene_name) in MODELS.items():
+        run = wrf_mi.train(record, folder / "runs" / column.replace(", ", "-"), model, scene=scenes[scene_name])
+        predicted = wrf_mi.open_run(run.folder, record).predict(record.tx_pos_m[rows]).mean
+        scores[column] = clipped_cea_db(np.asarray(predicted), truth, record)
     size = " x ".join(f"{side:.1f}" for side in room.size_m)
     what = f"{seed}: {size} m, {len(room.parts) - 6} pieces, {room.mount}{', perfect' if room.perfect else ''}"
     chosen = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
@@ -105,16 +101,11 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
 def main() -> dict[str, Any]:
     """Measure all rooms; a room that this code has measured before is not measured again.
 
-    Returns:
-        ``rows``: of each room, and of the median over rooms, ``cea_db`` by column, and for each room how wrong its
-        ``scan`` is and sizes and duration of its ``correction``.
+    Rows have, of each room and of the median over rooms, ``cea_db`` by column, and for each room how wrong its ``scan``
+    is and sizes and duration of its ``correction``.
     """
-    place, rows = RUNS / fit_key(source_files()), list[dict[str, Any]]()
-    for seed in SEEDS:
-        folder = place / str(seed)
-        shutil.rmtree(folder, ignore_errors=True)  # of a stopped measurement
-        rows.append(kept(place / f"{seed}.json", partial(measure_room, seed, folder)))
-        shutil.rmtree(folder, ignore_errors=True)
+    place = RUNS / fit_key(source_files())
+    rows = [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]
     gains = [row["cea_db"][CORRECTED] - row["cea_db"][SCAN] for row in rows]
     medians = {column: float(np.median([row["cea_db"][column] for row in rows])) for column in COLUMNS}
     text = f"{np.median(gains):.1f} dB ({min(gains):.1f} to {max(gains):.1f} dB)"

@@ -38,14 +38,13 @@ STEPS = 3000
 RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
 PATHS, IDW = "paths alone", "IDW"
 CURVES = (RANDOM, MESH, JOINT, PATHS)
-CALIBRATION = ("calibration=gain,materials", "transmission=true")
-"""Settings of the paths alone."""
+CALIBRATION = ("calibration=gain,materials", "transmission=true")  # settings of the paths alone
 
 
 def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:
     """Median scores of all `CURVES` by name, and of inverse-distance weighting; ``task``."""
-    scene, found, field = scene_of_cell(cell, folder.parent), dict[str, Any](), (f"steps={steps}",)
-    for name, model, given, settings in (
+    scene, scores, field = scene_of_cell(cell, folder.parent), dict[str, Any](), (f"steps={steps}",)
+    for name, model, field_scene, settings in (
         (RANDOM, "wrf-gs+", None, field),
         (MESH, "wrf-gs+", None, (*field, f"initial.mesh={scene}")),
         (JOINT, "wrf-gs+", scene, field),
@@ -53,12 +52,12 @@ def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str
     ):
         place = folder / name.replace(" ", "-")
         shutil.rmtree(place, ignore_errors=True)
-        run = train(cell.dataset, place, model, scene=given, n_train=cell.n_train, seed=seed, settings=settings)
+        run = train(cell.dataset, place, model, scene=field_scene, n_train=cell.n_train, seed=seed, settings=settings)
         task, reference = TASKS[run.metrics["task"]], run.metrics["reference"]
         idw = reference[task.reference]["median"]
-        found |= {name: run.metrics[task.block]["median"], IDW: idw, "task": task.name}
+        scores |= {name: run.metrics[task.block]["median"], IDW: idw, "task": task.name}
     shutil.rmtree(folder)
-    return found
+    return scores
 
 
 def rows_needed(rows: Sequence[int], score: Sequence[float], goal: float, higher_is_better: bool) -> float | None:
@@ -77,19 +76,19 @@ def rows_needed(rows: Sequence[int], score: Sequence[float], goal: float, higher
     return float(np.exp(low + share * (high - low)))
 
 
-def curves(found: Sequence[Mapping[str, Any]], dataset: str, name: str) -> np.ndarray:
+def curves(scores: Sequence[Mapping[str, Any]], dataset: str, name: str) -> np.ndarray:
     """Scores [sizes, seeds] of a data set by a name of `measure`."""
     return np.array(
-        [[one[name] for one in found if (one["dataset"], one["rows"]) == (dataset, n)] for n in ROWS[dataset]]
+        [[entry[name] for entry in scores if (entry["dataset"], entry["rows"]) == (dataset, n)] for n in ROWS[dataset]]
     )
 
 
-def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
+def saved(scores: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Rows of the table: scores of each data set and size, and the rows that joint training needs."""
     lines = []
     for dataset, rows in ROWS.items():
-        task = _task(found, dataset)
-        means = {name: curves(found, dataset, name).mean(axis=1) for name in CURVES}
+        task = _task(scores, dataset)
+        means = {name: curves(scores, dataset, name).mean(axis=1) for name in CURVES}
         for number, n in enumerate(rows):
             shown = ", ".join(f"{name} {means[name][number]:.{task.digits}f}" for name in means)
             needed = rows_needed(rows, means[JOINT], means[RANDOM][number], task.higher_is_better)
@@ -98,22 +97,22 @@ def saved(found: Sequence[Mapping[str, Any]]) -> list[Row]:
     return lines
 
 
-def _task(found: Sequence[Mapping[str, Any]], dataset: str) -> Task:
+def _task(scores: Sequence[Mapping[str, Any]], dataset: str) -> Task:
     """Task of a data set."""
-    return TASKS[next(one["task"] for one in found if one["dataset"] == dataset)]
+    return TASKS[next(entry["task"] for entry in scores if entry["dataset"] == dataset)]
 
 
-def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
+def picture(measured: Sequence[Mapping[str, Any]]) -> Figure:
     """Scores over the number of rows, a panel for each data set: mean and range over seeds."""
     figure = Figure(figsize=(3.4 * len(ROWS), 3.4), layout="constrained", facecolor="white")
     panels = figure.subplots(1, len(ROWS), squeeze=False)[0]
     for axes, (dataset, rows) in zip(panels, ROWS.items(), strict=True):
         for name in CURVES:
-            scores = curves(found, dataset, name)
+            scores = curves(measured, dataset, name)
             (drawn,) = axes.plot(rows, scores.mean(axis=1), marker="o", label=name)
             axes.fill_between(rows, scores.min(axis=1), scores.max(axis=1), alpha=0.2, color=drawn.get_color())
-        axes.plot(rows, curves(found, dataset, IDW).mean(axis=1), "k--", label=IDW)
-        label = _task(found, dataset).label
+        axes.plot(rows, curves(measured, dataset, IDW).mean(axis=1), "k--", label=IDW)
+        label = _task(measured, dataset).label
         axes.set(xscale="log", xticks=rows, xticklabels=rows, xlabel="training rows", ylabel=label, title=dataset)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
@@ -124,17 +123,16 @@ def picture(found: Sequence[Mapping[str, Any]]) -> Figure:
 def main() -> dict[str, Any]:
     """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture.
 
-    Raises:
-        InputError: signal strengths that are not on this machine; the other data are made here.
+    `InputError` for signal strengths that are not on this machine; the other data are made here.
     """
     data_folder(FLAT)
-    place, found = RUNS / fit_key(source_files()), list[dict[str, Any]]()
+    place, scores = RUNS / fit_key(source_files()), list[dict[str, Any]]()
     for seed in SEEDS:
         for dataset, rows in ROWS.items():
             for n in rows:
                 cell, name = Cell(dataset, "official", n), f"{dataset}-{n}-{seed}"
-                one = kept(place / f"{name}.json", partial(measure, cell, seed, place / name))
-                found.append({"dataset": dataset, "rows": n, "seed": seed, **one})
+                entry = kept(place / f"{name}.json", partial(measure, cell, seed, place / name))
+                scores.append({"dataset": dataset, "rows": n, "seed": seed, **entry})
     if PICTURE.parent.is_dir():
-        write_figure(PICTURE, picture(found))
-    return {"rows": saved(found), "scores": found}
+        write_figure(PICTURE, picture(scores))
+    return {"rows": saved(scores), "scores": scores}

@@ -37,34 +37,22 @@ logger = logging.getLogger(__name__)
 
 REPEATS, MOST_S = 7, 8.0
 """Timed calls of each size, and seconds after which no further call begins; three are timed in any case."""
-CALL_S = 100.0
-"""Expected seconds of a call, at growth as n^1.1, beyond which a size is skipped."""
-SLOW_MS, FEW = 4000.0, 2
-"""Milliseconds of a slow call, and timed calls of a slow one, without warm-up."""
-GAUSSIANS, ELEMENTS = 1000, 16
-"""Numbers where another size grows."""
-SMALL = 90
-"""Gaussians of the field that predicts for thousands of transmitters."""
+CALL_S = 100.0  # expected seconds of a call, at growth as n^1.1, beyond which a size is skipped
+SLOW_MS, FEW = 4000.0, 2  # milliseconds of a slow call, and timed calls of a slow one, without warm-up
+GAUSSIANS, ELEMENTS = 1000, 16  # numbers where another size grows
+SMALL = 90  # Gaussians of the field that predicts for thousands of transmitters
 OPTIONS = TraceOptions(depth=2, rays=1 << 14)
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A call whose cost is measured while a size grows.
+    """A call whose cost is measured while a size grows."""
 
-    Attributes:
-        name: name for JSON.
-        title: what is called, for the table.
-        work: what the size counts.
-        sizes: ascending sizes.
-        make: makes the call of a size; its time does not count.
-    """
-
-    name: str
-    title: str
-    work: str
-    sizes: tuple[int, ...]
-    make: Callable[[int], Call]
+    name: str  # name for JSON
+    title: str  # what is called, for the table
+    work: str  # what the size counts
+    sizes: tuple[int, ...]  # ascending sizes
+    make: Callable[[int], Call]  # makes the call of a size; its time does not count
 
 
 def _splat(count: int, height: int = HEIGHT, width: int = WIDTH) -> Call:
@@ -167,9 +155,8 @@ AXES: list[Axis] = [
 def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: float = CALL_S) -> dict[str, Any]:
     """Times and memory of one call at each size.
 
-    Returns:
-        ``sizes`` that were measured, ``left_out``, ``ms`` and ``memory_mb`` of each, and the ``exponent`` of time with
-        its interval and ``limit``, that of n log n at the same sizes.
+    ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time
+    with its interval, ``limit`` that of n log n at the same sizes.
     """
     sizes: list[int] = []
     times: list[Any] = []
@@ -188,7 +175,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         logger.info("%s %d: %.1f ms, %.0f MB", axis.name, size, np.median(times[-1]), memory[-1])
         del call
         gc.collect()
-    found = exponent(sizes, times)
+    growth = exponent(sizes, times)
     return {
         "name": axis.name,
         "title": axis.title,
@@ -197,36 +184,36 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         "left_out": list(axis.sizes[len(sizes) :]),
         "ms": [float(np.median(ms)) for ms in times],
         "memory_mb": memory,
-        "exponent": vars(found),
+        "exponent": vars(growth),
         "limit": n_log_n(sizes),
     }
 
 
-def verdict(found: Interval, limit: float) -> str:
+def verdict(growth: Interval, limit: float) -> str:
     """Whether growth is at most that of the limit; it fails only where its whole interval lies above."""
-    if found.low > limit:
+    if growth.low > limit:
         return "does not hold"
-    return "holds" if found.high <= limit else "holds within its interval"
+    return "holds" if growth.high <= limit else "holds within its interval"
 
 
 def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     """Rows for the benchmark's table."""
-    made = []
-    for one in results:
-        found, sizes = Interval(**one["exponent"]), one["sizes"]
-        kept = sizes[larger_half(len(sizes))]
-        missing = f", {one['left_out'][0]:,} left out: too slow" if one["left_out"] else ""
-        growth = [f"{ms:.3g} ms" for ms in one["ms"]]
-        memory = [f"{mb:.0f}" for mb in one["memory_mb"]]
-        value = f"exponent {found.value:.2f} ({found.low:.2f} to {found.high:.2f}) from {kept[0]:,}"
-        made.append(
+    lines = []
+    for result in results:
+        slope, sizes = Interval(**result["exponent"]), result["sizes"]
+        larger = sizes[larger_half(len(sizes))]
+        missing = f", {result['left_out'][0]:,} left out: too slow" if result["left_out"] else ""
+        growth = [f"{ms:.3g} ms" for ms in result["ms"]]
+        memory = [f"{mb:.0f}" for mb in result["memory_mb"]]
+        value = f"exponent {slope.value:.2f} ({slope.low:.2f} to {slope.high:.2f}) from {larger[0]:,}"
+        lines.append(
             line(
-                f"{sizes[0]:,} to {sizes[-1]:,} {one['work']}, {one['title']}{missing}",
+                f"{sizes[0]:,} to {sizes[-1]:,} {result['work']}, {result['title']}{missing}",
                 f"{value}; {', '.join(growth)}; {', '.join(memory)} MB",
-                f"at most n log n ({one['limit']:.2f}): {verdict(found, one['limit'])}",
+                f"at most n log n ({result['limit']:.2f}): {verdict(slope, result['limit'])}",
             )
         )
-    return made
+    return lines
 
 
 def main() -> dict[str, Any]:

@@ -26,16 +26,12 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 from .comparison import line, room_file
 from .trace import ROOMS, assign
 
-SAME_DIRECTION_RAD = np.radians(3.0)
-SAME_LENGTH_M = 0.05
-"""Tolerances of equal paths: directions at both ends, and length."""
-CLEAR_M = 0.06
-"""Least distance of positions from surfaces, as a noisy wall may lie on the other side of nearer ones."""
-SCANNER_CLEAR_M = 0.4
-SCANNER_HEIGHTS_M = (1.2, 1.8)
-"""Least distance of a scanner from surfaces, and range of its height above the floor."""
-POSES = 6
-"""Number of a scan's poses."""
+SAME_DIRECTION_RAD = np.radians(3.0)  # largest difference of directions of equal paths, at both ends
+SAME_LENGTH_M = 0.05  # and of their lengths
+CLEAR_M = 0.06  # least distance of positions from surfaces, as a noisy wall may lie on the other side of nearer ones
+SCANNER_CLEAR_M = 0.4  # least distance of a scanner from surfaces
+SCANNER_HEIGHTS_M = (1.2, 1.8)  # range of its height above the floor
+POSES = 6  # number of a scan's poses
 
 
 def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, seed: int = 1) -> dict[str, Any]:
@@ -43,11 +39,7 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
 
     Reflections are perfect, two at most, so a path of length d has the power 1 / d^2 up to a constant. Paths of equal
     ends are matched one to one. *Recall* is the share of power of the room's paths that are matched, *precision* that
-    of the made scene's.
-
-    Returns:
-        ``recall`` and ``precision`` of power and of the number of paths, by the number of reflections too, numbers of
-        points, surfaces and paths, seconds and the process's memory.
+    of the made scene's; both are also of the number of paths, and by the number of reflections.
     """
     file = Path(room)
     points, frequency_hz = scanned_points(file, poses, seed=seed)
@@ -60,17 +52,17 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
     with tempfile.TemporaryDirectory() as folder:
         scan = write_arrays(Path(folder) / f"{file.stem}.npz", {"points": points})
         start = time.perf_counter()
-        made = make_scene(scan, Path(folder) / "scene")
+        measured = make_scene(scan, Path(folder) / "scene")
         seconds = time.perf_counter() - start
         memory = peak_memory_mb()
-        other = open_scene(made.folder, frequency_hz)
+        other = open_scene(measured.folder, frequency_hz)
         end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
         options = TraceOptions(depth=2, rays=1 << 20, seed=seed)
         truth, ours = (trace_paths(scene, chosen, end, options).paths for scene in (original, other))
-    found = match(truth, ours)
+    matched = match(truth, ours)
     shares = {
         name: {"power": _power_share(paths, which), "paths": len(which) / max(len(paths), 1)}
-        for name, paths, which in (("recall", truth, found[0]), ("precision", ours, found[1]))
+        for name, paths, which in (("recall", truth, matched[0]), ("precision", ours, matched[1]))
     }
     return {
         "room": file.stem,
@@ -78,13 +70,13 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
         "range_noise_m": RANGE_NOISE_M,
         "outliers": OUTLIERS,
         "poses": poses,
-        "surfaces": made.counts["surfaces"],
+        "surfaces": measured.counts["surfaces"],
         "receivers": len(chosen),
         "paths_room": len(truth),
         "paths_made": len(ours),
         **shares,
         "recall_by_reflections": {
-            depth: _power_share(truth, found[0], truth.bounces == depth)
+            depth: _power_share(truth, matched[0], truth.bounces == depth)
             for depth in range(int(truth.bounces.max(initial=0)) + 1)
         },
         "make_seconds": seconds,
@@ -98,8 +90,8 @@ def match(truth: Paths, ours: Paths) -> tuple[IntArray, IntArray]:
 
     def distances(a: IntArray, b: IntArray) -> list[FloatArray]:
         turned = [
-            np.arccos(np.clip(one[a] @ other[b].T, -1, 1)) / SAME_DIRECTION_RAD
-            for one, other in ((truth.arrival, ours.arrival), (truth.departure, ours.departure))
+            np.arccos(np.clip(mine[a] @ other[b].T, -1, 1)) / SAME_DIRECTION_RAD
+            for mine, other in ((truth.arrival, ours.arrival), (truth.departure, ours.departure))
         ]
         return [np.abs(truth.length_m[a, None] - ours.length_m[None, b]) / SAME_LENGTH_M, *turned]
 
@@ -132,7 +124,7 @@ def spread(places: FloatArray, count: int) -> FloatArray:
     """At most ``count`` of the places [n, 3], each as far as possible from those before (Gonzalez 1985)."""
     chosen = [places[0]]
     while len(chosen) < min(count, len(places)):
-        distance = np.min([np.linalg.norm(places - one, axis=1) for one in chosen], axis=0)
+        distance = np.min([np.linalg.norm(places - place, axis=1) for place in chosen], axis=0)
         chosen.append(places[np.argmax(distance)])
     return np.stack(chosen)
 
@@ -162,10 +154,10 @@ def scans() -> dict[str, Any]:
     rows = [
         line(
             f"{name}, received power on specular paths found again (of that predicted, right)",
-            f"{100 * found['recall']['power']:.1f} % ({100 * found['precision']['power']:.1f} %)",
+            f"{100 * shares['recall']['power']:.1f} % ({100 * shares['precision']['power']:.1f} %)",
             "80 %, aim 90 %",
         )
-        for name, found in figures.items()
+        for name, shares in figures.items()
     ]
     return {"rows": rows, "rooms": figures}
 
@@ -178,10 +170,10 @@ def large_scan() -> dict[str, Any]:
         count = len(cloud)
         del cloud
         start = time.perf_counter()
-        made = make_scene(scan, Path(folder) / "scene")
+        scene = make_scene(scan, Path(folder) / "scene")
         seconds = time.perf_counter() - start
     peak = peak_memory_mb()
     value = f"{seconds:.0f} s, {peak / 1024:.1f} GiB"
     row = line(f"{count / 1e6:.1f} million points of the office", value, "120 s, 4 GiB")
-    figures = {"points": count, "surfaces": made.counts["surfaces"], "seconds": seconds, "peak_memory_mb": peak}
+    figures = {"points": count, "surfaces": scene.counts["surfaces"], "seconds": seconds, "peak_memory_mb": peak}
     return {"rows": [row], **figures}

@@ -27,7 +27,7 @@ from scipy.stats import binomtest, quantile_test
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
-from wrf_mi.runs.sweep import dataset_files
+from wrf_mi.runs.sweep import dataset_files, markdown_table
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
@@ -45,8 +45,7 @@ TABLE_ROWS = (
 )
 """Rows of the tables with all training rows and seed 0, of at most five minutes each."""
 CONFIDENCE = 0.95
-FIELDS = 5
-"""Random fields of the integrator's comparison with splatting, of the 20 that are stored."""
+FIELDS = 5  # random fields of the integrator's comparison with splatting, of the 20 that are stored
 EQUAL, BETTER, WORSE, FAILED, ABSENT = "equal", "better", "worse", "failed", "not on this machine"
 
 
@@ -79,19 +78,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that are measured together.
+    """Figures that are measured together."""
 
-    Attributes:
-        name: name for files and progress.
-        figures: stored figures.
-        measure: function from the folder of runs to the figures' values.
-        present: whether the data are on this machine or can be made here.
-    """
-
-    name: str
-    figures: tuple[Figure, ...]
-    measure: Callable[[Path], Sequence[float]]
-    present: bool = True
+    name: str  # name for files and progress
+    figures: tuple[Figure, ...]  # stored figures
+    measure: Callable[[Path], Sequence[float]]  # function from the folder of runs to the figures' values
+    present: bool = True  # whether the data are on this machine or can be made here
 
 
 def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float]:
@@ -101,8 +93,8 @@ def median_interval(quantiles: Sequence[float], rows: int) -> tuple[float, float
     section 3.2; `scipy.stats.quantile_test`.
     """
     scores = np.interp(np.linspace(0, 1, rows), np.linspace(0, 1, len(quantiles)), quantiles)
-    found = quantile_test(scores, p=0.5).confidence_interval(CONFIDENCE)
-    return float(found.low), float(found.high)
+    interval = quantile_test(scores, p=0.5).confidence_interval(CONFIDENCE)
+    return float(interval.low), float(interval.high)
 
 
 def _stored(name: str) -> dict[str, Any]:
@@ -122,10 +114,10 @@ def _of_table(row: Row) -> Group:
     figure = Figure(name, stored["score"]["median"], low, high, task.higher_is_better)
 
     def again(runs: Path) -> list[float]:
-        found = measure(runs, row)
-        if found["data"] != stored.get("data", found["data"]):
+        measured = measure(runs, row)
+        if measured["data"] != stored.get("data", measured["data"]):
             raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it again")
-        return [found["score"]["median"]]
+        return [measured["score"]["median"]]
 
     return Group(row.name, (figure,), again, available(row.part))
 
@@ -145,8 +137,8 @@ def _integrator() -> Group:
     from .traced import LARGEST_ERROR, LOWEST_SSIM, against_splatted, worst
 
     def again(_: Path) -> list[float]:
-        found = worst(against_splatted(FIELDS))
-        return [found["lowest_ssim"], found["largest_complex_error"]]
+        errors = worst(against_splatted(FIELDS))
+        return [errors["lowest_ssim"], errors["largest_complex_error"]]
 
     stored = _stored("traced-and-splatted")["figures"]["small"]
     words = "Mitsuba integrator against splatting"
@@ -184,9 +176,8 @@ def groups() -> list[Group]:
 def main() -> dict[str, Any]:
     """Measure all sentinels whose data are on this machine, unless this code was measured before.
 
-    Returns:
-        ``rows``: of each figure ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and
-        ``date`` and ``seconds`` of its group; ``failed``: a line, where a figure got worse or was not measured.
+    Rows have, of each figure, ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and
+    ``date`` and ``seconds`` of its group; ``failed`` is a line, where a figure got worse or was not measured.
     """
     known = groups()
     place = RUNS / fit_key(source_files())
@@ -196,9 +187,9 @@ def main() -> dict[str, Any]:
     for count, group in enumerate(known, 1):
         minutes = (time.perf_counter() - begun) / 60
         _say(f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
-        found = _rows(group, place)
-        rows += found
-        for row in found:
+        group_rows = _rows(group, place)
+        rows += group_rows
+        for row in group_rows:
             _say(f"{row['what']}: {row['value']}; stored {row['asked']}")
     return {"rows": rows, **_failure(rows)}
 
@@ -207,14 +198,14 @@ def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
     """Rows of a group, measured or read."""
     if not group.present:
         return [figure.row(None, ABSENT) for figure in group.figures]
-    kept = place / f"{group.name}.json"
+    file = place / f"{group.name}.json"
     try:
-        if not kept.exists():
+        if not file.exists():
             begun = time.perf_counter()
             values = [float(value) for value in group.measure(place)]
             measured = {"values": values, "date": time.strftime("%Y-%m-%d"), "seconds": time.perf_counter() - begun}
-            write_atomically(kept, json.dumps(measured))
-        content = json.loads(kept.read_text())
+            write_atomically(file, json.dumps(measured))
+        content = json.loads(file.read_text())
         more = {"date": content["date"], "seconds": content["seconds"]}
         pairs = zip(group.figures, content["values"], strict=True)
         return [figure.row(value, figure.verdict(value)) | more for figure, value in pairs]
@@ -236,9 +227,9 @@ def _say(text: str) -> None:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of stored and measured figures."""
-    lines = ["| figure | stored | equal within | measured | verdict |", "| --- | --- | --- | --- | --- |"]
+    lines = []
     for row in rows:
         measured = "" if row["measured"] is None else f"{row['measured']:.4g}"
         interval = f"{row['low']:.4g} to {row['high']:.4g}"
-        lines.append(f"| {row['what']} | {row['stored']:.4g} | {interval} | {measured} | {row['verdict']} |")
-    return "\n".join(lines)
+        lines.append([row["what"], f"{row['stored']:.4g}", interval, measured, row["verdict"]])
+    return markdown_table(["figure", "stored", "equal within", "measured", "verdict"], lines)

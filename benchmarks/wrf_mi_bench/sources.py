@@ -20,19 +20,16 @@ from .table_plan import CORRECTED, NAMED
 
 PACKAGES = {"wrf_mi": "", "wrf_mi_bench": "benchmarks", "wrf_mi_plugins": "plugins", "wrf_mi_scenes": "scenes"}
 """Packages of this project, and their folders in a checkout."""
-SOURCE = "source"
-"""Key of the digests in a stored result."""
-DIGITS = 12
-"""Hexadecimal digits of a digest."""
+SOURCE = "source"  # key of the digests in a stored result
+DIGITS = 12  # hexadecimal digits of a digest
 COMMANDS = {
     "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
     "train": ("wrf_mi.cli.train",),
     NAMED: ("wrf_mi_bench.scene",),
-    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.correct"),
+    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.scenes"),
 }
 """Modules behind words of commands that benchmarks run in subprocesses."""
-RUNNER = f"{__package__}.bench"
-"""Lists, runs and stores benchmarks; makes no figure."""
+RUNNER = f"{__package__}.bench"  # lists, runs and stores benchmarks; makes no figure
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -46,14 +43,14 @@ def by_folder(files: Mapping[str, str]) -> dict[str, str]:
     folders: dict[str, dict[str, str]] = {}
     for name, text in sorted(files.items()):
         folders.setdefault(name.rpartition("/")[0], {})[name] = code_digest(text)
-    return {folder: _sha(repr(found)) for folder, found in folders.items()}
+    return {folder: _sha(repr(texts)) for folder, texts in folders.items()}
 
 
 def modules_of_benchmark(module: str) -> tuple[str, ...]:
     """The module of a benchmark, and the modules, commands and models that its strings name, as for subprocesses."""
     file = _file(module)
-    found = () if file is None else ast.walk(_tree(file))
-    texts = sorted({one.value for one in found if isinstance(one, ast.Constant) and isinstance(one.value, str)})
+    nodes = () if file is None else ast.walk(_tree(file))
+    texts = sorted({node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)})
     named = [text for text in texts if text.partition(".")[0] in PACKAGES and _file(text) is not None]
     return (module, *named, *modules_of_command(texts))
 
@@ -77,7 +74,7 @@ def code_digest(text: str) -> str:
 def _plain(node: Any) -> Any:
     # Not `ast.dump`: fields that are empty appear in some versions of Python only.
     if isinstance(node, list):
-        return [_plain(one) for one in node]
+        return [_plain(item) for item in node]
     if not isinstance(node, ast.AST):
         return node
     fields = dict(ast.iter_fields(node))
@@ -88,20 +85,20 @@ def _plain(node: Any) -> Any:
 
 def needed_files(*modules: str) -> dict[str, Path]:
     """Files of modules and of all that they import, by package and path."""
-    found: dict[str, Path] = {}
-    left, own = list(modules), {*PACKAGES, *(module.partition(".")[0] for module in modules)}
-    seen = {RUNNER}
+    files: dict[str, Path] = {}
+    left, packages = list(modules), {*PACKAGES, *(module.partition(".")[0] for module in modules)}
+    visited = {RUNNER}
     while left:
         module = left.pop()
-        if module in seen or module.partition(".")[0] not in own:
+        if module in visited or module.partition(".")[0] not in packages:
             continue
-        seen.add(module)
+        visited.add(module)
         if (file := _file(module)) is None:
             continue
         name = module.replace(".", "/")
-        found[f"{name}/__init__.py" if file.name == "__init__.py" else f"{name}.py"] = file
+        files[f"{name}/__init__.py" if file.name == "__init__.py" else f"{name}.py"] = file
         left += [module.rpartition(".")[0], *_imports(file, module)]
-    return found
+    return files
 
 
 @cache
@@ -127,12 +124,12 @@ def _imports(file: Path, module: str) -> tuple[str, ...]:
     # Functions of a package's first file call for users what modules below import where they need it.
     first = file.name == "__init__.py"
     package = module if first else module.rpartition(".")[0]
-    found: list[str] = []
+    modules: list[str] = []
     for node in _tree(file).body if first else ast.walk(_tree(file)):
         if isinstance(node, ast.Import):
-            found += [name.name for name in node.names]
+            modules += [name.name for name in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
             base = ".".join([*above, *([node.module] if node.module else [])])
-            found += [base, *(f"{base}.{name.name}" for name in node.names)]
-    return tuple(found)
+            modules += [base, *(f"{base}.{name.name}" for name in node.names)]
+    return tuple(modules)

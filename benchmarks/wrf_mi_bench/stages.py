@@ -3,6 +3,10 @@
 Each cell is a run of the hybrid and one of each part on the same rows. Scores are compared row by row; a part is
 *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
 is measured (`wrf_mi_bench.comparison.stored_part`).
+
+The benchmark of intervals counts test values inside the 90 % intervals of three models. Standard deviations are those
+of errors on training rows that are held out in space: the hybrid has its own, other models are fitted once more, as
+``wrf-mi train --intervals`` does.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
@@ -35,8 +40,7 @@ from .tables import meshed_scan, scene_of
 
 RUNS = Path("runs/bench/stages")
 LAB, CHANNELS = "laboratory", "random-room"
-CHANNELS_SEED = 12
-"""Seed of the room of `CHANNELS`: none of `wrf_mi_bench.rooms`."""
+CHANNELS_SEED = 12  # seed of the room of `CHANNELS`: none of `wrf_mi_bench.rooms`
 ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
     (RFID, "official"): (5, 15, 48, None),
     (RFID, "blocked"): (None,),
@@ -49,13 +53,10 @@ ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
 """Numbers of training rows by data set and split; None: all."""
 LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
 """Largest loss against a part that is allowed, in the unit of the score."""
-WORSE_SHARE = 0.02
-"""Largest share of comparisons in which the hybrid may be clearly worse."""
-INSIDE = (0.85, 0.95)
-"""Limits of the share of test values inside the 90 % intervals."""
+WORSE_SHARE = 0.02  # largest share of comparisons in which the hybrid may be clearly worse
+INSIDE = (0.85, 0.95)  # limits of the share of test values inside the 90 % intervals
 HYBRID, JOINT, CALIBRATED = "hybrid", "wrf-gs+", "ray-tracing, calibrated"
-TRANSMISSION = ("transmission=true",)
-"""Waves pass the slabs of a scene, furniture among them."""
+TRANSMISSION = ("transmission=true",)  # waves pass the slabs of a scene, furniture among them
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,13 @@ class Cell:
 
 
 CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
+INTERVAL_CELLS = tuple(
+    Cell(dataset, split, n_train)
+    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CHANNELS: None}.items()
+    for split in ("official", "blocked")
+)
+INTERVAL_MODELS = ("kriging", JOINT, HYBRID)
+"""Models; Gaussians are trained jointly with the paths of the scene where there is one."""
 
 
 def scene_of_cell(cell: Cell, folder: Path) -> str | None:
@@ -129,15 +137,15 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
     block = TASKS[hybrid.task].block
     figures = []
     for name, run in {HYBRID: hybrid, **others}.items():
-        one = {"model": name, "score": run.metrics[block], "block": block}
+        figure = {"model": name, "score": run.metrics[block], "block": block}
         keys = ("train_seconds", "inside_90", "crps", "ms_per_sample")
-        one |= {key: run.metrics.get(key) for key in keys}
+        figure |= {key: run.metrics.get(key) for key in keys}
         if name == HYBRID:
-            one["stages"] = run.metrics["stages"]
+            figure["stages"] = run.metrics["stages"]
         else:
             gain = bootstrap(differences(hybrid, run), statistic=np.mean)
-            one |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
-        figures.append(one)
+            figure |= {"gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
+        figures.append(figure)
     return figures
 
 
@@ -178,26 +186,26 @@ def measured(cell: Cell, folder: Path) -> dict[str, Any]:
 def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the table: the hybrid, then each part with the hybrid's gain over it."""
     rows = []
-    for one in figures:
-        score, inside = one["score"], one["inside_90"]
+    for part in figures:
+        score, inside = part["score"], part["inside_90"]
         value = f"median {score['median']:.4g}, mean {score['mean']:.4g}"
-        value += "" if inside is None else f", {inside:.0%} inside, CRPS {one['crps']:.3g}"
+        value += "" if inside is None else f", {inside:.0%} inside, CRPS {part['crps']:.3g}"
         asked = "85 to 95 % inside"
-        if "gain" in one:
-            limit = LIMITS[one["block"]]
-            interval = f"{one['gain_low']:.3g} to {one['gain_high']:.3g}"
-            asked = f"hybrid better by {one['gain']:.3g} ({interval}), at most {limit} worse"
-        rows.append({"what": f"{cell.title}: {one['model']}", "value": value, "asked": asked, **one, "cell": cell.name})
+        if "gain" in part:
+            limit = LIMITS[part["block"]]
+            interval = f"{part['gain_low']:.3g} to {part['gain_high']:.3g}"
+            asked = f"hybrid better by {part['gain']:.3g} ({interval}), at most {limit} worse"
+        rows.append(
+            {"what": f"{cell.title}: {part['model']}", "value": value, "asked": asked, **part, "cell": cell.name}
+        )
     return rows
 
 
 def main() -> dict[str, Any]:
     """Measure all cells that are not stored; `InputError` where data are not on this machine.
 
-    Returns:
-        ``rows``; ``worse``: number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside``:
-        number of runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; and ``failed``, where a limit is
-        exceeded.
+    ``worse`` is the number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside`` that of
+    runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; ``failed`` is there where a limit is exceeded.
     """
     for name in (RFID, FLAT):
         data_folder(name)
@@ -225,26 +233,15 @@ def stages_text(stages: Sequence[Mapping[str, Any]]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table, a line for each cell: the hybrid, its stages, its best part by mean score, kriging and IDW."""
-    head = (
-        "data",
-        "hybrid",
-        "inside",
-        "CRPS",
-        "stages, held-out score",
-        "best part alone",
-        "gain over it",
-        "kriging",
-        "IDW",
-        "clearly worse than",
-    )
-    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+    head = ["data", "hybrid", "inside", "CRPS", "stages, held-out score", "best part alone", "gain over it"]
+    lines = []
     for cell in dict.fromkeys(row["cell"] for row in rows):
         hybrid, *others = (row for row in rows if row["cell"] == cell)
         medians = {row["model"]: f"{row['score']['median']:.3g}" for row in others}
         best = min(others, key=lambda row: row["gain"])
         worse = [row["model"] for row in others if row["gain_high"] < 0]
         inside, crps = hybrid["inside_90"], hybrid["crps"]
-        cells = (
+        cells = [
             hybrid["what"].rpartition(":")[0],
             f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
             "" if inside is None else f"{inside:.0%}",
@@ -254,9 +251,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
             *(medians.get(name, "") for name in ("kriging", "idw")),
             ", ".join(worse),
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        ]
+        lines.append(cells)
+    return markdown_table([*head, "kriging", "IDW", "clearly worse than"], lines)
 
 
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -265,13 +262,60 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     beyond = [row for row in pairs if row["gain"] < -LIMITS[row["block"]]]
     hybrids = [row for row in rows if "gain" not in row and row["inside_90"] is not None]
     inside = [row for row in hybrids if INSIDE[0] <= row["inside_90"] <= INSIDE[1]]
-    counts: dict[str, Any] = {
-        "comparisons": len(pairs),
-        "worse": len(worse),
-        "cells": len(hybrids),
-        "inside": len(inside),
-    }
+    counts: dict[str, Any] = {"comparisons": len(pairs), "worse": len(worse)}
+    counts |= {"cells": len(hybrids), "inside": len(inside)}
     if len(worse) > WORSE_SHARE * len(pairs) or beyond:
         text = f"clearly worse than a part alone in {len(worse)} of {len(pairs)} comparisons"
         counts["failed"] = f"{text}, by more than the limit in {len(beyond)}"
     return counts
+
+
+def measured_intervals(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
+    """Score, share inside the 90 % intervals, CRPS and time of training of a model, as they are stored."""
+    data, scene = data_of(cell, folder)
+    if name == HYBRID:
+        run = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
+    else:
+        run = run_alone(cell, data, folder, name, scene, intervals=True)
+    block = TASKS[run.task].block
+    return {"block": block, "score": run.metrics[block]} | {
+        key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")
+    }
+
+
+def intervals() -> dict[str, Any]:
+    """Measure all runs that are not stored; `InputError` where data are not on this machine.
+
+    ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` states where some do not.
+    """
+    for name in (RFID, FLAT):
+        data_folder(name)
+    place = RUNS / fit_key(source_files())
+    place.mkdir(parents=True, exist_ok=True)
+    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    for cell in INTERVAL_CELLS:
+        for name in INTERVAL_MODELS:
+            print(f"intervals: {cell.title}: {name}", file=sys.stderr, flush=True)
+            part = stored_part(
+                "intervals", f"{cell.name}-{name}", partial(measured_intervals, cell, name, place / cell.name)
+            )
+            parts.append(part)
+            value = f"{part['inside_90']:.1%} inside, CRPS {part['crps']:.3g}"
+            known = {key: part[key] for key in ("inside_90", "crps", "score")}
+            row = {"what": f"{cell.title}: {name}", "value": value, "asked": "85 to 95 % inside"}
+            rows.append({**row, **known, "cell": cell.title, "model": name})
+            print(f"intervals: {row['what']}: {value}", file=sys.stderr, flush=True)
+    inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
+    result = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
+    if inside < len(rows):
+        result["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
+    return result
+
+
+def interval_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table, a line for each data set and split: share inside and CRPS of each model."""
+    lines = []
+    for cell in dict.fromkeys(row["cell"] for row in rows):
+        known = {row["model"]: f"{row['inside_90']:.0%}, {row['crps']:.3g}" for row in rows if row["cell"] == cell}
+        lines.append([cell, *(known.get(name, "") for name in INTERVAL_MODELS)])
+    return markdown_table(["data", *INTERVAL_MODELS], lines)

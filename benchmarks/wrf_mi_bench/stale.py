@@ -25,23 +25,17 @@ from .quick import FILE as QUICK
 from .sources import PACKAGES, SOURCE, by_folder, modules_of_benchmark, modules_of_command, needed_files, source_digests
 from .tables import FOLDER
 
-UNKNOWN = "unknown"
-"""Source of a result that states none, outside a git repository."""
-SHOWN = 4
-"""Changed folders in a line; ``--json`` has all."""
+UNKNOWN = "unknown"  # source of a result that states none, outside a git repository
+SHOWN = 4  # changed folders in a line; ``--json`` has all
 
 
 def stale(out: Path) -> tuple[list[dict[str, Any]], int]:
     """Results in ``out`` whose source has changed or is unknown, and the number of all results.
 
-    Returns:
-        ``name``, ``date``, ``command``, which measures it anew, and ``changed``: folders of source files, or `UNKNOWN`.
-        The number of results.
-
-    Raises:
-        InputError: a result that cannot be read.
+    A result has ``name``, ``date``, ``command``, which measures it anew, and ``changed``: folders of source files, or
+    `UNKNOWN`. `InputError` for a result that cannot be read.
     """
-    history, found, count = History(out), [], 0
+    history, older, count = History(out), [], 0
     digests = cache(lambda modules: source_digests(*modules))
     for path, result, modules, command in results(out):
         count += 1
@@ -51,8 +45,8 @@ def stale(out: Path) -> tuple[list[dict[str, Any]], int]:
         changed = sorted(name for name in {*now, *(before or {})} if before and before.get(name) != now.get(name))
         if changed or not before:
             name = path.relative_to(out).with_suffix("").as_posix()
-            found.append({"name": name, "date": date, "command": command, "changed": changed or UNKNOWN})
-    return found, count
+            older.append({"name": name, "date": date, "command": command, "changed": changed or UNKNOWN})
+    return older, count
 
 
 def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], str]]:
@@ -74,28 +68,24 @@ def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], 
             yield path, content, modules_of(folder), f"rm {path}; wrf-mi bench {folder}"
 
 
-def stale_lines(found: Sequence[Mapping[str, Any]], count: int) -> str:
+def stale_lines(older: Sequence[Mapping[str, Any]], count: int) -> str:
     """A line for each result, and their number."""
     lines = []
-    for one in found:
-        folders = [UNKNOWN] if one["changed"] == UNKNOWN else one["changed"]
+    for item in older:
+        folders = [UNKNOWN] if item["changed"] == UNKNOWN else item["changed"]
         more = f" and {len(folders) - SHOWN} more" if len(folders) > SHOWN else ""
-        lines.append(f"{one['name']}: {one['date']}; {one['command']}; changed: {', '.join(folders[:SHOWN])}{more}")
-    unknown = sum(one["changed"] == UNKNOWN for one in found)
+        lines.append(f"{item['name']}: {item['date']}; {item['command']}; changed: {', '.join(folders[:SHOWN])}{more}")
+    unknown = sum(item["changed"] == UNKNOWN for item in older)
     return "\n".join(
-        [*lines, f"{len(found) - unknown} of {count} results are older than their source, {unknown} unknown"]
+        [*lines, f"{len(older) - unknown} of {count} results are older than their source, {unknown} unknown"]
     )
 
 
 @dataclass
 class History:
-    """Commits of the git repository of a folder; none where it is in no repository.
+    """Commits of the git repository of a folder; none where it is in no repository."""
 
-    Attributes:
-        folder: a folder of results.
-    """
-
-    folder: Path
+    folder: Path  # a folder of results
     _texts: dict[str, dict[str, str]] = field(default_factory=dict)
     _digests: dict[tuple[str, ...], dict[str, str]] = field(default_factory=dict)
 
@@ -121,16 +111,16 @@ class History:
         """The last commit of a file on its date, as later ones may have changed its layout, or else of anything."""
         until = f"--until={date}T23:59:59"
         for more in (["--", str(path.resolve())], []):
-            if found := self._git("log", "-1", "--format=%H", until, *more).decode().strip():
-                return found
+            if commit := self._git("log", "-1", "--format=%H", until, *more).decode().strip():
+                return commit
         return ""
 
     def _python_files(self, commit: str) -> dict[str, str]:
         root = self._git("rev-parse", "--show-toplevel").decode().strip()
         packed = self._git("-C", root, "archive", "--format=tar", commit)  # in a folder below, of that folder alone
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
-            files = [one for one in archive if one.isfile() and one.name.endswith(".py")]
-            return {one.name: stream.read().decode() for one in files if (stream := archive.extractfile(one))}
+            files = [member for member in archive if member.isfile() and member.name.endswith(".py")]
+            return {member.name: stream.read().decode() for member in files if (stream := archive.extractfile(member))}
 
     def _git(self, *words: str) -> bytes:
         """Output of git in the folder; nothing where it fails or is not installed."""

@@ -23,15 +23,13 @@ from wrf_mi.training.trainer import Trainer
 from .bench import BenchFailed
 from .stress_curves import curves, draw
 from .stress_fields import HARD, HARDEST, RECEIVER, SMALL, cases, gradient_row, image_row, layers, made, ordinary
-from .stress_joint import CANCELLING, COPLANAR, joint
+from .stress_joint import CANCELLING, COPLANAR, joint, phases
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
 from .stress_receivers import derivatives, of_fields, of_paths
 from .stress_rows import DOUBLE, EXACT, FITS, NEITHER, Row, Worst, held
-from .stress_traced import phases
 
-PICTURE = Path("docs/images/numerics.png")
-"""Picture of the error curves, written only in a checkout of the project."""
+PICTURE = Path("docs/images/numerics.png")  # picture of the error curves, written only in a checkout of the project
 SHORT = (
     *("steps=25", "log_every=25", "validate_every=25", "checkpoint_every=6"),
     *("initial.gaussians=12", "density.every=0", "optimiser.warm_up=0"),
@@ -165,21 +163,21 @@ PARTS: Sequence[tuple[Callable[..., list[Row]], tuple[Any, ...], tuple[Any, ...]
 
 def main() -> dict[str, Any]:
     """All rows at full size, and a picture of error curves."""
-    rows = [one for part, full, _ in PARTS for one in part(*full)]
-    found = curves()
+    rows = [row for part, full, _ in PARTS for row in part(*full)]
+    errors = curves()
     if PICTURE.parent.is_dir():
-        draw(found, PICTURE)
-    return {"rows": rows, "curves": found}
+        draw(errors, PICTURE)
+    return {"rows": rows, "curves": errors}
 
 
 def quick_rows() -> list[Row]:
     """A few cases of each row."""
-    return [one for part, _, few in PARTS for one in part(*few)]
+    return [row for part, _, few in PARTS for row in part(*few)]
 
 
 def quick() -> dict[str, Any]:
     """`quick_rows`; `BenchFailed` where a bound is not kept."""
     rows = quick_rows()
-    if missed := [f"{one['what']}: {one['value']}, asked {one['asked']}" for one in rows if not held(one)]:
+    if missed := [f"{row['what']}: {row['value']}, asked {row['asked']}" for row in rows if not held(row)]:
         raise BenchFailed(f"bench stress --quick: {'; '.join(missed)}")
     return {"rows": rows}

@@ -78,7 +78,7 @@ def _medians(
     error: Callable[[Field, str, int], float],
 ) -> list[float]:
     families: list[Any] = [{"": lambda rng, x=x: family(float(x), rng)} for x in values]
-    return [float(np.median([error(*case[1:]) for case in cases(given, SEEDS)])) for given in families]
+    return [float(np.median([error(*case[1:]) for case in cases(family_of_x, SEEDS)])) for family_of_x in families]
 
 
 def _similarity(contrast: float) -> float:
@@ -91,7 +91,7 @@ def _similarity(contrast: float) -> float:
     return float(np.median(errors))
 
 
-def draw(found: Curves, out: Path) -> None:
+def draw(by_stage: Curves, out: Path) -> None:
     """Write a picture with a panel for each stage and its bound as a dashed line."""
     from matplotlib.figure import Figure
 
@@ -104,9 +104,9 @@ def draw(found: Curves, out: Path) -> None:
     )
     figure = Figure(figsize=(15, 3.4), layout="constrained")
     for axes, (name, across, up, bound) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        for label, values in found[name].items():
+        for label, values in by_stage[name].items():
             if label != "x":
-                axes.loglog(found[name]["x"], np.maximum(values, 1e-13), "o-", markersize=3, label=label)
+                axes.loglog(by_stage[name]["x"], np.maximum(values, 1e-13), "o-", markersize=3, label=label)
         axes.axhline(bound, color="0.5", linestyle="--", linewidth=1)
         axes.set(xlabel=across, ylabel=up)
         axes.legend(fontsize=7)

@@ -36,8 +36,7 @@ Family = Callable[[Rng], "Field"]
 RECEIVER = Receiver(
     "receiver", np.array([5.0, 0.25, 0.125]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
-SIZE, SMALL = (30, 60), (8, 16)
-"""Rows and columns of an image; of one with tens of thousands of layers."""
+SIZE, SMALL = (30, 60), (8, 16)  # rows and columns of an image; of one with tens of thousands of layers
 ON_THE_EDGE = 1e-3
 """Relative distance to a footprint's edge, where it jumps by 0.011, within which pixels are not compared."""
 
@@ -64,8 +63,8 @@ class Field:
         return {"position": self.position_m, "scale": self.scale_m, "rotation": self.rotation} | pairs
 
 
-def made(count: int, rng: Rng, **given: Any) -> Field:
-    """Random field around `RECEIVER`; ``given`` arrays replace drawn ones."""
+def made(count: int, rng: Rng, **replaced: Any) -> Field:
+    """Random field around `RECEIVER`; ``replaced`` arrays replace drawn ones."""
     values: dict[str, Any] = {
         "position_m": placed(rng.uniform(0, 2 * np.pi, count), np.arcsin(rng.uniform(-0.1, 1, count)), rng),
         "scale_m": np.exp(rng.normal(np.log(0.4), 0.5, (count, 3))),
@@ -74,7 +73,7 @@ def made(count: int, rng: Rng, **given: Any) -> Field:
         "opacity": rng.uniform(0, 1, count),
         "attenuation": np.sqrt(rng.uniform(0, 1, count)) * np.exp(2j * np.pi * rng.uniform(0, 1, count)),
     }
-    return Field(**{name: _held_by_float32(value) for name, value in (values | given).items()})
+    return Field(**{name: _held_by_float32(value) for name, value in (values | replaced).items()})
 
 
 def ordinary(rng: Rng) -> Field:
@@ -136,11 +135,11 @@ HARDEST = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in dep
 """Families whose derivatives the quick form compares."""
 
 
-def layers(rng: Rng, count: int = 50_000, **given: Any) -> Field:
+def layers(rng: Rng, count: int = 50_000, **replaced: Any) -> Field:
     """Gaussians behind each other, whose transmittance underflows in float32."""
     position_m = placed(rng.normal(1, 0.005, count), rng.normal(0.7, 0.005, count), rng)
     distance = np.linalg.norm(position_m - RECEIVER.position_m, axis=1)
-    return made(count, rng, position_m=position_m, scale_m=np.tile(0.1 * distance[:, None], 3), **given)
+    return made(count, rng, position_m=position_m, scale_m=np.tile(0.1 * distance[:, None], 3), **replaced)
 
 
 def image(field: Field, blending: str, size: Size) -> ComplexArray:
@@ -148,6 +147,12 @@ def image(field: Field, blending: str, size: Size) -> ComplexArray:
     plane = perception_plane(*size, mi.Float)
     re, im = splat(on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
     return (re.numpy().astype(float) + 1j * im.numpy()).reshape(size)
+
+
+def off_edges(squared: FloatArray, cosine: FloatArray) -> NDArray[np.bool_]:
+    """Mask of directions off the edge of a footprint, where float32 may fall on the other side of the jump."""
+    inside = (np.abs(np.sqrt(squared) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
+    return np.asarray(inside & (np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE))
 
 
 def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> tuple[ComplexArray, NDArray[np.bool_]]:
@@ -160,14 +165,10 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
         directions = np.concatenate([directions, directions * [1, -1, -1]])
     parts = (field.position_m, field.scale_m, field.rotation)
     last = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
-    seen = field_oracle.project(*parts, RECEIVER)
+    projection = field_oracle.project(*parts, RECEIVER)
     clear = np.ones(directions.shape[:2], bool)
-    for i in seen.order:
-        cosine = directions @ seen.direction[i]
-        point = directions @ seen.basis[i].T / np.where(cosine > MIN_COSINE, cosine, 1)[..., None]
-        reach = np.sqrt(np.einsum("...i,ij,...j->...", point, np.linalg.inv(seen.covariance[i]), point))
-        clear &= (np.abs(reach - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
-        clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
+    for i in projection.order:
+        clear &= off_edges(*field_oracle.reach(projection, i, directions))
     return field_oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 
@@ -242,8 +243,8 @@ def image_row(
     worst, edge, pixels, number = Worst(), 0, 0, 0
     for name, field, blending, _ in cases(families, count):
         expected, clear = truth(field, blending, size)
-        found = render(field, blending, size)
-        error = relative((found - expected)[clear], expected) if np.isfinite(found).all() else np.nan
+        rendered = render(field, blending, size)
+        error = relative((rendered - expected)[clear], expected) if np.isfinite(rendered).all() else np.nan
         worst.add(error, name)
         number, edge, pixels = number + 1, edge + int((~clear).sum()), pixels + clear.size
     more = f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out"
@@ -252,25 +253,20 @@ def image_row(
 
 def gradient_row(
     what: str,
-    given: Iterable[tuple[str, Field, str, int]],
+    tried: Iterable[tuple[str, Field, str, int]],
     report: Report | None = None,
     single: Slope | None = None,
     least: int = 1,
 ) -> Row:
-    """Row of derivatives in float32 compared with float64.
+    """Row of derivatives in float32, by ``single`` or else `gradient`, compared with float64.
 
-    Args:
-        what: beginning of the row.
-        given: cases.
-        report: differentiated arrays, see `gradient`.
-        single: derivatives in float32; None: `gradient`.
-        least: number of Gaussians below which a case is skipped.
+    Arrays of ``report`` are differentiated, see `gradient`; cases with fewer than ``least`` Gaussians are skipped.
     """
     worst, number = GradientWorst(), 0
-    for name, field, blending, seed in given:
+    for name, field, blending, seed in tried:
         if len(field.signal) >= least:
-            found = single(field, blending, seed) if single else gradient(field, blending, mi.Float, seed, report)
+            slopes = single(field, blending, seed) if single else gradient(field, blending, mi.Float, seed, report)
             double = gradient(field, blending, DOUBLE, seed, report)
-            worst.add(found, double, felt_values(field, blending), name)
+            worst.add(slopes, double, felt_values(field, blending), name)
             number += 1
     return worst.row(f"{what}, {number} cases")

@@ -1,4 +1,6 @@
-"""Joint graph of paths and Gaussians, values and derivatives, float32 compared with float64.
+"""Traced paths, alone and together with Gaussians, values and derivatives, float32 compared with float64.
+
+Phases and delays of traced paths are compared with mirror images in closed form.
 
 Reports and derivatives of a random functional by every parameter are compared. The reference for paths is
 `stress_oracle` in NumPy with central differences, that for Gaussians the same code in float64. Errors of RSSI and CSI
@@ -30,17 +32,22 @@ from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.tracing import TraceOptions, open_scene
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.paths.instrument_parameters import pattern_name, receiver_pose
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
+from .stress_fields import RECEIVER
 from .stress_oracle import ComplexArray, OraclePaths, ReportOracle, TracedOracle, Values, report_error, slopes
-from .stress_rows import DOUBLE, GRADIENT, IMAGE, GradientWorst, Row, Worst
-from .stress_traced import box_sheets
+from .stress_rows import DOUBLE, GRADIENT, IMAGE, PHASE, GradientWorst, Row, Worst, row
 
+DELAY = 1e-6  # bound on the relative error of Sionna RT's delays: 17 roundings of float32
+HALLS: tuple[tuple[float, tuple[float, float, float]], ...] = (
+    (28e9, (100.0, 60.0, 12.0)),
+    (915e6, (10_000.0, 4_000.0, 300.0)),
+)
+"""Carrier and size in metres."""
 HZ = 920e6
-ROOM = (6.0, 5.0, 3.0)
-"""Size of the room in metres."""
+ROOM = (6.0, 5.0, 3.0)  # size of the room in metres
 WAVENUMBER = 2 * np.pi * HZ / speed_of_light
 SIZE = (8, 24)
 ELEMENTS_M = planar_array(3, 3, 0.16)
@@ -53,12 +60,9 @@ MODELS: Mapping[str, Any] = {
 ORACLE = ReportOracle(SIZE, ELEMENTS_M, HZ)
 KINDS = ("itu_concrete", "itu_brick", "itu_plasterboard", "itu_glass", "itu_wood", "itu_metal")
 THICKNESS_M = {"itu_concrete": 0.3, "itu_metal": 0.1, **dict.fromkeys(KINDS[1:5], 0.02), "itu_chipboard": 0.02}
-GRAZING_M = 1e-3
-"""Height of both antennas above the floor: 4e-4 rad at 5 m."""
-LEFT = 0.01
-"""Remaining share of the traced side where the learned side cancels it."""
-MANY = 160
-"""Transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths."""
+GRAZING_M = 1e-3  # height of both antennas above the floor: 4e-4 rad at 5 m
+LEFT = 0.01  # remaining share of the traced side where the learned side cancels it
+MANY = 160  # transmitters, each with the 63 paths of up to three reflections in a box: 10,080 paths
 STEP = 1e-5
 """Step of differences of the paths in natural steps (`_natural`): a tilt of 1e-5 rad is 1e-3 rad of phase 5 m away."""
 PLACE = Receiver(
@@ -68,8 +72,7 @@ PLACE = Receiver(
     Antenna(frame="array"),
 )
 """Receiver whose antenna turns with its array, so that reports depend on the rotation."""
-NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])
-"""Two transmitters."""
+NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])  # two transmitters
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 
@@ -79,25 +82,15 @@ Parts = dict[str, tuple[str, Mesh]]
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned geometry.
+    """An ill-conditioned geometry."""
 
-    Attributes:
-        parts: parts of the scene beside the room.
-        receiver: receiver from which paths are searched.
-        tx_pos_m: positions of transmitters [n, 3].
-        options: options of the search.
-        values: given parameters by name.
-        cancels: whether the traced side's gain cancels the learned side at the first transmitter.
-        moved: whether planes are shifted by millimetres and tilted by 0.01 rad.
-    """
-
-    parts: Parts = field(default_factory=dict)
-    receiver: Receiver = PLACE
-    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)
-    options: TraceOptions = TWO_BOUNCES
-    values: Mapping[str, FloatArray] = field(default_factory=dict)
-    cancels: bool = False
-    moved: bool = True
+    parts: Parts = field(default_factory=dict)  # parts of the scene beside the room
+    receiver: Receiver = PLACE  # receiver from which paths are searched
+    tx_pos_m: FloatArray = field(default_factory=lambda: NEAR_M)  # positions of transmitters [n, 3]
+    options: TraceOptions = TWO_BOUNCES  # options of the search
+    values: Mapping[str, FloatArray] = field(default_factory=dict)  # given parameters by name
+    cancels: bool = False  # whether the traced side's gain cancels the learned side at the first transmitter
+    moved: bool = True  # whether planes are shifted by millimetres and tilted by 0.01 rad
 
 
 CASES: Mapping[str, Case] = {
@@ -168,8 +161,8 @@ class _Joint:
 
     def _cancel(self) -> None:
         name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
-        here = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
-        factor = -wave / here * (1 + LEFT)
+        traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
+        factor = -wave / traced_wave * (1 + LEFT)
         gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
         self._values = _rounded({**self._values, name: gain})
 
@@ -188,9 +181,9 @@ class _Joint:
         steps = {key: STEP * _natural(key) for key in self._values if not key.startswith("field.")}
         of_paths = slopes(functionals, self._values, steps)
         for number, (kind, reference) in enumerate(references.items()):
-            found, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
+            report, single = self._by_graph(MODELS[kind], weights[kind], mi.Float)
             _, double = self._by_graph(MODELS[kind], weights[kind], DOUBLE, learned_alone=True)
-            value.add(reference.error(found, paths), kind)
+            value.add(reference.error(report, paths), kind)
             truth = {key: part + (of_paths[key][number] if key in steps else 0) for key, part in double.items()}
             slope.add(single, truth, {key: self._felt(key) for key in truth}, kind)
         what = f"{name}, {int(self._traced.exists.sum())} paths, {len(references)} cases"
@@ -226,8 +219,8 @@ class _Joint:
         paths = self._traced({name: dr.detach(p) for name, p in params.items()} if learned_alone else params)
         report = model(paths, self._learned(model, params, kind))
         dr.backward(dr.sum(report * on_device(weight, kind)))
-        found = dr.detach(report).numpy().astype(float)
-        return found, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
+        values = dr.detach(report).numpy().astype(float)
+        return values, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
 
 
 class _Reference:
@@ -243,10 +236,10 @@ class _Reference:
             ports = np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz)
         return ORACLE.report(model, paths.at(*ports), self._there)
 
-    def error(self, found: FloatArray, paths: OraclePaths) -> float:
+    def error(self, report: FloatArray, paths: OraclePaths) -> float:
         """Error of a report."""
         waves = np.abs(paths.gain).reshape(len(self._there), -1).sum(axis=1) + np.abs(self._there).max(axis=1)
-        return report_error(self._model, found, self.report(paths), waves)
+        return report_error(self._model, report, self.report(paths), waves)
 
 
 def _natural(name: str) -> float:
@@ -262,3 +255,82 @@ def _tensor(value: FloatArray, kind: Any) -> Any:
 
 def _rounded(values: Values) -> dict[str, FloatArray]:
     return {name: np.asarray(value, np.float32).astype(float) for name, value in values.items()}
+
+
+def box_sheets(size_m: tuple[float, float, float]) -> dict[str, Any]:
+    """Meshes of the six sides of a box."""
+    spans = [(0.0, side) for side in size_m]
+    return {
+        f"{axis}{at:g}": sheet(axis, at, *(span for other, span in enumerate(spans) if other != axis))
+        for axis in range(3)
+        for at in (0.0, size_m[axis])
+    }
+
+
+def phases(count: int = 30) -> list[Row]:
+    """Rows of traced phases and of Sionna RT's float32 delays, compared with mirror images in closed form."""
+    return [row for frequency_hz, size_m in HALLS for row in _phases(frequency_hz, size_m, count)]
+
+
+def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int) -> list[Row]:
+    """Rows of a metal hall with up to two reflections."""
+    rng = np.random.default_rng(0)
+    tx, rx = rng.uniform(0.1, 0.9, (count, 3)) * size_m, rng.uniform(0.1, 0.9, 3) * size_m
+    with tempfile.TemporaryDirectory() as work:
+        parts = {name: ("itu_metal", wall) for name, wall in box_sheets(size_m).items()}
+        scene = open_scene(write_scene(Path(work), parts, "Hall of metal"), frequency_hz)
+        options = TraceOptions(depth=2, rays=1 << 14)
+        paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
+        delays_s = _sionna_delays(scene, tx, rx)
+    worst, single, delay = Worst(), Worst(), Worst()
+    metres, counted = 0.0, 0
+    for index, position_m in enumerate(tx):
+        lengths_m, exact = np.sort(paths.length_m[paths.tx == index]), _mirror_images(position_m, rx, np.array(size_m))
+        theirs = speed_of_light * delays_s[index]
+        for lengths, errors in ((lengths_m, worst), (lengths_m.astype(np.float32), single)):
+            errors.add(np.abs(lengths - exact).max() if len(lengths) == len(exact) else np.inf)
+        # Sionna RT finds some paths of large halls two or three times, by both triangles of a wall.
+        off = np.abs(theirs[:, None] - exact) if len(theirs) else np.full((1, len(exact)), np.inf)
+        counted += len(theirs)
+        metres = max(metres, float(off.min(axis=0).max()), float(off.min(axis=1).max()))
+        delay.add(max((off.min(axis=0) / exact).max(), (off / exact).min(axis=1).max()))
+    wavenumber = 2 * np.pi * frequency_hz / speed_of_light
+    where = f"{frequency_hz / 1e9:g} GHz in {size_m[0]:g} m"
+    more = f" rad; with lengths in float32 {wavenumber * single.error:.0e} rad"
+    return [
+        row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more),
+        row(
+            f"Sionna RT's own delays at {where}, {counted} paths",
+            delay.error,
+            DELAY,
+            f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad",
+        ),
+    ]
+
+
+def _sionna_delays(scene: Any, tx_pos_m: FloatArray, rx_pos_m: FloatArray) -> list[FloatArray]:
+    """Delays of Sionna RT's own solver in s, for each transmitter: up to two reflections."""
+    from sionna import rt
+
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.add(rt.Receiver("rx", mi.Point3f(*map(float, rx_pos_m))))
+    delays = []
+    for place in tx_pos_m:
+        scene.add(rt.Transmitter("tx", mi.Point3f(*map(float, place))))
+        paths = rt.PathSolver()(scene, max_depth=2, samples_per_src=1 << 15, refraction=False, seed=1)
+        tau = np.asarray(paths.tau.numpy(), float).ravel()
+        delays.append(tau[np.asarray(paths.valid.numpy(), bool).ravel()])
+        scene.remove("tx")
+    scene.remove("rx")
+    return delays
+
+
+def _mirror_images(tx: FloatArray, rx: FloatArray, size: FloatArray, depth: int = 2) -> FloatArray:
+    """Lengths of all paths of up to ``depth`` reflections in a box, sorted.
+
+    Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
+    """
+    numbers = np.array(np.meshgrid(*[np.arange(-depth, depth + 1)] * 3)).reshape(3, -1).T
+    numbers = numbers[np.abs(numbers).sum(axis=1) <= depth]
+    image = np.where(numbers % 2 == 0, numbers * size + tx, (numbers + 1) * size - tx)
+    return np.sort(np.linalg.norm(image - rx, axis=1))

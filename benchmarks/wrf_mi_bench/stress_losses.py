@@ -20,8 +20,7 @@ from .stress_rows import DOUBLE, EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, 
 UNFELT_SLOPE = UNFELT / np.sqrt(SIZE[0] * SIZE[1])
 """Floor of a derivative's norm: a thousandth of the mean absolute error's."""
 Pair = tuple[FloatArray, FloatArray]
-LARGEST = 1e15
-"""Largest pixel whose fourth power does not overflow float32."""
+LARGEST = 1e15  # largest pixel whose fourth power does not overflow float32
 
 
 def _around(rng: Rng, contrast: float, shift: float = 0.0) -> Pair:
@@ -53,17 +52,17 @@ def losses(count: int) -> list[Row]:
     slope, alone = GradientWorst(), GradientWorst()
     for name, make in KINDS.items():
         for seed in range(count):
-            one, other = (v.astype(np.float32).astype(float) for v in make(np.random.default_rng(seed)))
-            structure = structural_similarity(other, one, data_range=1)
-            truth = (1 - SSIM_WEIGHT) * np.abs(one - other).mean() + SSIM_WEIGHT * (1 - structure)
-            values = {"prediction": np.ones(one.size)}
-            found = {kind: _both(kind, one, other, SSIM_WEIGHT) for kind in (mi.Float, DOUBLE)}
-            likeness.add(abs(found[mi.Float][1] - structure), name)
-            loss.add(abs(found[mi.Float][0] - truth) / max(truth, 1.0), name)
-            slope.add(found[mi.Float][2], found[DOUBLE][2], values, name, UNFELT_SLOPE)
-            structural = {kind: _both(kind, one, other, 1.0)[2] for kind in (mi.Float, DOUBLE)}
+            image, other = (v.astype(np.float32).astype(float) for v in make(np.random.default_rng(seed)))
+            structure = structural_similarity(other, image, data_range=1)
+            truth = (1 - SSIM_WEIGHT) * np.abs(image - other).mean() + SSIM_WEIGHT * (1 - structure)
+            values = {"prediction": np.ones(image.size)}
+            results = {kind: _both(kind, image, other, SSIM_WEIGHT) for kind in (mi.Float, DOUBLE)}
+            likeness.add(abs(results[mi.Float][1] - structure), name)
+            loss.add(abs(results[mi.Float][0] - truth) / max(truth, 1.0), name)
+            slope.add(results[mi.Float][2], results[DOUBLE][2], values, name, UNFELT_SLOPE)
+            structural = {kind: _both(kind, image, other, 1.0)[2] for kind in (mi.Float, DOUBLE)}
             alone.add(structural[mi.Float], structural[DOUBLE], values, name, UNFELT_SLOPE)
-            received.add(_absolute(one, other, np.random.default_rng(seed)), name)
+            received.add(_absolute(image, other, np.random.default_rng(seed)), name)
     return [
         likeness.row(f"loss: similarity against scikit-image's, {cases}", IMAGE),
         loss.row(f"loss: of spectra against NumPy, {cases}", IMAGE),
@@ -74,9 +73,9 @@ def losses(count: int) -> list[Row]:
     ]
 
 
-def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[float, float, dict[str, FloatArray]]:
+def _both(kind: Any, image: FloatArray, other: FloatArray, eta: float) -> tuple[float, float, dict[str, FloatArray]]:
     """Loss, similarity and derivative of the loss."""
-    prediction = on_device(one, kind)
+    prediction = on_device(image, kind)
     dr.enable_grad(prediction)
     value, structure = spectrum_loss(prediction, on_device(other, kind), 1, *SIZE, eta=eta)
     dr.backward(value)
@@ -84,15 +83,15 @@ def _both(kind: Any, one: FloatArray, other: FloatArray, eta: float) -> tuple[fl
     return float(dr.detach(value)[0]), float(dr.detach(structure)[0]), slope
 
 
-def _absolute(one: FloatArray, other: FloatArray, rng: Rng) -> float:
+def _absolute(image: FloatArray, other: FloatArray, rng: Rng) -> float:
     """Error of the mean absolute error and its derivatives, with a third of the values NaN."""
-    known = rng.random(one.size) > 1 / 3
-    prediction = to_float(one)
+    known = rng.random(image.size) > 1 / 3
+    prediction = to_float(image)
     dr.enable_grad(prediction)
     value = absolute_error(prediction, to_float(np.where(known, other.ravel(), np.nan)))
     dr.backward(value)
-    truth = np.abs(one - other).ravel()[known].mean()
-    slope = np.where(known, np.sign(one - other).ravel(), 0) / known.sum()
+    truth = np.abs(image - other).ravel()[known].mean()
+    slope = np.where(known, np.sign(image - other).ravel(), 0) / known.sum()
     off = np.linalg.norm(dr.grad(prediction).numpy() - slope) / (np.linalg.norm(slope) or 1.0)
     return max(abs(float(dr.detach(value)[0]) - truth) / max(truth, 1.0), float(off))
 
@@ -102,10 +101,10 @@ def _differences(count: int) -> Row:
     errors, step = [], 1e-5
     for seed in range(count):
         rng = np.random.default_rng(seed)
-        one, other = rng.uniform(size=SIZE), rng.uniform(size=SIZE)
+        image, other = rng.uniform(size=SIZE), rng.uniform(size=SIZE)
         way = rng.normal(size=SIZE)
-        slope = float(-_both(DOUBLE, one, other, 1.0)[2]["prediction"] @ way.ravel())
-        up, down = (structural_similarity(other, one + s * way, data_range=1) for s in (step, -step))
+        slope = float(-_both(DOUBLE, image, other, 1.0)[2]["prediction"] @ way.ravel())
+        up, down = (structural_similarity(other, image + s * way, data_range=1) for s in (step, -step))
         difference = (up - down) / (2 * step)
         errors.append(abs(slope - difference) / abs(difference))
     worst = Worst()

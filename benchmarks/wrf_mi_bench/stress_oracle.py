@@ -32,8 +32,7 @@ ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
 Planes = tuple[FloatArray, FloatArray]
 """Unit normals [q, 3] and offsets [q] of planes."""
-ACROSS = 1e-6
-"""Sine of the angle to a wall's normal below which the polarisation basis is arbitrary."""
+ACROSS = 1e-6  # sine of the angle to a wall's normal below which the polarisation basis is arbitrary
 
 
 @dataclass(frozen=True)
@@ -116,8 +115,8 @@ class TracedOracle:
     def _constant(self, quantity: str, stated: FloatArray, least: float, values: Values) -> FloatArray:
         slabs = self._traced.slabs
         if slabs.grouping == "surface":
-            whole = values.get(name_of(SURFACE, quantity))
-            return stated if whole is None else least + np.exp(whole)
+            entry = values.get(name_of(SURFACE, quantity))
+            return stated if entry is None else least + np.exp(entry)
         entries = [values.get(name_of(name, quantity)) for name in slabs.names]
         return np.array(
             [s if entry is None else least + np.exp(entry[0]) for s, entry in zip(stated, entries, strict=True)], float
@@ -149,17 +148,11 @@ class TracedOracle:
 
 @dataclass(frozen=True)
 class ReportOracle:
-    """Reports of receivers in NumPy.
+    """Reports of receivers in NumPy."""
 
-    Attributes:
-        size: rows and columns of a hemisphere's directions.
-        elements_m: positions of the array's elements [m, 3].
-        frequency_hz: carrier frequency of spectra.
-    """
-
-    size: tuple[int, int]
-    elements_m: FloatArray
-    frequency_hz: float
+    size: tuple[int, int]  # rows and columns of a hemisphere's directions
+    elements_m: FloatArray  # positions of the array's elements [m, 3]
+    frequency_hz: float  # carrier frequency of spectra
 
     def learned(self, model: Any, field: ComplexArray) -> ComplexArray:
         """Signals of complex fields [n, directions]: the same, or at an antenna, for each frequency, their sum."""
@@ -183,14 +176,14 @@ class ReportOracle:
         return np.asarray(minmax_scale(spectrum) if model.instrument_scale else spectrum).ravel()
 
 
-def report_error(model: Any, found: FloatArray, truth: FloatArray, waves: FloatArray) -> float:
+def report_error(model: Any, report: FloatArray, truth: FloatArray, waves: FloatArray) -> float:
     """Error of a report, relative to its norm, or at an antenna to the sums [n] of the waves' magnitudes."""
     if not isinstance(model, CsiReceiver):
-        return relative(found - truth, truth)
+        return relative(report - truth, truth)
     if isinstance(model, PowerReceiver):
-        found, truth = 10 ** (found / 20), 10 ** (truth / 20)
+        report, truth = 10 ** (report / 20), 10 ** (truth / 20)
         waves = np.maximum(waves, truth)
-    return float((np.abs(found - truth).reshape(len(waves), -1) / waves[:, None]).max())
+    return float((np.abs(report - truth).reshape(len(waves), -1) / waves[:, None]).max())
 
 
 def _mirror(planes: Planes, plane: NDArray[Any], reflects: NDArray[np.bool_], points: FloatArray) -> FloatArray:
@@ -234,7 +227,7 @@ def pattern(coefficients: FloatArray, direction: FloatArray) -> ComplexArray:
 
 def slopes(of: Callable[[Values], FloatArray], values: Values, steps: Mapping[str, float]) -> dict[str, FloatArray]:
     """Derivatives [m, ...] of functionals [m] by the parameters in ``steps``, by fourth-order central differences."""
-    found = {}
+    derivatives = {}
     for name, step in steps.items():
         shape = values[name].shape
         columns = []
@@ -244,5 +237,5 @@ def slopes(of: Callable[[Values], FloatArray], values: Values, steps: Mapping[st
                 for h in (step / 2, step)
             )
             columns.append((4 * near - far) / 3)
-        found[name] = np.transpose(columns).reshape(-1, *shape)
-    return found
+        derivatives[name] = np.transpose(columns).reshape(-1, *shape)
+    return derivatives

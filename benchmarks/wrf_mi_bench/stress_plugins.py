@@ -26,62 +26,44 @@ from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M,
 from wrf_mi.gaussians.parameters import Gaussians
 
 from . import field_oracle
-from .stress_fields import (
-    HARD,
-    ON_THE_EDGE,
-    RECEIVER,
-    SIZE,
-    SMALL,
-    ComplexArray,
-    Family,
-    Field,
-    Size,
-    cases,
-    gradient_row,
-    image_row,
-    layers,
-    made,
-    on_device,
-    ordinary,
-)
+from . import stress_fields as fields
 from .stress_rows import Row, Worst
 from .traced import scene_of
 
-FORWARD = 1e-3
-"""Bound on the relative difference of forward from reverse mode."""
+FORWARD = 1e-3  # bound on the relative difference of forward from reverse mode
 
 
 def plugin_images(random: int, of_each: int, many: int = 1) -> list[Row]:
     """Renders of random and of ill-conditioned fields, of one pixel and of 50,000 layers."""
-    hard = {name: family for name, family in HARD.items() if name != "none"}
+    hard = {name: family for name, family in fields.HARD.items() if name != "none"}
     rows = [
-        plugin_row("random fields", {"random": ordinary}, random),
+        plugin_row("random fields", {"random": fields.ordinary}, random),
         plugin_row(f"{len(hard)} kinds of hard fields", hard, of_each),
-        plugin_row("one pixel", {"random": ordinary}, max(of_each, 5), (1, 1)),
+        plugin_row("one pixel", {"random": fields.ordinary}, max(of_each, 5), (1, 1)),
     ]
-    return [*rows, plugin_row("50,000 layers", {"layers": layers}, many, SMALL)] if many else rows
+    return [*rows, plugin_row("50,000 layers", {"layers": fields.layers}, many, fields.SMALL)] if many else rows
 
 
-def plugin_row(what: str, families: Mapping[str, Family], count: int, size: Size = SIZE) -> Row:
+def plugin_row(what: str, families: Mapping[str, fields.Family], count: int, size: fields.Size = fields.SIZE) -> Row:
     """Row of renders of ``count`` fields of each family."""
-    return image_row(f"plugin: image, {what}", families, count, size, rendered, defined)
+    return fields.image_row(f"plugin: image, {what}", families, count, size, rendered, defined)
 
 
-def rendered(field: Field, blending: str, size: Size) -> ComplexArray:
+def rendered(field: fields.Field, blending: str, size: fields.Size) -> fields.ComplexArray:
     """Image [height, width] by ``mi.render``."""
-    scene = scene_of(on_device(field, blending, mi.Float)[0], RECEIVER, *size)
+    scene = scene_of(fields.on_device(field, blending, mi.Float)[0], fields.RECEIVER, *size)
     parts = np.asarray(mi.render(scene).numpy(), float)
     return np.asarray(parts[..., 0] + 1j * parts[..., 1])
 
 
-def defined(field: Field, blending: str, size: Size) -> tuple[ComplexArray, NDArray[np.bool_]]:
+def defined(field: fields.Field, blending: str, size: fields.Size) -> tuple[fields.ComplexArray, NDArray[np.bool_]]:
     """Image [height, width] of each Gaussian's largest response on a ray, and a mask of rays off all edges."""
-    offset = field.position_m - RECEIVER.position_m
+    offset = field.position_m - fields.RECEIVER.position_m
     depth = np.linalg.norm(offset, axis=1)
     x, y, z = field.position_m.T
     order = np.lexsort((z, y, x, depth))
     order = order[depth[order] >= NEAR_M]
-    rays = pixel_directions(*size) @ RECEIVER.to_world.T
+    rays = pixel_directions(*size) @ fields.RECEIVER.to_world.T
     turn = rotation_matrix(field.rotation)
     responses, clear = np.zeros((len(order), *size)), np.ones(size, bool)
     for row, i in enumerate(order):
@@ -92,24 +74,26 @@ def defined(field: Field, blending: str, size: Size) -> tuple[ComplexArray, NDAr
         square = ((t[..., None] * along - centre) ** 2).sum(-1)
         cosine = rays @ (offset[i] / depth[i])
         responses[row] = np.where((square < CUTOFF**2) & (cosine > MIN_COSINE), np.exp(-square / 2), 0)
-        clear &= (np.abs(np.sqrt(square) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
-        clear &= np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE
+        clear &= fields.off_edges(square, cosine)
     if blending == "alpha":
         return field_oracle.blend_alpha(responses, field.signal[order], field.opacity[order]), clear
     return field_oracle.blend_product(responses, field.signal[order], field.attenuation[order]), clear
 
 
-def plugin_gradients(of_each: int, names: Iterable[str] = tuple(HARD)) -> list[Row]:
+def plugin_gradients(of_each: int, names: Iterable[str] = tuple(fields.HARD)) -> list[Row]:
     """Derivatives through ``mi.render`` compared with the same sum in float64, and forward with reverse mode."""
-    families: dict[str, Family] = {"random": lambda rng: made(60, rng), **{name: HARD[name] for name in names}}
+    families: dict[str, fields.Family] = {
+        "random": lambda rng: fields.made(60, rng),
+        **{name: fields.HARD[name] for name in names},
+    }
     forward = Worst()
 
-    def single(field: Field, blending: str, seed: int) -> dict[str, FloatArray]:
-        found, error = _through_render(field, blending, seed)
+    def single(field: fields.Field, blending: str, seed: int) -> dict[str, FloatArray]:
+        slopes, error = _through_render(field, blending, seed)
         forward.add(error)
-        return found
+        return slopes
 
-    row = gradient_row("plugin: derivatives", cases(families, of_each), _summed, single)
+    row = fields.gradient_row("plugin: derivatives", fields.cases(families, of_each), _summed, single)
     count = row["what"].rpartition(", ")[2]
     return [row, forward.row(f"plugin: derivatives forward against backward, {count}", FORWARD)]
 
@@ -117,23 +101,23 @@ def plugin_gradients(of_each: int, names: Iterable[str] = tuple(HARD)) -> list[R
 def _summed(gaussians: Gaussians, pose: Pose) -> list[Any]:
     """Image as the sum of all Gaussians on each ray, without lists."""
     kind: Any = type(gaussians.position[0])
-    directions = pixel_directions(*SIZE).reshape(-1, 3)
-    bundles = ray_bundles([to_device(column, kind) for column in directions.T], *SIZE)
+    directions = pixel_directions(*fields.SIZE).reshape(-1, 3)
+    bundles = ray_bundles([to_device(column, kind) for column in directions.T], *fields.SIZE)
     footprints = ray_footprints(gaussians, pose)
     lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
     parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending)
     return list(parts)
 
 
-def _through_render(field: Field, blending: str, seed: int) -> tuple[dict[str, FloatArray], float]:
+def _through_render(field: fields.Field, blending: str, seed: int) -> tuple[dict[str, FloatArray], float]:
     """Derivatives by group of parameters, and the relative error of forward mode along a random step."""
     from wrf_mi_plugins.shape import shape_parameters
 
-    gaussians, parts = on_device(field, blending, mi.Float)
-    scene = scene_of(gaussians, RECEIVER, *SIZE)
+    gaussians, parts = fields.on_device(field, blending, mi.Float)
+    scene = scene_of(gaussians, fields.RECEIVER, *fields.SIZE)
     params = mi.traverse(scene)
     rng = np.random.default_rng(seed)
-    weight = [rng.normal(size=SIZE).astype(np.float32) for _ in range(2)]
+    weight = [rng.normal(size=fields.SIZE).astype(np.float32) for _ in range(2)]
     weights = to_tensor(np.stack(weight, axis=-1))
 
     def render() -> Any:

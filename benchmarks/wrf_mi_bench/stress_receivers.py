@@ -64,19 +64,19 @@ def of_fields(random: int, of_each: int, families: Iterable[str] = FAMILIES) -> 
         for name, field, blending, _ in cases({family: FAMILIES[family]}, random if family == "random" else of_each):
             number += 1
             truth, clear = reference(field, blending, SIZE, sphere=True)
-            seen = (truth * clear).reshape(-1)
+            field_on_sphere = (truth * clear).reshape(-1)
             gaussians = on_device(field, blending, mi.Float)[0]
             re, im = learned_field(gaussians, pose(mi.Float), perception_plane(*SIZE, mi.Float), sphere=True)
             mask = to_device(clear.reshape(-1).astype(np.float32), mi.Float)
-            waves = np.array([(np.tile(solid_angles(*SIZE), 2) * np.abs(seen)).sum() or 1.0])
+            waves = np.array([(np.tile(solid_angles(*SIZE), 2) * np.abs(field_on_sphere)).sum() or 1.0])
             for what, model in MODELS.items():
-                part = dr.arange(mi.UInt32, seen.size // (1 if model.sphere else 2))
-                found = model(None, tuple(dr.gather(mi.Float, side * mask, part) for side in (re, im)))
+                part = dr.arange(mi.UInt32, field_on_sphere.size // (1 if model.sphere else 2))
+                report = model(None, tuple(dr.gather(mi.Float, side * mask, part) for side in (re, im)))
                 none = np.zeros((1, len(TONES_HZ if model.sphere else ELEMENTS_M)), complex)
-                expected = ORACLE.report(model, none, ORACLE.learned(model, seen[None, : dr.width(part)]))
-                error = report_error(model, found.numpy().astype(float), expected, waves)
+                expected = ORACLE.report(model, none, ORACLE.learned(model, field_on_sphere[None, : dr.width(part)]))
+                error = report_error(model, report.numpy().astype(float), expected, waves)
                 worst.setdefault(TITLES.get(what, what), Worst()).add(error, name)
-    return [one.row(f"receiver: {what}, {number} cases", IMAGE) for what, one in worst.items()]
+    return [worst_of.row(f"receiver: {what}, {number} cases", IMAGE) for what, worst_of in worst.items()]
 
 
 def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: Iterable[str] = FAMILIES) -> list[Row]:
@@ -92,15 +92,15 @@ def derivatives(of_each: int, names: Iterable[str] = tuple(MODELS), families: It
 
         # Instrument scaling cancels nearly all derivatives of a single Gaussian; rounding would remain.
         least = 2 if name == "scaled spectrum" else 1
-        given = cases({family: FAMILIES[family] for family in families}, of_each)
-        rows.append(gradient_row(f"receiver: derivatives of {name}", given, report, least=least))
+        tried = cases({family: FAMILIES[family] for family in families}, of_each)
+        rows.append(gradient_row(f"receiver: derivatives of {name}", tried, report, least=least))
     return rows
 
 
 def of_paths(count: int, each: int = 50) -> list[Row]:
     """Row of element signals and CSI of paths of 1 m to 100 km at 28 GHz, Dr.Jit compared with NumPy in float64."""
     worst, carrier_hz = Worst(), 28e9
-    here = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    array = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     elements, tones = planar_array(4, 4, 0.005), carrier_hz * np.linspace(0.98, 1.02, 16)
     for seed in range(count):
         rng = np.random.default_rng(seed)
@@ -130,7 +130,7 @@ def of_paths(count: int, each: int = 50) -> list[Row]:
             n_rx=1,
         )
         for ports, truth in (
-            (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, here, elements, carrier_hz)[..., 0]),
+            (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, array, elements, carrier_hz)[..., 0]),
             (Ports(np.zeros((16, 3)), tones), csi(known, tones)),
         ):
             re, im = path_sum(traced, ports)

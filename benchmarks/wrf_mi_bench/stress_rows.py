@@ -20,20 +20,13 @@ import mitsuba as mi  # noqa: E402
 Row = dict[str, str]
 DOUBLE: Any = dr.float64_array_t(mi.Float)
 
-IMAGE = 1e-4
-"""Bound on the relative L2 error of float32 images and reports."""
-GRADIENT = 1e-3
-"""Bound on the relative error, in norm, of a derivative in float32."""
-EXACT = 1e-5
-"""Bound on the median relative error of a derivative in float64 against central differences."""
-PHASE = 1e-3
-"""Bound on the error of a phase, rad."""
-UNFELT = 1e-3
-"""Floor of the norm of a group's derivatives times parameters, as a share of the largest group's."""
-PLAIN = 1e-3
-"""Share of a group's largest derivative above which signs are compared."""
-NEITHER = "0 neither"
-"""Bound of the row on fits: no fit with values that are not finite and no message."""
+IMAGE = 1e-4  # bound on the relative L2 error of float32 images and reports
+GRADIENT = 1e-3  # bound on the relative error, in norm, of a derivative in float32
+EXACT = 1e-5  # bound on the median relative error of a derivative in float64 against central differences
+PHASE = 1e-3  # bound on the error of a phase, rad
+UNFELT = 1e-3  # floor of the norm of a group's derivatives times parameters, as a share of the largest group's
+PLAIN = 1e-3  # share of a group's largest derivative above which signs are compared
+NEITHER = "0 neither"  # bound of the row on fits: no fit with values that are not finite and no message
 FITS = "fits with random bad"
 
 STAGES = (
@@ -71,21 +64,13 @@ class Worst:
 
 @dataclass
 class GradientWorst:
-    """Largest differences of derivatives in float32 from float64, by group, each times its parameters.
+    """Largest differences of derivatives in float32 from float64, by group, each times its parameters."""
 
-    Attributes:
-        error: norm of the difference over the norm.
-        cosine: 1 - cosine of the angle between both.
-        norm: difference of the ratio of their norms from 1.
-        signs: number of wrong signs among derivatives above `PLAIN`.
-        compared: number of signs compared.
-    """
-
-    error: Worst = field(default_factory=Worst)
-    cosine: Worst = field(default_factory=Worst)
-    norm: Worst = field(default_factory=Worst)
-    signs: int = 0
-    compared: int = 0
+    error: Worst = field(default_factory=Worst)  # norm of the difference over the norm
+    cosine: Worst = field(default_factory=Worst)  # 1 - cosine of the angle between both
+    norm: Worst = field(default_factory=Worst)  # difference of the ratio of their norms from 1
+    signs: int = 0  # number of wrong signs among derivatives above `PLAIN`
+    compared: int = 0  # number of signs compared
 
     def add(
         self,
@@ -100,21 +85,21 @@ class GradientWorst:
         least = max(least, UNFELT * max(felt.values(), default=0.0))
         for key in double:
             name = f"{key}, {where}" if where else key
-            found, truth = single[key] * values[key], double[key] * values[key]
-            if not np.isfinite(found).all():
+            derivative, truth = single[key] * values[key], double[key] * values[key]
+            if not np.isfinite(derivative).all():
                 self.error.add(np.nan, name)
                 continue
             # Where the true derivative is zero the error is absolute.
-            self.error.add(np.linalg.norm(found - truth) / (max(felt[key], least) or 1.0), name)
+            self.error.add(np.linalg.norm(derivative - truth) / (max(felt[key], least) or 1.0), name)
             if felt[key] <= least or not felt[key]:
                 continue
-            size = float(np.linalg.norm(found))
+            size = float(np.linalg.norm(derivative))
             # 1 - cosine of nearly equal vectors from their difference: the scalar product has no digits left for it.
-            unlike = np.linalg.norm(found / size - truth / felt[key]) ** 2 / 2 if size else 1.0
+            unlike = np.linalg.norm(derivative / size - truth / felt[key]) ** 2 / 2 if size else 1.0
             self.cosine.add(unlike, name)
             self.norm.add(abs(size / felt[key] - 1), name)
             plain = np.abs(truth) > PLAIN * np.abs(truth).max()
-            self.signs += int((np.sign(found) != np.sign(truth))[plain].sum())
+            self.signs += int((np.sign(derivative) != np.sign(truth))[plain].sum())
             self.compared += int(plain.sum())
 
     def row(self, what: str, bound: float = GRADIENT) -> Row:
@@ -150,11 +135,11 @@ def relative(error: Any, truth: Any) -> float:
 
 def stages(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, int, float, float]]:
     """Title, number of cases, worst error and widest bound of each of `STAGES`; NaN for a stage without rows."""
-    found = []
+    titled = []
     for title, begins in STAGES:
         members = [row for row in rows if re.match(begins, row["what"])]
         # Where a row states paths and cases, the cases come last.
         counts = [re.findall(r"(\d+) (?:cases|paths)", row["what"]) for row in members]
         worst, bound = zip(*map(worst_of, members), strict=True) if members else ((float("nan"),), (float("nan"),))
-        found.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
-    return found
+        titled.append((title, sum(int(count[-1]) for count in counts if count), max(worst), max(bound)))
+    return titled

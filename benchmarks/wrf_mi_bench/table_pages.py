@@ -13,6 +13,7 @@ import numpy as np
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically, write_figure
 from wrf_mi.runs.figures import score_cdf
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 
 from .table_plan import MADE_HERE, PARTS, SHARES, Part, plan
@@ -43,10 +44,12 @@ def write_tables(place: Path, quick: bool = False) -> None:
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
         text += [f"## {title}", part_table(part, groups)]
         most = max(share for share, _ in groups)
-        whole = {method: found[0] for (share, method), found in groups.items() if share == most}
+        first = {method: rows[0] for (share, method), rows in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
-            {part.entries[method].label: one["quantiles"] for method, one in whole.items()}, {}, TASKS[part.task].label
+            {part.entries[method].label: row["quantiles"] for method, row in first.items()},
+            {},
+            TASKS[part.task].label,
         )
         write_figure(place / picture, figure)
         text.append(f"![Distribution of the scores of each method]({picture})")
@@ -61,8 +64,7 @@ OVERVIEWS = {
     "uplink": "downlink channels from the uplink",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
-IN_README = ("spectrum", "rssi", "uplink")
-"""Overviews that the project's README shows."""
+IN_README = ("spectrum", "rssi", "uplink")  # overviews that the project's README shows
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
     "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "
@@ -76,8 +78,7 @@ NOTE = (
     "with as many threads as `worker_threads` says there, or else all: read ratios. Rows with † are of a data set of "
     "this package as an earlier recipe made it; `wrf-mi bench tables` measures them anew."
 )
-FORMER = "†"
-"""Mark of rows that were measured on other data than the newest rows of their part."""
+FORMER = "†"  # mark of rows that were measured on other data than the newest rows of their part
 
 
 Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
@@ -100,7 +101,7 @@ def is_former(part: Part, rows: Sequence[Mapping[str, Any]], newest: str | None)
 
 def newest_data(groups: Groups) -> str | None:
     """Digest of the data of most of the newest rows."""
-    rows = [row for found in groups.values() for row in found]
+    rows = [row for of_method in groups.values() for row in of_method]
     last = max(row["date"] for row in rows)
     return Counter(row.get("data") for row in rows if row["date"] == last).most_common(1)[0][0]
 
@@ -110,16 +111,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
     """
-    columns: dict[Part, dict[str, float]] = {}
-    former = set[tuple[Part, str]]()
-    for part in PARTS:
-        groups = grouped(part, stored, quick) if part.table == name else {}
-        newest = newest_data(groups) if groups else None
-        for (share, method), rows in groups.items():
-            if quick or share == SHARES[0]:
-                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
-                if is_former(part, rows, newest):
-                    former.add((part, method))
+    columns, former = _medians(name, stored, quick)
     if not columns:
         return ""
     task = TASKS[next(iter(columns)).task]
@@ -129,7 +121,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         for rank, method in enumerate(sorted(medians, key=lambda method: sign * medians[method])):
             ranks.setdefault(method, []).append(rank / max(len(medians) - 1, 1))
     entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
-    lines = _head([task.label, *(title_of(part) for part in columns), "paper, other data"])
+    lines = []
     best = {part: min(medians.values(), key=lambda median: sign * median) for part, medians in columns.items()}
     for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
         cells = []
@@ -140,16 +132,25 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
         # Where labels differ between columns, as the inputs do, the plain name is shown.
         labels = {entry.label for entry in entries[method]}
         label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
-        lines.append(_cells([label, *cells, entries[method][0].published]))
-    return "\n".join(lines)
+        lines.append([label, *cells, entries[method][0].published])
+    return markdown_table([task.label, *(title_of(part) for part in columns), "paper, other data"], lines)
 
 
-def _cells(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _head(cells: Sequence[str]) -> list[str]:
-    return [_cells(cells), _cells(["---"] * len(cells))]
+def _medians(
+    name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool
+) -> tuple[dict[Part, dict[str, float]], set[tuple[Part, str]]]:
+    """Medians of each method by part of an overview, and those measured on former data."""
+    columns: dict[Part, dict[str, float]] = {}
+    former = set[tuple[Part, str]]()
+    for part in PARTS:
+        groups = grouped(part, stored, quick) if part.table == name else {}
+        newest = newest_data(groups) if groups else None
+        for (share, method), rows in groups.items():
+            if quick or share == SHARES[0]:
+                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
+                if is_former(part, rows, newest):
+                    former.add((part, method))
+    return columns, former
 
 
 def title_of(part: Part) -> str:
@@ -163,39 +164,38 @@ def part_table(part: Part, groups: Groups) -> str:
     sign = -1 if task.higher_is_better else 1
 
     def median(key: tuple[float, str]) -> float:
-        return float(np.mean([one["score"]["median"] for one in groups[key]]))
+        return float(np.mean([row["score"]["median"] for row in groups[key]]))
 
-    heads = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
-    lines = _head([*heads, "paper, other data"])
+    head = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
+    lines = []
     digits, newest = task.digits, newest_data(groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
-        found = groups[share, method]
-        each = {key: float(np.mean([one["score"][key] for one in found])) for key in ("median", "mean", "p10", "p90")}
-        medians = [one["score"]["median"] for one in found]
-        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(found) > 1 else ""
+        rows = groups[share, method]
+        each = {key: float(np.mean([row["score"][key] for row in rows])) for key in ("median", "mean", "p10", "p90")}
+        medians = [row["score"]["median"] for row in rows]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(rows) > 1 else ""
         cells = [
-            str(found[0]["n_train"]),
-            part.entries[method].label + (f" {FORMER}" if is_former(part, found, newest) else ""),
+            str(rows[0]["n_train"]),
+            part.entries[method].label + (f" {FORMER}" if is_former(part, rows, newest) else ""),
             f"**{each['median']:.{digits}f}**{spread}",
             *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
-            f"{np.median([one['train_seconds'] for one in found]):.0f} s",
-            f"{np.median([one['ms_per_sample'] for one in found]):.2g} ms",
-            f"{max(one['peak_memory_mb'] for one in found):.0f} MB",
+            f"{np.median([row['train_seconds'] for row in rows]):.0f} s",
+            f"{np.median([row['ms_per_sample'] for row in rows]):.2g} ms",
+            f"{max(row['peak_memory_mb'] for row in rows):.0f} MB",
             part.entries[method].published if share == max(share for share, _ in groups) else "",
         ]
-        lines.append(_cells(cells))
-    lines += _reference_rows(part, groups)
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown_table([*head, "paper, other data"], [*lines, *_reference_rows(part, groups)])
 
 
-def _reference_rows(part: Part, groups: Groups) -> list[str]:
+def _reference_rows(part: Part, groups: Groups) -> list[list[str]]:
     """Lines of the references that every run states, where the part has no row of interpolation."""
     if "idw" in part.entries:
         return []
     digits, share = 2, max(share for share, _ in groups)
-    one = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
+    row = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
     words, lines = TASKS[part.task].references, []
-    for key, block in one["reference"].items():
-        scores = " | ".join(f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
-        lines.append(f"| {one['n_train']} | {words[key]} | **{block['median']:.{digits}f}** | {scores} | | | | |")
+    for key, block in row["reference"].items():
+        scores = (f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
+        lines.append([str(row["n_train"]), words[key], f"**{block['median']:.{digits}f}**", *scores, *[""] * 4])
     return lines

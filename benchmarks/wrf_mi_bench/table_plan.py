@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from wrf_mi.datasets.registry import locate
 
-MADE_HERE = "traced-"
-"""Names of data sets that this package makes begin with it."""
+MADE_HERE = "traced-"  # names of data sets that this package makes begin with it
 SEEDS = (0, 1, 2)
 ONE = SEEDS[:1]
 SHARES = (1.0, 0.3, 0.1)
@@ -17,27 +16,18 @@ SHARES = (1.0, 0.3, 0.1)
 
 @dataclass(frozen=True)
 class Entry:
-    """A method of a table.
+    """A method of a table."""
 
-    Attributes:
-        label: label in the table.
-        arguments: arguments of ``wrf-mi train`` except data set, split, rows and seed.
-        quick: further arguments of the small version, which takes half a minute.
-        seeds: seeds; several for random methods of less than three minutes.
-        few_seeds: seeds with fewer rows, which are random themselves.
-        published: figures of the paper, on other data; "": none.
-    """
-
-    label: str
-    arguments: tuple[str, ...]
-    quick: tuple[str, ...] = ()
-    seeds: Sequence[int] = ONE
-    few_seeds: Sequence[int] = SEEDS
-    published: str = ""
+    label: str  # label in the table
+    arguments: tuple[str, ...]  # arguments of ``wrf-mi train`` except data set, split, rows and seed
+    quick: tuple[str, ...] = ()  # further arguments of the small version, which takes half a minute
+    seeds: Sequence[int] = ONE  # seeds; several for random methods of less than three minutes
+    few_seeds: Sequence[int] = SEEDS  # seeds with fewer rows, which are random themselves
+    published: str = ""  # figures of the paper, on other data; "": none
 
 
 def _set(*settings: str) -> tuple[str, ...]:
-    return tuple(word for one in settings for word in ("--set", one))
+    return tuple(word for setting in settings for word in ("--set", setting))
 
 
 def _model(name: str, *more: str) -> tuple[str, ...]:
@@ -47,16 +37,13 @@ def _model(name: str, *more: str) -> tuple[str, ...]:
 NAMED, CORRECTED = "{scene}", "{corrected}"
 """Arguments that are replaced by the arguments of a scene, as stated and corrected by the row's training rows."""
 THROUGH_WALLS = ("--paths", "line-of-sight,reflection,transmission")
-IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")
-"""Transmission through walls of two surfaces each."""
-CALIBRATED = ("--calibrate", "gain,patterns")
-"""Calibration of uncalibrated strengths."""
+IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")  # transmission through walls of two surfaces each
+CALIBRATED = ("--calibrate", "gain,patterns")  # calibration of uncalibrated strengths
 ON_A_FLOOR = (*THROUGH_WALLS, "--depth", "5", "--reflections", "3")
 """Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
 """Schedules of the small version: networks, and networks with slow steps."""
-SHORT = _set("steps=400", "validate_every=200")
-"""Schedule of fields of Gaussians in the small version."""
+SHORT = _set("steps=400", "validate_every=200")  # schedule of fields of Gaussians in the small version
 SPECTRUM: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
     "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
@@ -149,33 +136,21 @@ NEW_RECEIVERS: Mapping[str, Entry] = {
 }
 CHEAP = ("ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
-FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")
-"""Methods measured with fewer rows too."""
+FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")  # methods measured with fewer rows too
 
 
 @dataclass(frozen=True)
 class Part:
-    """A data set with a split.
+    """A data set with a split."""
 
-    Attributes:
-        task: task of the data set.
-        table: overview: the task, or the input from which channels are predicted.
-        dataset: name of the data set.
-        split: name of the split.
-        entries: methods by name.
-        few: whether fewer rows are measured too.
-        scene: scene that `wrf_mi_bench.tables.scene_of` makes; "": none.
-        once: methods of more than three minutes on one thread, with one seed.
-    """
-
-    task: str
-    table: str
-    dataset: str
-    split: str
-    entries: Mapping[str, Entry] = field(hash=False)
-    few: bool = False
-    scene: str = ""
-    once: Collection[str] = ()
+    task: str  # task of the data set
+    table: str  # overview: the task, or the input from which channels are predicted
+    dataset: str  # name of the data set
+    split: str  # name of the split
+    entries: Mapping[str, Entry] = field(hash=False)  # methods by name
+    few: bool = False  # whether fewer rows are measured too
+    scene: str = ""  # scene that `wrf_mi_bench.tables.scene_of` makes; "": none
+    once: Collection[str] = ()  # methods of more than three minutes on one thread, with one seed
 
 
 PARTS = (

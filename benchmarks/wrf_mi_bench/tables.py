@@ -12,7 +12,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -43,21 +43,22 @@ from .sources import modules_of_command, source_digests
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
 
-FOLDER = "tables"
-"""Folder of the rows; ``tables-quick`` for the small version."""
-QUANTILES = 101
-"""Number of equally spaced quantiles of a row's scores."""
-FLAT_HEIGHT_M = 2.7
-"""Height of the ceiling of the flat, which its layout lacks."""
-FAR_M, PLATE_M = 100.0, 0.01
-"""Distance and size of the only surface of the open scene; Sionna RT needs one."""
+FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
+QUANTILES = 101  # number of equally spaced quantiles of a row's scores
+FLAT_HEIGHT_M = 2.7  # height of the ceiling of the flat, which its layout lacks
+FAR_M, PLATE_M = 100.0, 0.01  # distance and size of the only surface of the open scene; Sionna RT needs one
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 
 def scene_of(part: Part, folder: Path) -> list[str]:
     """Arguments with the scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
-        return ["--scene", str(_once(folder / f"open-{fit_key(FAR_M, PLATE_M)}", _open_scene))]
+        place = folder / f"open-{fit_key(FAR_M, PLATE_M)}"
+        if not place.exists():
+            plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
+            with atomic_folder(place, False) as made:
+                write_scene(made, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
+        return ["--scene", str(place)]
     if part.scene == "lidar":
         return ["--scene", str(meshed_scan(part.dataset, folder))]
     if part.scene == "floor":
@@ -76,32 +77,19 @@ def meshed_scan(dataset: str, folder: Path) -> Path:
     """Scene in ``folder`` from the scan of a data set, which is made where needed."""
     load_record(dataset)
     scan = data_folder(dataset) / SCAN
-    made = folder / f"{dataset}-{fit_key(scan)}"
-    if not made.exists():
-        make_scene(scan, made)
-    return made
+    scene = folder / f"{dataset}-{fit_key(scan)}"
+    if not scene.exists():
+        make_scene(scan, scene)
+    return scene
 
 
 def corrected_scene(row: Row, folder: Path) -> Path:
     """Scene of a row in ``folder``, corrected by its training rows."""
     stated = scene_of(row.part, folder)[1]
-    made = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
-    if not made.exists():
-        run_command(["correct", stated, row.part.dataset, *row.rows], made, resumes=False)
-    return made
-
-
-def _once(place: Path, make: Callable[[Path], object]) -> Path:
-    """A folder, made completely or not at all."""
-    if not place.exists():
-        with atomic_folder(place, False) as part:
-            make(part)
-    return place
-
-
-def _open_scene(folder: Path) -> None:
-    plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
-    write_scene(folder, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
+    scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
+    if not scene.exists():
+        run_command(["correct", stated, row.part.dataset, *row.rows], scene, resumes=False)
+    return scene
 
 
 def _scene(row: Row, runs: Path) -> list[str]:
@@ -150,12 +138,9 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
 def tables(
     out: Path, runs: Path, quick: bool = False, scheduler: Scheduler | None = None, most_s: float | None = None
 ) -> list[dict[str, Any]]:
-    """Measure all rows that are not stored yet and write tables and pictures.
+    """Measure all rows that are not stored yet and write tables and pictures; all stored rows.
 
     A row whose command fails is reported and omitted; the other rows are measured.
-
-    Returns:
-        All stored rows.
     """
     place = out / (f"{FOLDER}-quick" if quick else FOLDER)
     place.mkdir(parents=True, exist_ok=True)
@@ -164,7 +149,7 @@ def tables(
     missing = sorted({row.part.dataset for row in rows if not available(row.part)})
     for name in missing:
         print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
-    stored, digests = {one["row"]: one for one in read_rows(place)}, dict[str, str]()
+    stored, digests = {row["row"]: row for row in read_rows(place)}, dict[str, str]()
     left = [row for row in rows if available(row.part) and not _holds(stored.get(row.name), row, digests)]
     print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
     _report_versions([stored[row.name] for row in rows if row.name in stored and row not in left])
@@ -214,14 +199,14 @@ def _holds(stored: Mapping[str, Any] | None, row: Row, digests: dict[str, str]) 
     return stored["data"] == digests[dataset]
 
 
-def _report_versions(kept: Sequence[Mapping[str, Any]]) -> None:
+def _report_versions(rows: Sequence[Mapping[str, Any]]) -> None:
     """Report how many kept rows have other versions of packages or do not state their data."""
     now = package_versions()
-    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in kept)
-    silent = sum("data" not in row for row in kept)
+    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in rows)
+    silent = sum("data" not in row for row in rows)
     for count, what in ((others, "were measured by other versions of packages"), (silent, "do not state their data")):
         if count:
-            text = f"tables: {count} of {len(kept)} stored rows {what} and are kept; delete their files to measure them"
+            text = f"tables: {count} of {len(rows)} stored rows {what} and are kept; delete their files to measure them"
             print(text, file=sys.stderr)
 
 

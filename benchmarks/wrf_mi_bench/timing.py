@@ -34,29 +34,20 @@ import drjit as dr  # noqa: E402
 
 Call = Callable[[], Any]
 
-REPEATS, WARM_UP = 15, 2
-"""Timed calls, and calls before them: the first compiles, the second still fills caches."""
+REPEATS, WARM_UP = 15, 2  # timed calls, and calls before them: the first compiles, the second still fills caches
 RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 LOOK_EVERY_S = 1e-3
 
 
 @dataclass(frozen=True)
 class Split:
-    """Shares of the time of a call, in ms.
+    """Shares of the time of a call, in ms."""
 
-    Attributes:
-        tracing: Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder.
-        code_generation: generation of kernels that were not in the cache, with LLVM's or CUDA's compiler.
-        execution: execution of kernels; concurrent ones count in full, up to the time of the call.
-        kernels: number of launched kernels, reductions and sorts included.
-        compiled: number of compiled kernels among them.
-    """
-
-    tracing: float
-    code_generation: float
-    execution: float
-    kernels: int
-    compiled: int
+    tracing: float  # Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder
+    code_generation: float  # generation of kernels that were not in the cache, with LLVM's or CUDA's compiler
+    execution: float  # execution of kernels; concurrent ones count in full, up to the time of the call
+    kernels: int  # number of launched kernels, reductions and sorts included
+    compiled: int  # number of compiled kernels among them
 
 
 def settle(result: Any) -> None:
@@ -67,15 +58,10 @@ def settle(result: Any) -> None:
 
 @dataclass(frozen=True)
 class Within:
-    """A call in a context whose entering and leaving is not timed, for example another variant of Mitsuba.
+    """A call in a context whose entering and leaving is not timed, for example another variant of Mitsuba."""
 
-    Attributes:
-        call: timed call.
-        context: function that returns the context.
-    """
-
-    call: Call
-    context: Callable[[], AbstractContextManager[Any]]
+    call: Call  # timed call
+    context: Callable[[], AbstractContextManager[Any]]  # function that returns the context
 
     def __call__(self) -> Any:
         """Result of the call in its context."""
@@ -86,9 +72,7 @@ class Within:
 def seconds(call: Call, processor: bool = False) -> float:
     """Time of one call, until all its kernels have run.
 
-    Args:
-        call: timed call.
-        processor: whether to measure the processor time of this process, which other processes do not lengthen.
+    ``processor`` measures the processor time of this process, which other processes do not lengthen.
     """
     if isinstance(call, Within):
         with call.context():
@@ -109,12 +93,8 @@ def interleaved(
 ) -> dict[str, NDArray[np.float64]]:
     """Times in ms [rounds] of several interleaved calls in this process; every round calls each once.
 
-    Args:
-        calls: calls by name.
-        repeats: number of timed rounds.
-        warm_up: number of rounds before them.
-        most_s: seconds after which no further round begins; three are timed in any case.
-        processor: see `seconds`.
+    ``warm_up`` rounds precede the timed ones; after ``most_s`` seconds no further round begins, but three are timed in
+    any case. ``processor``: see `seconds`.
     """
     start = time.perf_counter()
     for _ in range(warm_up):
@@ -146,21 +126,29 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
     return bootstrap(ours / theirs)
 
 
-def split(call: Call) -> Split:
-    """Shares of the time of a call, from Dr.Jit's kernel history.
+def history_of(call: Call, again: bool = False) -> tuple[float, list[dict[str, Any]]]:
+    """Time of a call in ms, and Dr.Jit's history of its kernels.
 
-    A frozen function that was recorded without the history is recorded again by the first call.
+    A frozen function that was recorded without the history is recorded again by the first call, which is made before
+    where ``again`` is given.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        if again:
+            call()
         dr.sync_thread()
         dr.kernel_history_clear()
-        whole = 1e3 * seconds(call)
-        history = dr.kernel_history()
+        total_ms = 1e3 * seconds(call)
+        return total_ms, dr.kernel_history()
+
+
+def split(call: Call) -> Split:
+    """Shares of the time of a call, see `history_of`."""
+    total_ms, history = history_of(call)
     generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
     # Kernels may run concurrently with each other and with the recording of the next.
-    executed = min(sum(entry["execution_time"] for entry in history), max(whole - generated, 0.0))
+    executed = min(sum(entry["execution_time"] for entry in history), max(total_ms - generated, 0.0))
     compiled = sum(not entry.get("cache_hit", 1) for entry in history)
-    return Split(max(whole - generated - executed, 0.0), generated, executed, len(history), compiled)
+    return Split(max(total_ms - generated - executed, 0.0), generated, executed, len(history), compiled)
 
 
 def memory_mb(call: Call) -> float:
@@ -176,7 +164,7 @@ def memory_mb(call: Call) -> float:
     if RESET_PEAK.exists():
         RESET_PEAK.write_text("5")  # proc(5): resets the peak resident set size
         settle(call())
-        line = next(one for one in STATUS.read_text().splitlines() if one.startswith("VmHWM:"))
+        line = next(entry for entry in STATUS.read_text().splitlines() if entry.startswith("VmHWM:"))
         peak = 1024 * int(line.split()[1])
     else:
         peak = _watched(call)
@@ -207,23 +195,18 @@ def _watched(call: Call) -> int:
 def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) -> Interval:
     """Exponent of the growth of time with size: the least-squares slope of their logarithms over the larger sizes.
 
-    Overheads hide the growth at small sizes. The interval is from resampled repetitions at each size.
-
-    Args:
-        sizes: ascending sizes, two or more.
-        times: times of the repetitions at each size.
-        seed: seed of the resamples.
+    Overheads hide the growth at small sizes. Sizes ascend; the interval is from resampled repetitions at each size.
     """
     if len(sizes) != len(times) or len(sizes) < 2:
         raise ValueError(f"exponent: {len(sizes)} sizes and {len(times)} sets of times; give two or more of both")
-    kept = larger_half(len(sizes))
-    x = np.log(np.asarray(sizes, float)[kept])
+    larger = larger_half(len(sizes))
+    x = np.log(np.asarray(sizes, float)[larger])
     x -= x.mean()
 
     def slope(*samples: FloatArray, axis: int) -> Any:
         return np.tensordot(x, np.log([np.median(values, axis=axis) for values in samples]), 1) / (x @ x)
 
-    return bootstrap(*list(times)[kept], statistic=slope, seed=seed)
+    return bootstrap(*list(times)[larger], statistic=slope, seed=seed)
 
 
 def larger_half(count: int) -> slice:

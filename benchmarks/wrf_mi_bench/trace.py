@@ -28,15 +28,11 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 from .comparison import line, room_file
 
 ROOMS = ("conference", "office")
-SAME_LENGTH_M = 1e-3
-SAME_POINT_M = 1e-2
-"""Tolerances of equal paths: length, and last interaction point."""
-ON_SURFACE_M = 1e-4
-"""Distance from a path's points within which a crossing is the reflection itself."""
-MIRRORED = 1e-5
-"""Tolerance of the cosine between bisector and normal of a reflection."""
-SHORTEST_M = 1e-2
-"""Least length of a segment in Sionna RT."""
+SAME_LENGTH_M = 1e-3  # largest difference of the lengths of equal paths
+SAME_POINT_M = 1e-2  # and of their last interaction points
+ON_SURFACE_M = 1e-4  # distance from a path's points within which a crossing is the reflection itself
+MIRRORED = 1e-5  # tolerance of the cosine between bisector and normal of a reflection
+SHORTEST_M = 1e-2  # least length of a segment in Sionna RT
 
 
 def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, Any]:
@@ -44,11 +40,8 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
 
     MATLAB's image method has perfect reflections without change of sign, two at most, so the channel is the sum over
     paths of lambda / (4 pi d) exp(-j k d). Paths that MATLAB lacks are confirmed in float64 by `confirm_paths`.
-
-    Returns:
-        Counts and shares of paths, errors in metres, quantiles of ``cea_db`` over all receivers with a channel in
-        MATLAB and over those where MATLAB lacks no path, seconds, and memory; None for quantiles of no receiver and
-        the share of no path.
+    Quantiles of ``cea_db`` are over all receivers with a channel in MATLAB, and over those where MATLAB lacks no path;
+    quantiles of no receiver and the share of no path are None.
     """
     file = Path(room)
     data = read_arrays(file, KEYS)
@@ -119,13 +112,8 @@ def match_paths(ours: PathKey, theirs: PathKey) -> tuple[IntArray, IntArray]:
 def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntArray, IntArray]:
     """One-to-one assignment of as many paths as possible of the same position, all of whose distances are below 1.
 
-    Args:
-        ours: index of the position of each path, [p].
-        theirs: index of the position of each path of the other list, [q].
-        distances: matrices of distances between paths a [n] and b [m] of both lists, [n, m] each.
-
-    Returns:
-        Indices into both lists, of equal length.
+    Positions are indices [p] and [q] of both lists of paths; ``distances`` gives matrices [n, m] between paths a [n]
+    and b [m] of both. Returns indices into both lists, of equal length.
     """
     pairs = [np.zeros((2, 0), np.int64)]
     for position in np.intersect1d(ours, theirs):
@@ -133,8 +121,8 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
         apart = np.stack(distances(a, b))
         same = apart.max(axis=0) < 1
         rows, columns = linear_sum_assignment(np.where(same, apart.sum(axis=0), 1e3))
-        kept = same[rows, columns]
-        pairs.append(np.stack([a[rows[kept]], b[columns[kept]]]))
+        matched = same[rows, columns]
+        pairs.append(np.stack([a[rows[matched]], b[columns[matched]]]))
     first, second = np.concatenate(pairs, axis=1)
     return first, second
 
@@ -142,11 +130,7 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
 def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
     """Which paths are mirror reflections or lines of sight without obstruction, by brute force in float64.
 
-    Args:
-        paths: paths of reflections to a receiver.
-        tx_pos_m: positions of the transmitters, [n_tx, 3].
-        rx_pos_m: position of the receiver, [3].
-        triangles: corners of the mesh in metres, [f, 3, 3].
+    Transmitters [n_tx, 3], a receiver [3] and corners of the mesh's triangles [f, 3, 3] are in metres.
     """
     corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)
@@ -161,13 +145,13 @@ def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, tria
         u, v = (np.cross(s, second[which]) * n).sum(axis=1), (np.cross(first[which], s) * n).sum(axis=1)
         return np.asarray((u >= -slack) & (v >= -slack) & (u + v <= 1 + slack))
 
-    def obstructed(here: FloatArray, there: FloatArray) -> bool:
-        length = float(np.linalg.norm(there - here))
-        way = (there - here) / length
+    def obstructed(start: FloatArray, end: FloatArray) -> bool:
+        length = float(np.linalg.norm(end - start))
+        way = (end - start) / length
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (offset - normal @ here) / (normal @ way)
+            t = (offset - normal @ start) / (normal @ way)
         which = np.flatnonzero((t > ON_SURFACE_M) & (t < length - ON_SURFACE_M))
-        return bool(inside(here + t[which, None] * way, which, 0.0).any())
+        return bool(inside(start + t[which, None] * way, which, 0.0).any())
 
     def mirrored(before: FloatArray, at: FloatArray, after: FloatArray) -> bool:
         which = np.flatnonzero(np.abs(normal @ at - offset) < ON_SURFACE_M)
@@ -187,14 +171,12 @@ def newrf() -> dict[str, Any]:
     """Both rooms of the NeWRF data compared with MATLAB's image method, with rows for the table."""
     figures = {name: image_method_agreement(room_file(name)) for name in ROOMS}
     rows = []
-    for name, found in figures.items():
-        lacking = (
-            f"MATLAB lacks {found['paths_matlab_lacks']} more, of which {found['of_these_confirmed']} are confirmed"
-        )
-        value = f"{100 * found['share_found']:.2f} %, lengths within {1e3 * found['length_error_m']:.2f} mm"
-        cea = f"{found['cea_db']['median']:.0f} dB (p10 {found['cea_db']['p10']:.0f} dB)"
+    for name, room in figures.items():
+        lacking = f"MATLAB lacks {room['paths_matlab_lacks']} more, of which {room['of_these_confirmed']} are confirmed"
+        value = f"{100 * room['share_found']:.2f} %, lengths within {1e3 * room['length_error_m']:.2f} mm"
+        cea = f"{room['cea_db']['median']:.0f} dB (p10 {room['cea_db']['p10']:.0f} dB)"
         rows += [
             line(f"{name}, paths found ({lacking})", value, "99 %, 1 mm"),
-            line(f"{name}, channel of all {found['receivers']} positions, median CEA", cea, "30 dB"),
+            line(f"{name}, channel of all {room['receivers']} positions, median CEA", cea, "30 dB"),
         ]
     return {"rows": rows, "rooms": figures}

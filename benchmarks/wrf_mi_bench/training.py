@@ -33,24 +33,20 @@ from wrf_mi.training.trainer import Trainer
 
 from .bench import run_command
 from .comparison import line
-from .timing import interleaved, seconds
+from .timing import history_of, interleaved
 
 DATA = "rfid-lab"
 TITLES = {"wrf-gs+": "WRF-GS+", "wrf-gs": "WRF-GS", "factorised": "factorised", "kriging": "kriging"}
-ASKED_S, ASKED_MB = 180, 2 * 1024
-"""Bounds on time and memory of kriging and of WRF-GS+, on two cores."""
+ASKED_S, ASKED_MB = 180, 2 * 1024  # bounds on time and memory of kriging and of WRF-GS+, on two cores
 BATCHES = (1, 4)
 """Transmitters of a timed step: the default, and a group that shares its geometry where that stands still."""
-STEPS, ROUNDS = 10, 9
-"""Steps of one timed call, and calls."""
+STEPS, ROUNDS = 10, 9  # steps of one timed call, and calls
 PRODUCT_SIZE = 1536
-STREAM_FLOATS = 1 << 26
-"""An array of 256 MB, which no cache holds."""
+STREAM_FLOATS = 1 << 26  # an array of 256 MB, which no cache holds
 FORWARD, BACKWARD = 28, 63
 """Operations of a pixel and a Gaussian on its tile's list, counted in `wrf_mi.gaussians.blend` (alpha blending): a
 multiply-add is two, a root, an exponential or a reciprocal one."""
-SHARED_FORWARD, SHARED_BACKWARD = 4, 8
-"""Operations of a further transmitter with the same geometry."""
+SHARED_FORWARD, SHARED_BACKWARD = 4, 8  # operations of a further transmitter with the same geometry
 QUIET = ("density.every=0", "log_every=1000000", "validate_every=1000000", "checkpoint_every=1000000")
 
 
@@ -75,8 +71,8 @@ def fit(model: str) -> dict[str, Any]:
         folder = Path(work) / "run"
         run_command(("train", DATA, "--model", model), folder, "bench training: ")
         metrics = json.loads((folder / METRICS).read_text())
-    kept = {key: metrics.get(key) for key in ("peak_memory_mb", "ssim", "gaussians", "steps")}
-    return {"seconds": metrics["train_seconds"], "processor_seconds": _children_seconds() - before, **kept}
+    figures = {key: metrics.get(key) for key in ("peak_memory_mb", "ssim", "gaussians", "steps")}
+    return {"seconds": metrics["train_seconds"], "processor_seconds": _children_seconds() - before, **figures}
 
 
 def _children_seconds() -> float:
@@ -88,8 +84,8 @@ def _children_seconds() -> float:
 def trainer(model: str, gaussians: int, batch: int) -> Trainer:
     """Trainer with a number of Gaussians and transmitters a step, otherwise default, without end."""
     record = load_record(DATA)
-    given = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
-    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), given))
+    settings = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
+    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), settings))
 
 
 def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
@@ -173,12 +169,7 @@ PRODUCTS, WALKS = "products of networks", "two longest kernels, the walks of spl
 
 def shares(call: Callable[[], Any]) -> dict[str, float]:
     """Shares of the time of a call by kind of work, from Dr.Jit's kernel history."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()  # recorded again, as recordings depend on this flag
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        whole = 1e3 * seconds(call)
-        history = dr.kernel_history()
+    total_ms, history = history_of(call, again=True)  # recorded again, as recordings depend on the history's flag
     by_kind: Counter[str] = Counter()
     by_kernel: Counter[str] = Counter()
     for entry in history:
@@ -194,8 +185,8 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
         "other kernels": kernels - walks,
         "sorts, sums and copies": sum(by_kind.values()),
     }
-    parts["launching them, Python"] = max(whole - sum(parts.values()), 0.0)
-    return {name: value / whole for name, value in parts.items()}
+    parts["launching them, Python"] = max(total_ms - sum(parts.values()), 0.0)
+    return {name: value / total_ms for name, value in parts.items()}
 
 
 def main() -> dict[str, Any]:
@@ -213,7 +204,7 @@ def main() -> dict[str, Any]:
     times = interleaved(calls, ROUNDS)
     peak = 2e-6 * PRODUCT_SIZE**3 / bootstrap(times["product"], statistic=np.min).value
     stream = 8e-6 * STREAM_FLOATS / bootstrap(times["stream"], statistic=np.min).value
-    found = {
+    of_steps = {
         name: {
             "ms": asdict(bootstrap(times[name] / STEPS)),
             "least_ms": float(times[name].min() / STEPS),
@@ -223,7 +214,7 @@ def main() -> dict[str, Any]:
         for name, of in trainers.items()
     }
     machine = {"product_gflop_s": peak, "stream_gb_s": stream}
-    return {"rows": rows(fits, found, machine), "fits": fits, "steps": found, "machine": machine}
+    return {"rows": rows(fits, of_steps, machine), "fits": fits, "steps": of_steps, "machine": machine}
 
 
 def rows(
@@ -233,17 +224,17 @@ def rows(
     peak, stream = machine["product_gflop_s"], machine["stream_gb_s"]
     best = f"{peak:.0f} GFLOP/s in a product, {stream:.1f} GB/s read and written"
     lines = [line("the machine's best", best)]
-    for model, one in fits.items():
+    for model, run in fits.items():
         value = (
-            f"{one['seconds']:.0f} s, of processors {one['processor_seconds']:.0f} s; {one['peak_memory_mb']:.0f} MB; "
-            f"median SSIM {one['ssim']['median']:.3f}"
+            f"{run['seconds']:.0f} s, of processors {run['processor_seconds']:.0f} s; {run['peak_memory_mb']:.0f} MB; "
+            f"median SSIM {run['ssim']['median']:.3f}"
         )
         asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "kriging") else ""
         lines.append(line(f"{TITLES[model]}, fit to its final accuracy", value, asked))
-    for name, one in steps.items():
+    for name, run in steps.items():
         title, _, batch = name.rpartition(", ")
         where = f"{title}, a step of {batch} transmitter{'s' if int(batch) > 1 else ''}"
-        work, ms = Work(**one["work"]), Interval(**one["ms"])
+        work, ms = Work(**run["work"]), Interval(**run["ms"])
         # At best arithmetic and transfers overlap.
         limit_ms = 1e3 * max(work.gflop / peak, work.moved_gb / stream)
         value = (
@@ -251,6 +242,6 @@ def rows(
             f"{1e3 * work.moved_gb:.0f} MB moved: at least {limit_ms:.2f} ms, {100 * limit_ms / ms.value:.0f} %"
         )
         lines.append(line(where, value))
-        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in one["shares"].items())
+        parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in run["shares"].items())
         lines.append(line(f"{where}: where its time goes", parts))
     return lines

@@ -9,7 +9,7 @@ intervals are 95 % bootstrap intervals over rows. Each fold of each seed is stor
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from wrf_mi.correction import CorrectionOptions, correct_scene, default_options,
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import train
 from wrf_mi.runs.results import Observations, Results, read_run
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
 from wrf_mi.synthetic.furnished_room import BANDS
@@ -36,13 +37,11 @@ from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of
 
 RUNS = Path("runs/bench/unmeasured")
-LEFT = (0, 5, 20, 100)
-"""Numbers of rows at each receiver that is held out."""
+LEFT = (0, 5, 20, 100)  # numbers of rows at each receiver that is held out
 HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected scene"
 KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
 OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
-SCORE_DIGITS = 4
-"""Decimals of stored scores: finer than any difference that is reported."""
+SCORE_DIGITS = 4  # decimals of stored scores: finer than any difference that is reported
 PAIRS = "pairs"
 FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 """What is known of a measurement beside the scores of the methods."""
@@ -50,21 +49,13 @@ FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 
 @dataclass(frozen=True)
 class Held:
-    """A data set, and the split whose folds are held out.
+    """A data set, and the split whose folds are held out."""
 
-    Attributes:
-        dataset: name.
-        kind: ``frequency`` or ``receiver``.
-        n_train: number of training rows; None: all.
-        parts: what is corrected; None: the default of the task.
-        folds: number of folds.
-    """
-
-    dataset: str
-    kind: str
-    n_train: int | None
-    parts: tuple[str, ...] | None
-    folds: int
+    dataset: str  # name
+    kind: str  # ``frequency`` or ``receiver``
+    n_train: int | None  # number of training rows; None: all
+    parts: tuple[str, ...] | None  # what is corrected; None: the default of the task
+    folds: int  # number of folds
 
 
 CARRIERS = (Held(BANDS, "frequency", None, ("materials",), 5),)
@@ -92,9 +83,9 @@ def _run(place: Path, record: str | Record, split: Split | str, seed: int, model
 
 def _scores(run: Results, prediction: Observations | None = None) -> list[float]:
     """Scores of a run, or of another prediction of its rows, receiver by receiver where the truth is known."""
-    found = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
-    found = np.asarray(found, float)[:, np.argsort(run.row)]
-    return [round(float(one), SCORE_DIGITS) for one in found[np.isfinite(found)]]
+    scores = run.score if prediction is None else TASKS[run.task].of_rows(prediction, run.truth)
+    scores = np.asarray(scores, float)[:, np.argsort(run.row)]
+    return [round(float(score), SCORE_DIGITS) for score in scores[np.isfinite(scores)]]
 
 
 def _facts(hybrid: Results) -> dict[str, Any]:
@@ -110,11 +101,11 @@ def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
     split = f"{held.kind}:{fold}"
     (rows,) = make_splits(record, split, seed, held.n_train)
     better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
-    given: dict[str, Any] = {"n_train": held.n_train}
-    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **given)
-    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **given)
-    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **given)
-    kriging = _run(folder, held.dataset, split, seed, "kriging", **given)
+    rows_used: dict[str, Any] = {"n_train": held.n_train}
+    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **rows_used)
+    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **rows_used)
+    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **rows_used)
+    kriging = _run(folder, held.dataset, split, seed, "kriging", **rows_used)
     return {
         HYBRID: _scores(hybrid),
         TRACED: _scores(traced),
@@ -138,17 +129,17 @@ def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> d
     split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
     (rows,) = make_splits(record, split, seed, held.n_train)
     hybrid = _run(folder, record, rows, seed, "hybrid", scene=scene)
-    found: dict[str, Any] = {HYBRID: _scores(hybrid)}
+    scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
         alone, these = only(record, rows)
-        found[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
-        found[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
-        found[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
+        scores[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
+        scores[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
+        scores[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
     else:
-        for name, given in ((TRACED, scene), (CORRECTED, better)):
-            found[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=given, settings=TRANSMISSION))
-        found[LAW] = _scores(hybrid, hybrid.references["law"])
-    return found | _facts(hybrid)
+        for name, where in ((TRACED, scene), (CORRECTED, better)):
+            scores[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=where, settings=TRANSMISSION))
+        scores[LAW] = _scores(hybrid, hybrid.references["law"])
+    return scores | _facts(hybrid)
 
 
 def only(record: Record, split: Split) -> tuple[Record, Split]:
@@ -166,20 +157,20 @@ def _scene(held: Held, folder: Path) -> str:
     return str(meshed_scan(held.dataset, folder))
 
 
-def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
+def gains(measurements: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
     """Median and mean of each method, pooled, and the hybrid's mean gain over it with its interval, by name.
 
     Seeds score the same pairs of receiver and row, whose mean counts once.
     """
-    task = TASKS[found[0]["task"]]
+    task = TASKS[measurements[0]["task"]]
     sign = 1 if task.higher_is_better else -1
-    names = [name for name in found[0] if name not in FACTS]
-    pairs = [tuple(pair) for one in found for pair in one[PAIRS]]
+    names = [name for name in measurements[0] if name not in FACTS]
+    pairs = [tuple(pair) for measurement in measurements for pair in measurement[PAIRS]]
     place = {pair: k for k, pair in enumerate(dict.fromkeys(pairs))}
     number = np.array([place[pair] for pair in pairs])
     pooled = {}
     for name in names:
-        scores = np.clip(np.concatenate([one[name] for one in found]), *task.limits)
+        scores = np.clip(np.concatenate([measurement[name] for measurement in measurements]), *task.limits)
         pooled[name] = np.bincount(number, scores) / np.bincount(number)
     return {
         name: (
@@ -191,11 +182,11 @@ def gains(found: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, A
     }
 
 
-def _rows(what: str, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    digits = TASKS[found[0]["task"]].digits
-    inside = float(np.mean([one["inside_90"] for one in found]))
+def _rows(what: str, measurements: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    digits = TASKS[measurements[0]["task"]].digits
+    inside = float(np.mean([measurement["inside_90"] for measurement in measurements]))
     rows = []
-    for name, (median, mean, gain) in gains(found).items():
+    for name, (median, mean, gain) in gains(measurements).items():
         value = f"median {median:.{digits}f}, mean {mean:.{digits}f}"
         asked = f"{inside:.0%} inside (80 to 97 %)" if gain is None else f"hybrid better by {gain}"
         figures = {"at": what, "method": name, "median": median, "mean": mean, "inside": inside, "digits": digits}
@@ -212,14 +203,14 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     places = dict.fromkeys(row["at"] for row in rows)
     by_place = [[row for row in rows if row["at"] == at] for at in places]
     methods = [row["method"] for row in by_place[0]][1:]
-    shared = any([row["method"] for row in found][1:] != methods for found in by_place)
+    shared = any([row["method"] for row in of_place][1:] != methods for of_place in by_place)
     columns = ["held out", HYBRID, "inside", *(["others"] if shared else methods)]
-    lines = [f"| {' | '.join(columns)} |", f"| {' | '.join(['---'] * len(columns))} |"]
+    lines = []
     for at, (hybrid, *others) in zip(places, by_place, strict=True):
         cells = [f"{row['method']} {_with_gain(row)}" if shared else _with_gain(row) for row in others]
         first = [at, f"**{_score(hybrid)}**", f"{hybrid['inside']:.0%}"]
-        lines.append(f"| {' | '.join([*first, *(['; '.join(cells)] if shared else cells)])} |")
-    return "\n".join(lines)
+        lines.append([*first, *(["; ".join(cells)] if shared else cells)])
+    return markdown_table(columns, lines)
 
 
 def _score(row: Mapping[str, Any]) -> str:
@@ -233,32 +224,37 @@ def _with_gain(row: Mapping[str, Any]) -> str:
 
 def carriers() -> dict[str, Any]:
     """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
+    place = RUNS / fit_key(source_files())
+    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
     for held in CARRIERS:
         hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
         for fold in range(held.folds):
-            found = []
-            for seed in SEEDS:
-                name = f"{held.dataset}-{fold}-{seed}"
-                how = partial(at_carrier, held, fold, seed, place / name)
-                found.append(stored_part("new-carriers", name, how))
-            every += found
-            rows += _rows(f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz", found)
-    return {"rows": rows, "measured": measured_on(every)}
+            names = {seed: f"{held.dataset}-{fold}-{seed}" for seed in SEEDS}
+            parts[f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
+                name: partial(at_carrier, held, fold, seed, place / name) for seed, name in names.items()
+            }
+    return _measured("new-carriers", parts)
 
 
 def receivers() -> dict[str, Any]:
     """Measure receivers held out in turn, without and with few rows of their own, three seeds, as `carriers`."""
     data_folder(FLAT)
-    place, rows, every = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
+    place = RUNS / fit_key(source_files())
+    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
     for held in RECEIVERS:
         for left in LEFT:
-            found = []
-            for seed in SEEDS:
-                for fold in range(held.folds):
-                    name = f"{held.dataset}-{left}-{fold}-{seed}"
-                    how = partial(at_receivers, held, left, fold, seed, place / name)
-                    found.append(stored_part("new-receivers", name, how))
-            every += found
-            rows += _rows(f"{held.dataset}, {left} rows at new receivers", found)
-    return {"rows": rows, "measured": measured_on(every)}
+            names = {(seed, k): f"{held.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(held.folds)}
+            parts[f"{held.dataset}, {left} rows at new receivers"] = {
+                name: partial(at_receivers, held, left, k, seed, place / name) for (seed, k), name in names.items()
+            }
+    return _measured("new-receivers", parts)
+
+
+def _measured(benchmark: str, parts: Mapping[str, Mapping[str, Callable[[], dict[str, Any]]]]) -> dict[str, Any]:
+    """Rows of the table, of stored or new measurements by name, which are pooled by what was held out."""
+    rows, measurements = list[dict[str, Any]](), list[dict[str, Any]]()
+    for what, works in parts.items():
+        pooled = [stored_part(benchmark, name, work) for name, work in works.items()]
+        measurements += pooled
+        rows += _rows(what, pooled)
+    return {"rows": rows, "measured": measured_on(measurements)}

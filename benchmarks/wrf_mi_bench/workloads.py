@@ -78,5 +78,5 @@ def tracer(options: TraceOptions) -> RayTracer:
 def record(rows: int, **more: Any) -> Record:
     """Random spectra."""
     observation = np.random.default_rng(0).random((1, rows, HEIGHT, WIDTH)).astype(np.float32)
-    given = {"receivers": (RECEIVER,)} | more
-    return Record("random", "spectrum", transmitter_path(rows), observation=observation, **given)
+    facts = {"receivers": (RECEIVER,)} | more
+    return Record("random", "spectrum", transmitter_path(rows), observation=observation, **facts)

@@ -11,8 +11,7 @@ import pytest
 from wrf_mi_bench import quick as bench_quick
 from wrf_mi_bench.bench import BenchFailed
 from wrf_mi_bench.quick import FILE, PAIRS, Pair, measure_pairs, quick, ratio_table, read_stored, worse
-from wrf_mi_bench.stock import StockRenderer
-from wrf_mi_bench.traced import difference, random_field, splatted
+from wrf_mi_bench.traced import StockRenderer, difference, random_field, splatted
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.core import InputError

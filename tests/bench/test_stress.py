@@ -13,11 +13,10 @@ from wrf_mi_bench import stress as bench_stress
 from wrf_mi_bench import stress_fields, stress_joint, stress_plugins, stress_receivers, stress_rows
 from wrf_mi_bench.comparison import Row
 from wrf_mi_bench.stress_fields import HARD, Field, image, image_row, made, reference
-from wrf_mi_bench.stress_joint import joint
+from wrf_mi_bench.stress_joint import joint, phases
 from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_receivers import of_fields
 from wrf_mi_bench.stress_rows import held, worst_of
-from wrf_mi_bench.stress_traced import phases
 
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, PlaneTables

@@ -10,6 +10,7 @@ from calling import call, refused
 
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
+from wrf_mi.runs.folder import RunRequest
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.options import without_effect
 
@@ -78,16 +79,16 @@ def test_options_of_trace_without_effect_are_refused(
 def test_settings_of_ray_tracing_without_effect_are_named(
     settings: dict[str, Any], seed: int, warned: list[str], flat_folder: Path, room: Path, caplog: Any
 ) -> None:
-    plan_run(flat_folder, "ray-tracing", scene=room, seed=seed, **settings)
+    plan_run(flat_folder, RunRequest("ray-tracing", scene=room, seed=seed, **settings))
     found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(found) == len(warned)
     assert all(one.startswith(start) for one, start in zip(found, warned, strict=True)), found
 
 
 def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: Any) -> None:
-    plan_run(flat_folder, "wrf-gs+")
+    plan_run(flat_folder, RunRequest("wrf-gs+"))
     assert caplog.text == ""
-    plan_run(flat_folder, "wrf-gs+", settings=["traced.depth=5", "traced.rays=64"])
+    plan_run(flat_folder, RunRequest("wrf-gs+", settings=["traced.depth=5", "traced.rays=64"]))
     assert "traced.depth, traced.rays: no effect without a scene" in caplog.text
 
 

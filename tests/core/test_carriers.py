@@ -21,6 +21,7 @@ from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
 from wrf_mi.models import MODELS
 from wrf_mi.runs.api import open_run, plan_run, train
 from wrf_mi.runs.evaluate import reference_predictions
+from wrf_mi.runs.folder import RunRequest
 from wrf_mi.runs.results import read_run
 from wrf_mi.tasks import CARRIER, TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace
@@ -74,7 +75,7 @@ def test_models_of_several_carriers_are_named(flat: Record) -> None:
     with pytest.raises(
         InputError, match=r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
     ):
-        plan_run(flat, "nerf2")
+        plan_run(flat, RunRequest("nerf2"))
 
 
 def test_inconsistent_carriers_are_refused(flat: Record) -> None:
@@ -84,10 +85,10 @@ def test_inconsistent_carriers_are_refused(flat: Record) -> None:
         ({"frequencies_hz": np.ones(1)}, "set one of the two to None"),
     ):
         with pytest.raises(InputError, match=message):
-            plan_run(replace(flat, **change), "idw")
+            plan_run(replace(flat, **change), RunRequest("idw"))
     record = channels()
     with pytest.raises(InputError, match="carriers_hz belongs to spectra and signal strengths"):
-        plan_run(replace(record, frequencies_hz=None, carriers_hz=np.ones(len(record))), "linear")
+        plan_run(replace(record, frequencies_hz=None, carriers_hz=np.ones(len(record))), RunRequest("linear"))
 
 
 @pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])

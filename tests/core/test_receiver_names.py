@@ -13,6 +13,7 @@ import pytest
 
 from wrf_mi.core import InputError, Receiver, receivers
 from wrf_mi.core.receivers import receiver_index
+from wrf_mi.models import Inputs
 from wrf_mi.runs.prediction_file import write_prediction_file
 
 NAMES = ("kitchen", "1", "anchor2", "0")
@@ -77,13 +78,8 @@ def test_runs_predict_for_a_receiver_by_name(plain_flat_folder: Path, tmp_path: 
 
 
 def test_predicted_table_has_a_column_for_each_of_two_receivers_of_one_name(tmp_path: Path) -> None:
-    arrays = {
-        "row": np.arange(2),
-        "tx_pos": np.zeros((2, 3)),
-        "receiver_name": np.array(["a", "a"]),
-        "prediction": np.array([[-40.0, -41.0], [-50.0, -51.0]]),
-    }
-    write_prediction_file(tmp_path / "p.csv", arrays, None)
+    observations = {"prediction": np.array([[-40.0, -41.0], [-50.0, -51.0]])}
+    write_prediction_file(tmp_path / "p.csv", Inputs(np.zeros((2, 3))), ["a", "a"], observations)
     header, first, _ = (tmp_path / "p.csv").read_text().splitlines()
     assert header == "x,y,z,a_dbm,a_dbm"
     assert first == "0.0,0.0,0.0,-40.0,-50.0"

@@ -23,8 +23,7 @@ from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
 from wrf_mi.maps.locate_file import read_observations
-from wrf_mi.maps.locate_knn import Neighbours
-from wrf_mi.maps.locate_likelihood import Likelihood, Silence, densest, region_of
+from wrf_mi.maps.locate_likelihood import Likelihood, Neighbours, Silence, densest, region_of
 from wrf_mi.runs.api import train
 
 ROUNDING = 1e-9
@@ -139,8 +138,8 @@ def test_receivers_that_received_nothing_count_where_strength_decides_reception(
 
 def test_probability_of_silence_is_one_half_in_the_middle() -> None:
     silence = Silence(-80.0, 0.5)
-    assert np.exp(silence.log_received(np.array(-80.0))) == pytest.approx(0.5)
-    total = np.exp(silence.log_received(np.array([-90.0, -70]))) + np.exp(silence.log_silent(np.array([-90.0, -70])))
+    assert np.exp(silence.log_probability(np.array(-80.0), True)) == pytest.approx(0.5)
+    total = sum(np.exp(silence.log_probability(np.array([-90.0, -70]), received)) for received in (True, False))
     np.testing.assert_allclose(total, 1, atol=ROUNDING)
     assert (
         fit_silence(

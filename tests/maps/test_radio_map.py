@@ -18,7 +18,7 @@ from traced_rooms import SHOEBOX, THICKNESS_M, write_xml
 
 import wrf_mi
 from wrf_mi.core import InputError, Record
-from wrf_mi.maps import values
+from wrf_mi.maps import api
 from wrf_mi.maps.api import radio_map
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
@@ -121,7 +121,7 @@ def test_chunks_and_choices_of_receivers_do_not_change_values(
     given = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
     kitchen = radio_map(law, receivers=["kitchen"], **given)
     np.testing.assert_array_equal(kitchen["power_dbm"][0], mapped["power_dbm"][1])
-    monkeypatch.setattr(values, "CHUNK_SIZE", 7)
+    monkeypatch.setattr(api, "CHUNK_SIZE", 7)
     xr.testing.assert_allclose(radio_map(law, **given), mapped, rtol=FLOAT32)
 
 

@@ -19,14 +19,14 @@ from calling import SMALL
 from test_compare import captured, make_run
 
 from wrf_mi.cli.main import build_parser
-from wrf_mi.cli.train import training_arguments
+from wrf_mi.cli.train import training_request
 from wrf_mi.core import Record
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.runs.compare_page import changed_settings, command
 from wrf_mi.runs.compare_tables import best_run, common, common_means, differences
-from wrf_mi.runs.folder import AntennaOptions, read_config, start_run
-from wrf_mi.runs.repeat import changed_settings, command
+from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
 
@@ -118,7 +118,7 @@ def seeds(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> list[P
     """Folders with the configurations of three seeds."""
     out = tmp_path_factory.mktemp("seeds")
     for seed in range(3):
-        _, config, splits = plan_run(flat_folder, "trees", seed=seed)
+        _, config, splits = plan_run(flat_folder, RunRequest("trees", seed=seed))
         start_run(out / f"seed{seed}", config, splits)
     return [out / f"seed{seed}" for seed in range(3)]
 
@@ -165,13 +165,13 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
     flat = Path(shutil.copytree(flat_folder, tmp_path / "a flat"))
     make_scene(flat / "layout.csv", flat / "room", height_m=2.7)
     for dataset, arguments in every_run(folder, flat):
-        _, config, _ = plan_run(str(dataset), **arguments)
+        _, config, _ = plan_run(str(dataset), RunRequest(**arguments))
         line = command(config, tmp_path / "it's a run")
         program, *words = shlex.split(line)
         assert program == "wrf-mi"
         parsed = build_parser().parse_args(words)
         assert parsed.out == str(tmp_path / "it's a run")
-        again = plan_run(parsed.dataset, **training_arguments(parsed))[1]
+        again = plan_run(parsed.dataset, training_request(parsed))[1]
         assert again == config, line
 
 
@@ -182,7 +182,7 @@ def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, o
     resolved = "encoding.tx_scale_m"  # found from the data, which the command states, too
     assert set(changed) - {resolved} == {setting.partition("=")[0] for setting in steps}
     parsed = build_parser().parse_args(shlex.split(command(read_config(run), tmp_path / "again"))[1:])
-    assert plan_run(parsed.dataset, **training_arguments(parsed))[1] == open_run(run).config
+    assert plan_run(parsed.dataset, training_request(parsed))[1] == open_run(run).config
     page = compare([run], tmp_path / "out").read_text()
     assert command(read_config(run), run) in unescape(page)
     assert "loss.ssim_weight=0.25" in page

@@ -13,6 +13,7 @@ from made_flat import NAMED_ANCHORS_M
 from wrf_mi.core import Record
 from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.datasets.folder_files import read_csv
+from wrf_mi.models import Inputs
 from wrf_mi.runs.api import train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.prediction_file import read_inputs, write_prediction_file
@@ -90,13 +91,10 @@ def test_csv_predictions_equal_npz_predictions(
 
 def test_table_of_one_receiver_has_empty_fields_where_nothing_is_received(tmp_path: Path) -> None:
     """And names that CSV quotes."""
-    arrays = {
-        "row": np.arange(2),
-        "prediction": np.array([[-50.25, np.nan]], np.float32),
-        "tx_pos": np.arange(6).reshape(2, 3),
-        "receiver_name": np.array(['hall, "upper"']),
-    }
-    assert write_prediction_file(tmp_path / "out.csv", arrays, None)["prediction"].shape == (2,)
+    inputs = Inputs(np.arange(6.0).reshape(2, 3))
+    observations = {"prediction": np.array([[-50.25, np.nan]], np.float32)}
+    written = write_prediction_file(tmp_path / "out.csv", inputs, ['hall, "upper"'], observations)
+    assert written["prediction"].shape == (2,)
     table = read_csv(tmp_path / "out.csv")
     np.testing.assert_array_equal(table.numbers('hall, "upper"_dbm', may_be_empty=True), [-50.25, np.nan])
     assert (tmp_path / "out.csv").read_text().splitlines()[2] == "3.0,4.0,5.0,"

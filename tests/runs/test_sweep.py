@@ -19,9 +19,10 @@ import pytest
 from calling import SET, call, refused
 
 from wrf_mi.cli.main import build_parser, main
-from wrf_mi.cli.train import TRACING, training_arguments, training_names
+from wrf_mi.cli.train import TRACING, training_names, training_request
 from wrf_mi.core import InputError
 from wrf_mi.runs import sweep as module
+from wrf_mi.runs.folder import RunRequest
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.sweep import FLAGS, OPTIONS, Sweep, check_failures, plan_sweep, run_sweep, sweep_table
 
@@ -97,7 +98,7 @@ def test_each_run_has_every_option_of_the_sweep(
     """Options that a sweep shares with train are those of its runs, alone and varied."""
     planned: list[Sweep] = []
 
-    def stop(dataset: str, arguments: dict[str, object]) -> None:
+    def stop(dataset: str, request: RunRequest) -> None:
         raise InputError("planned")
 
     def plan(*arguments: Any) -> Sweep:
@@ -118,7 +119,7 @@ def test_each_run_has_every_option_of_the_sweep(
     plain, optioned = (parser.parse_args(sweep.runs[0].arguments) for sweep in planned)
     assert vars(plain) | {action.dest: getattr(optioned, action.dest)} == vars(optioned)
     assert getattr(optioned, action.dest) == getattr(parser.parse_args(["train", *option]), action.dest)
-    assert training_arguments(plain) != training_arguments(optioned)
+    assert training_request(plain) != training_request(optioned)
 
 
 def test_bad_input_is_refused_before_anything_starts(

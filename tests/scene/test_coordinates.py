@@ -22,7 +22,7 @@ from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.surfaces import sampled as points_on
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene
-from wrf_mi.viewer.scene_layer import read_scene
+from wrf_mi.viewer.layers import read_scene
 
 ROOM = (6.0, 5.0, 2.5)
 GRID = np.array([701_362.56, 4_485_513.72, 1650.1])

@@ -21,9 +21,8 @@ from PIL import Image
 from wrf_mi.core import InputError
 from wrf_mi.viewer import page as page_module
 from wrf_mi.viewer import view as view_module
-from wrf_mi.viewer.pack import LARGEST, MISSING, SMALLEST_RANGE, packed
-from wrf_mi.viewer.page import page, plotly_js
-from wrf_mi.viewer.run_layers import png
+from wrf_mi.viewer.layers import png
+from wrf_mi.viewer.page import LARGEST, MISSING, SMALLEST_RANGE, packed, page, plotly_js
 from wrf_mi.viewer.view import View
 
 ROUNDED = 0.51 / LARGEST

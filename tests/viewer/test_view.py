@@ -21,9 +21,8 @@ from wrf_mi.runs.run import open_run
 from wrf_mi.tracing import load_trace, open_scene
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.viewer.content import ViewOptions
+from wrf_mi.viewer.layers import path_layer, power_db, representative, scene_content, surfaces_in
 from wrf_mi.viewer.map_layer import read_map, thinned
-from wrf_mi.viewer.run_layers import path_layer, power_db, representative
-from wrf_mi.viewer.scene_layer import scene_content, surfaces_in
 
 FLOAT32 = 1e-5
 """Relative rounding of float32."""

@@ -70,19 +70,19 @@ def info_command(a: Arguments) -> int:
     """Summarise a data set."""
     from ..synthetic import load_record
 
-    found = summary(load_record(a.dataset, progress=True))
-    return show(a.json, found, render(found))
+    facts = summary(load_record(a.dataset, progress=True))
+    return show(a.json, facts, render(facts))
 
 
 def check_command(a: Arguments) -> int:
     """Report faults (exit status 2) and suspicions (0, or 1 if asked) of a data set."""
     from ..checking import check_data
 
-    found = check_data(a.dataset, a.ignore, progress=True)
-    show(a.json, found.as_dict(), "\n".join(found.lines()))
-    if not found.ok:
+    report = check_data(a.dataset, a.ignore, progress=True)
+    show(a.json, report.as_dict(), "\n".join(report.lines()))
+    if not report.ok:
         return 2
-    return 1 if a.strict and found.suspicions else 0
+    return 1 if a.strict and report.suspicions else 0
 
 
 def summary(record: Record) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def summary(record: Record) -> dict[str, Any]:
     from ..models.checks import check_parts
 
     check_parts(record)
-    seen = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
+    received = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
     carriers = None
     if record.carriers_hz is not None:
         hz, rows = np.unique(record.carriers_hz, return_counts=True)
@@ -112,14 +112,14 @@ def summary(record: Record) -> dict[str, Any]:
         "task": record.task,
         "source": record.source,
         "rows": len(record),
-        "receivers": {r.name: int(count) for r, count in zip(record.receivers, seen.sum(axis=1), strict=True)},
+        "receivers": {r.name: int(count) for r, count in zip(record.receivers, received.sum(axis=1), strict=True)},
         "observation": list(record.observation.shape[2:]),
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
         "carriers_hz": carriers,
         "runs": runs,
-        "n_readings": _range(record.n_readings, seen),
-        "std_db": _range(record.std, seen),
+        "n_readings": _range(record.n_readings, received),
+        "std_db": _range(record.std, received),
         "positions": record.has_positions,
         "headings": record.tx_heading_rad is not None,
         "uplink": record.uplink is not None,
@@ -127,14 +127,12 @@ def summary(record: Record) -> dict[str, Any]:
     }
 
 
-def render(found: dict[str, Any]) -> str:
+def render(facts: dict[str, Any]) -> str:
     """`summary` as text."""
-    shape = " x ".join(map(str, found["observation"])) or "one number"
-    received = ", ".join(f"{name} {count}" for name, count in found["receivers"].items())
-    official = (
-        "not stated" if found["official"] is None else "{} training rows, {} test rows".format(*found["official"])
-    )
-    carriers, frequencies = found["carriers_hz"], found["frequencies_hz"]
+    shape = " x ".join(map(str, facts["observation"])) or "one number"
+    received = ", ".join(f"{name} {count}" for name, count in facts["receivers"].items())
+    official = "{} training rows, {} test rows".format(*facts["official"]) if facts["official"] else "not stated"
+    carriers, frequencies = facts["carriers_hz"], facts["frequencies_hz"]
     if carriers is not None:
         carrier = carriers_text(np.array(list(carriers)))
         if len(carriers) <= SHOWN_CARRIERS:
@@ -144,26 +142,26 @@ def render(found: dict[str, Any]) -> str:
     else:
         band = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
         carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else band
-    known = [name for name in ("positions", "headings", "uplink", "truth") if found[name]]
+    known = [name for name in ("positions", "headings", "uplink", "truth") if facts[name]]
     lines = {
-        "data set": f"{found['name']}, {found['task']}, {found['source']}",
-        "rows": f"{found['rows']}, each {shape}",
+        "data set": f"{facts['name']}, {facts['task']}, {facts['source']}",
+        "rows": f"{facts['rows']}, each {shape}",
         "received": received,
         "official split": official,
         "carrier": carrier,
-        "runs": "not stated" if found["runs"] is None else ", ".join(f"{k} {n}" for k, n in found["runs"].items()),
-        "readings per row": _shown(found["n_readings"], ""),
-        "noise": _shown(found["std_db"], " dB"),
+        "runs": "not stated" if facts["runs"] is None else ", ".join(f"{k} {n}" for k, n in facts["runs"].items()),
+        "readings per row": _shown(facts["n_readings"], ""),
+        "noise": _shown(facts["std_db"], " dB"),
         "known": ", ".join(known) or "observations alone",
     }
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 
 
-def _range(values: NDArray[Any] | None, seen: NDArray[np.bool_]) -> list[float] | None:
+def _range(values: NDArray[Any] | None, received: NDArray[np.bool_]) -> list[float] | None:
     """Minimum, median and maximum where something was received."""
-    if values is None or not seen.any():
+    if values is None or not received.any():
         return None
-    return [float(value) for value in np.percentile(values[seen], [0, 50, 100])]
+    return [float(value) for value in np.percentile(values[received], [0, 50, 100])]
 
 
 def _shown(values: list[float] | None, unit: str) -> str:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 REAL = "rfid-lab"
 FLAT = "flat-ble"
 FLAT_PLAN = "layout.csv"
-FLAT_HEIGHT_M = 2.7
-"""Usual height of a room; the plan does not state it."""
+FLAT_HEIGHT_M = 2.7  # usual height of a room; the plan does not state it
 
 
 def add_parser(commands: Any) -> None:

@@ -40,8 +40,8 @@ def report() -> dict[str, Any]:
     """
     problems: list[dict[str, str]] = []
     versions = {name: installed_version(name) for name in _PACKAGES}
-    for name, found in versions.items():
-        if found is None:
+    for name, version in versions.items():
+        if version is None:
             problems.append({"problem": f"the package {name} is not installed", "remedy": "pip install -e ."})
     complete = not problems
     llvm = [_llvm(library) for library in find_llvm(ignore_variable=True)]
@@ -68,22 +68,22 @@ def report() -> dict[str, Any]:
     }
 
 
-def render(found: dict[str, Any]) -> str:
+def render(state: dict[str, Any]) -> str:
     """Report as text."""
-    backend = found["backend"]
+    backend = state["backend"]
     lines = [
         ("backend", f"{backend['name']} ({backend['variant']}) on {backend['device']}" if backend else "none"),
-        ("threads", str(found["threads"])),
-        ("GPU", found["gpu"]["device"] or found["gpu"]["reason"]),
+        ("threads", str(state["threads"])),
+        ("GPU", state["gpu"]["device"] or state["gpu"]["reason"]),
     ]
-    lines += [("LLVM", _llvm_line(library, backend)) for library in found["llvm"]] or [("LLVM", "none found")]
-    lines += [("Python", found["python"]), ("system", found["system"])]
-    lines += [(name, text or "not installed") for name, text in found["versions"].items()]
-    lines.append(("data", found["data"]["home"]))
-    lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in found["data"]["sets"]]
+    lines += [("LLVM", _llvm_line(library, backend)) for library in state["llvm"]] or [("LLVM", "none found")]
+    lines += [("Python", state["python"]), ("system", state["system"])]
+    lines += [(name, text or "not installed") for name, text in state["versions"].items()]
+    lines.append(("data", state["data"]["home"]))
+    lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in state["data"]["sets"]]
     width = max(len(label) for label, _ in lines) + 2
     text = [f"{label:<{width}}{value}" for label, value in lines]
-    for entry in found["problems"]:
+    for entry in state["problems"]:
         text += ["", entry["problem"], f"  remedy: {entry['remedy']}"]
     return "\n".join(text)
 
@@ -125,9 +125,9 @@ def doctor_command(a: Arguments) -> int:
     """Report on this machine; with ``--install-llvm`` LLVM is installed first."""
     if a.install_llvm:
         install_llvm()
-    found = report()
-    show(a.json, found, render(found))
-    return 0 if found["ok"] else 1
+    state = report()
+    show(a.json, state, render(state))
+    return 0 if state["ok"] else 1
 
 
 def _llvm(library: LlvmLibrary) -> dict[str, Any]:

@@ -22,7 +22,7 @@ def add_parser(commands: Any) -> None:
     parser = add_command(commands, "export", export_command, text)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     width = max(map(len, FORMATS)) + 2
-    lines = [f"  {name:<{width}}{' or '.join(one.kinds).upper():<14}{one.text}" for name, one in FORMATS.items()]
+    lines = [f"  {name:<{width}}{' or '.join(form.kinds).upper():<14}{form.text}" for name, form in FORMATS.items()]
     parser.epilog = "\n".join(["formats, and what they are made of (docs/export.md):", *lines])
     add = parser.add_argument
     add("source", metavar="SOURCE", help="run folder; scene (name, folder, XML, mesh); or data set (name or folder)")
@@ -65,18 +65,18 @@ def import_command(a: Arguments) -> int:
     return 0
 
 
-def _positions(given: list[str] | None, option: str) -> Any:
+def _positions(texts: list[str] | None, option: str) -> Any:
     """Positions [n, 3] of ``X,Y,Z`` or CSV files, or None."""
     import numpy as np
 
     from ..runs.prediction_file import read_inputs
 
-    if given is None:
+    if texts is None:
         return None
-    found = []
-    for text in given:
+    positions = []
+    for text in texts:
         if Path(text).suffix.lower() == ".csv":
-            found.append(read_inputs(text, None).tx_pos_m)
+            positions.append(read_inputs(text, None).tx_pos_m)
             continue
         try:
             position = np.array([float(part) for part in text.split(",")])
@@ -84,5 +84,5 @@ def _positions(given: list[str] | None, option: str) -> Any:
             position = np.zeros(0)
         if position.shape != (3,) or not np.isfinite(position).all():
             raise InputError(f"{option} {text}: give three numbers {POSITION} in metres, or a CSV file")
-        found.append(position[None])
-    return np.concatenate(found)
+        positions.append(position[None])
+    return np.concatenate(positions)

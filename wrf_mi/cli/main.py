@@ -16,8 +16,7 @@ from ..core.files import os_failure
 from ..version import __version__
 from .options import Parser
 
-MODULES = ("doctor", "data", "mesh", "correct", "edit", "train", "runs", "maps", "export", "bench", "demo")
-"""Modules of the commands, in the order of the help."""
+MODULES = ("doctor", "data", "scenes", "train", "runs", "maps", "export", "bench", "demo")  # in the order of the help
 
 
 def build_parser() -> Parser:
@@ -54,8 +53,8 @@ def _run(arguments: Sequence[str] | None) -> int:
             raise KeyboardInterrupt from None
         # Errors of this package have an exit status and a message of one line; any other keeps its traceback.
         known = {InputError: 2, OSError: 2, BackendError: 1}
-        found = (status for kind, status in known.items() if isinstance(error, kind))
-        exit_status = next(found, getattr(error, "exit_status", None))
+        statuses = (status for kind, status in known.items() if isinstance(error, kind))
+        exit_status = next(statuses, getattr(error, "exit_status", None))
         if exit_status is None:
             raise
         print(f"wrf-mi: {os_failure(error) if isinstance(error, OSError) else error}", file=sys.stderr)

@@ -51,19 +51,11 @@ def map_command(a: Arguments) -> int:
     out = Path(a.out)
     check_map_file(out)
     run = open_run(a.run)
+    options = {"height_m": a.height, "step_m": a.step, "surface": a.surface, "receivers": a.receiver}
+    options |= {"threshold_dbm": a.threshold, "transmit_dbm": a.transmit_power}
+    options |= {"heading_deg": a.heading, "frequency_hz": a.frequency}
     with Watch() as watch:
-        dataset = radio_map(
-            run,
-            height_m=a.height,
-            step_m=a.step,
-            surface=a.surface,
-            receivers=a.receiver,
-            threshold_dbm=a.threshold,
-            transmit_dbm=a.transmit_power,
-            heading_deg=a.heading,
-            frequency_hz=a.frequency,
-            on_progress=watch.on_progress,
-        )
+        dataset = radio_map(run, **options, on_progress=watch.on_progress)
     write_map(dataset, out)
     picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))
     if "power_std_db" not in dataset:
@@ -99,15 +91,8 @@ def locate_command(a: Arguments) -> int:
     """Write positions to a file, and a picture beside it."""
     from ..core.array_files import write_arrays
     from ..core.files import write_figure
+    from ..maps import locate_file as files
     from ..maps.locate import locate, located_run
-    from ..maps.locate_figure import draw_positions
-    from ..maps.locate_file import (
-        figures_of,
-        posterior_arrays,
-        read_observations,
-        test_observations,
-        write_positions_file,
-    )
 
     out = Path(a.out)
     if out.suffix.lower() != ".csv":
@@ -116,18 +101,20 @@ def locate_command(a: Arguments) -> int:
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
     strengths_dbm, true_m = (
-        test_observations(run) if a.input is None else read_observations(a.input, run.receivers, run.config.left_out)
+        files.test_observations(run)
+        if a.input is None
+        else files.read_observations(a.input, run.receivers, run.config.left_out)
     )
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
-        found = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
+        located = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
     picture = out.with_suffix(".png")
-    write_positions_file(out, found, true_m)
-    write_figure(picture, draw_positions(run, found, true_m))
+    files.write_positions_file(out, located, true_m)
+    write_figure(picture, files.draw_positions(run, located, true_m))
     if a.posterior is not None:
-        write_arrays(Path(a.posterior), posterior_arrays(found), compressed=True)
-    figures = figures_of(found, true_m)
-    text = f"{_summary(figures)}\n{len(found)} positions: {out}\npicture: {picture}"
+        write_arrays(Path(a.posterior), files.posterior_arrays(located), compressed=True)
+    figures = files.figures_of(located, true_m)
+    text = f"{_summary(figures)}\n{len(located)} positions: {out}\npicture: {picture}"
     return show(a.json, {"out": str(out), "picture": str(picture), **figures}, text)
 
 
@@ -166,12 +153,8 @@ def _add_view(commands: Any) -> None:
     text = "held-out rows whose observations, Gaussians' signals and paths are stored (default: 40)"
     add("--transmitters", type=int, metavar="N", help=text)
     add("--gaussians", type=int, metavar="N", help="Gaussians, the strongest (default: 1000)")
-    add(
-        "--paths",
-        type=int,
-        metavar="N",
-        help="paths of each transmitter to each receiver, the strongest (default: 200)",
-    )
+    text = "paths of each transmitter to each receiver, the strongest (default: 200)"
+    add("--paths", type=int, metavar="N", help=text)
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete (default: none)")
 
 
@@ -185,11 +168,9 @@ def view_command(a: Arguments) -> int:
     limits = {name: getattr(a, name) for name in ("transmitters", "gaussians", "paths")}
     limits = {name: value for name, value in limits.items() if value is not None}
     with Watch() as watch:
-        found = view(
-            *a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty()
-        )
-    size = found.write(out).stat().st_size
-    names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in found.counts}
-    counted = ", ".join(f"{n} {names[name][: -1 if n == 1 else None]}" for name, n in found.counts.items())
-    text = "\n".join([counted, *found.content.notes, f"view: {out} ({size / 1e6:.1f} MB)"])
-    return show(a.json, {"out": a.out, "bytes": size, **found.counts, "notes": found.content.notes}, text)
+        page = view(*a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty())
+    size = page.write(out).stat().st_size
+    names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in page.counts}
+    counted = ", ".join(f"{n} {names[name][: -1 if n == 1 else None]}" for name, n in page.counts.items())
+    text = "\n".join([counted, *page.content.notes, f"view: {out} ({size / 1e6:.1f} MB)"])
+    return show(a.json, {"out": a.out, "bytes": size, **page.counts, "notes": page.content.notes}, text)

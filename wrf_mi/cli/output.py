@@ -72,9 +72,13 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
     scores = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f")
     columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".3g")
     print(f"{'stage, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
-    for one in reports:
-        cells = [f"{one[key]:{form}}" if one.get(key) is not None else "" for key, _, form in columns]
-        print(f"{one['stage']:<34}" + "".join(f"{cell:>15}" for cell in cells) + ("" if one["kept"] else "  not kept"))
+    for report in reports:
+        cells = [f"{report[key]:{form}}" if report.get(key) is not None else "" for key, _, form in columns]
+        print(
+            f"{report['stage']:<34}"
+            + "".join(f"{cell:>15}" for cell in cells)
+            + ("" if report["kept"] else "  not kept")
+        )
 
 
 class Watch:

@@ -52,19 +52,19 @@ def _reliability(run: Path, picture: Path) -> dict[str, Any]:
     from ..core.files import write_figure
     from ..maps.coverage import reliability_figure, run_reliability
 
-    found = run_reliability(run)
-    write_figure(picture, reliability_figure({run.resolve().name: found}))
-    return {"error": found.error, "brier": found.brier, "threshold_db": found.threshold_db.tolist()}
+    result = run_reliability(run)
+    write_figure(picture, reliability_figure({run.resolve().name: result}))
+    return {"error": result.error, "brier": result.brier, "threshold_db": result.threshold_db.tolist()}
 
 
 def _add_predict(commands: Any) -> None:
     parser = add_command(commands, "predict", predict_command, "predict at new transmitter positions")
     parser.add_argument("run", metavar="RUN", help="run folder")
-    given = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group(required=True)
     text = "positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
-    given.add_argument("--tx", metavar="FILE.csv", help=text)
+    source.add_argument("--tx", metavar="FILE.csv", help=text)
     text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
-    given.add_argument("--input", metavar="FILE.npz", help=text)
+    source.add_argument("--input", metavar="FILE.npz", help=text)
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
     parser.add_argument("--out", required=True, metavar="FILE", help=text)
     add_operator(parser)
@@ -74,16 +74,14 @@ def _add_predict(commands: Any) -> None:
 def predict_command(a: Arguments) -> int:
     """Write predictions to a file."""
     from ..parallel import open_scheduler
-    from ..runs.api import predict_to_file
     from ..runs.prediction_file import read_inputs
+    from ..runs.run import open_run
 
     check_operator(a)
     inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
-        positions = (inputs.tx_pos_m, a.out, inputs.tx_heading_rad)
-        workers = scheduler if a.scheduler else None
-        given: dict[str, Any] = {"uplink": inputs.uplink, "carriers_hz": inputs.carriers_hz}
-        shapes = predict_to_file(a.run, *positions, workers, not a.no_operator, **given, progress=True)
+        run = open_run(a.run, operator=not a.no_operator)
+        shapes = run.predict_to_file(inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
     return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
 

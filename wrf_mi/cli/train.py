@@ -6,7 +6,7 @@ import json
 import sys
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..backend import init
 from ..core import AntennaOptions, InputError
@@ -23,11 +23,13 @@ from .options import (
 )
 from .output import Watch, show, show_metrics
 
+if TYPE_CHECKING:
+    from ..runs.folder import RunRequest
+
 HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
-BESIDE_RESUME = ("resume", "json", "help_settings", "call")
-"""Arguments that ``--resume`` does not refuse."""
+BESIDE_RESUME = ("resume", "json", "help_settings", "call")  # arguments that ``--resume`` does not refuse
 
 
 def add_parser(commands: Any) -> None:
@@ -50,8 +52,8 @@ def train_command(a: Arguments) -> int:
         print(_settings_text())
         return 0
     if a.resume:
-        given = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
-        if any(value is not None and value is not False and value != [] for value in given):
+        values = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
+        if any(value is not None and value is not False and value != [] for value in values):
             raise InputError("--resume RUN goes on with the settings of RUN: omit data set and settings")
         return _resume(a)
     if not a.dataset or not a.out:
@@ -63,12 +65,12 @@ def train_command(a: Arguments) -> int:
 
 def run_training(a: Arguments, **more: Any) -> int:
     """Call `wrf_mi.train` with the arguments of the command line and ``more``, and print the scores."""
-    arguments = training_arguments(a)
+    request = training_request(a)
     from ..runs.api import train
 
     with Watch(resumable=True) as watch:
-        progress: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop}
-        run = train(a.dataset, a.out, **arguments, **progress, **more, progress=sys.stderr.isatty())
+        session: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop, **more}
+        run = train(a.dataset, a.out, **vars(request), **session, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
 
@@ -90,12 +92,10 @@ def _is_deterministic(folder: Path) -> bool:
         return False  # `read_config` reports the error
 
 
-def training_arguments(a: Arguments) -> dict[str, Any]:
-    """Arguments of `wrf_mi.train` except data set and folder.
+def training_request(a: Arguments) -> RunRequest:
+    """What the arguments of the command line ask to fit; `InputError`: options that do not belong together."""
+    from ..runs.folder import RunRequest
 
-    Raises:
-        InputError: options that do not belong together.
-    """
     model = a.model or HYBRID
     settings = [*a.set]
     if getattr(a, "stages", None) is not None or getattr(a, "fast", False):  # trace has neither
@@ -108,16 +108,15 @@ def training_arguments(a: Arguments) -> dict[str, Any]:
         )
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
-    return {
-        **{name: getattr(a, name) for name in ("scene", "material", "receiver", "evaluation", "n_train")},
-        "model": model,
-        "settings": settings,
-        "deterministic": a.deterministic,
-        "intervals": a.intervals,
-        "antennas": AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
-        "split": "official" if a.split is None else a.split,
-        "seed": a.seed or 0,
-    }
+    names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
+    return RunRequest(
+        model,
+        settings=settings,
+        antennas=AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
+        split="official" if a.split is None else a.split,
+        seed=a.seed or 0,
+        **{name: getattr(a, name) for name in names},
+    )
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
@@ -153,7 +152,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
     seed = None if a.calibrate is not None else a.seed
     numbers = {"depth": a.depth, "reflections": a.reflections, "rays": a.rays, "seed": seed}
     numbers["phase_error"] = a.phase_error
-    stated: dict[str, Any] = {key: given for key, given in numbers.items() if given is not None}
+    stated: dict[str, Any] = {key: value for key, value in numbers.items() if value is not None}
     if a.rays is not None and a.rays != "auto":
         if not a.rays.isdecimal():
             raise InputError(f'rays {a.rays!r}: give a whole number, or "auto"')
@@ -204,7 +203,7 @@ def trace_command(a: Arguments) -> int:
     """Predict by ray tracing alone."""
     from ..parallel import open_scheduler
 
-    training_arguments(a)  # refused before workers start
+    training_request(a)  # refused before workers start
     if a.calibrate is not None and a.scheduler is not None:
         raise InputError("trace: --calibrate trains in one process; omit --scheduler")
     if a.deepmimo is not None:
@@ -250,10 +249,10 @@ def sweep_command(a: Arguments) -> int:
     from ..runs.sweep import check_failures, check_run, plan_sweep, run_sweep, sweep_table
 
     # Read off the parser, so that no option of train is left out.
-    given = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
-    settings = given.pop("set")
-    options = {name: str(value) for name, value in given.items() if value is not None and not isinstance(value, bool)}
-    flags = [f"--{name}" for name, value in given.items() if value is True]
+    stated = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
+    settings = stated.pop("set")
+    options = {name: str(value) for name, value in stated.items() if value is not None and not isinstance(value, bool)}
+    flags = [f"--{name}" for name, value in stated.items() if value is True]
     sweep = plan_sweep(a.out, a.vary, options, settings, flags)
     parser = Parser(prog="wrf-mi")
     _add_train(parser.add_subparsers())
@@ -261,7 +260,7 @@ def sweep_command(a: Arguments) -> int:
         single = parser.parse_args([*run.arguments, "--out", str(run.folder)])
         if not single.dataset:
             raise InputError("sweep needs DATASET")
-        check_run(single.dataset, training_arguments(single))
+        check_run(single.dataset, training_request(single))
     with open_scheduler(a.scheduler) as scheduler:
         rows = run_sweep(sweep, scheduler)
     show(a.json, rows, f"{sweep_table(rows, sweep.varied)}\nresults: {a.out}")

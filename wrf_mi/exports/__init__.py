@@ -13,8 +13,7 @@ from ..core.registry import Registry, resolve
 from .format import DATASET, RUN, SCENE, ExportOptions, Format
 
 ENTRY_POINTS = "wrf_mi.exports"
-SCENES = (SCENE, RUN)
-"""A run stands for its corrected scene, or else for the scene that it was traced in."""
+SCENES = (SCENE, RUN)  # a run stands for its corrected scene, or else for the scene that it was traced in
 _TRACED = ("tx_pos_m", "rx_pos_m", "frequency_hz", "material", "kinds", "depth")
 _WRITERS: dict[str, tuple[tuple[str, ...], str, str, tuple[str, ...]]] = {
     "3dgs": ((RUN,), ".ply", "gaussians:write_3dgs", ("tx_pos_m", "frequency_hz")),
@@ -47,8 +46,7 @@ BUILT_IN = {
     name: Format(name, kinds, suffix, f"{__name__}.{writer}", options, _TEXTS[name])
     for name, (kinds, suffix, writer, options) in _WRITERS.items()
 }
-FORMATS = Registry[Format]("format", ENTRY_POINTS, BUILT_IN)
-"""All formats by name."""
+FORMATS = Registry[Format]("format", ENTRY_POINTS, BUILT_IN)  # all formats by name
 
 
 def export(source: str | Path, format: str, out: str | Path, options: ExportOptions | None = None) -> dict[str, Any]:

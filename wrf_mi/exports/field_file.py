@@ -16,11 +16,9 @@ from .format import ExportOptions
 from .gaussians import field_of
 from .source import Source
 
-FORMAT = 1
-"""Version of the file."""
+FORMAT = 1  # version of the file
 VERSION, SPLIT_ARRAYS, FITTED_ARRAYS = "export/format", "split/", "run/"
-TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}
-"""Keys of the texts of a run folder's files."""
+TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}  # keys of the texts of a run folder's files
 
 
 def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
@@ -35,12 +33,12 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     """
     run = source.run
     field = field_of(run)
-    kept = {key: values for key, values in field.arrays().items() if not key.startswith(PARAM)}
+    form = {key: values for key, values in field.arrays().items() if not key.startswith(PARAM)}
     model = stored_arrays(run.folder / FITTED)
     arrays: dict[str, Any] = {
         VERSION: FORMAT,
         **keyed(PARAM, field.params),
-        **kept,
+        **form,
         **{key: values for key, values in model.items() if key.startswith(FITTED_ARRAYS)},
         **keyed(SPLIT_ARRAYS, stored_arrays(run.folder / SPLIT)),
     }

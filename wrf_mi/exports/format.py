@@ -10,8 +10,7 @@ from typing import Any
 from ..core import InputError
 from ..core.angles import FloatArray
 
-RUN, SCENE, DATASET = "run", "scene", "data set"
-"""Kinds of sources."""
+RUN, SCENE, DATASET = "run", "scene", "data set"  # kinds of sources
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,8 @@ class ExportOptions:
     progress: bool = False
 
 
-NAMES = {
-    "tx_pos_m": "--tx",
-    "rx_pos_m": "--rx",
-    "frequency_hz": "--frequency",
-    "material": "--material",
-    "kinds": "--paths",
-    "depth": "--depth",
-}
+NAMES = {"tx_pos_m": "--tx", "rx_pos_m": "--rx", "frequency_hz": "--frequency"}
+NAMES |= {"material": "--material", "kinds": "--paths", "depth": "--depth"}
 """Options that belong to some formats, as the command has them."""
 
 
@@ -71,11 +64,7 @@ class Format:
     text: str
 
     def check(self, out: Path, options: ExportOptions) -> None:
-        """Refuse a name of the file, or options, that do not belong to the format.
-
-        Raises:
-            InputError: naming them.
-        """
+        """Refuse a name of the file, or options, that do not belong to the format; `InputError`: naming them."""
         if self.suffix and out.suffix.lower() != self.suffix:
             raise InputError(f"{out}: format {self.name} is a file {self.suffix}; give such a name")
         unset = ExportOptions()

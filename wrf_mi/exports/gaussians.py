@@ -21,10 +21,8 @@ from .source import Source
 
 DEGREE_0 = 0.28209479177387814
 """Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a viewer's colour is 0.5 + `DEGREE_0` f_dc."""
-RANGE_DB = 40.0
-"""Range of magnitudes of the signal, below the strongest, over which colours differ."""
-OPAQUE = 1e-6
-"""Least distance of an opacity from 0 and 1, whose logits are infinite."""
+RANGE_DB = 40.0  # range of magnitudes of the signal, below the strongest, over which colours differ
+OPAQUE = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
 
 
 def field_of(run: Run) -> FittedField:

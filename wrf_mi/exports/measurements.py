@@ -12,8 +12,7 @@ from ..datasets.record_file import write_record_file
 from .format import ExportOptions
 from .source import Source
 
-BITS = 16
-"""Bits of a pixel: 8 would round spectra that are computed or of 16 bits."""
+BITS = 16  # bits of a pixel: 8 would round spectra that are computed or of 16 bits
 
 
 def _written(task: str | None, write: Callable[[Path, Record, bool], object]) -> Callable[..., dict[str, Any]]:

@@ -17,7 +17,7 @@ from ..core.files import write_csv
 from ..datasets.folder_files import CsvTable, read_csv
 from ..tracing import TraceOptions, TraceResult, open_scene, trace_paths, write_deepmimo
 from ..tracing.options import stated_kinds, without_effect
-from .format import ExportOptions
+from .format import RUN, ExportOptions
 from .source import Source
 
 logger = logging.getLogger(__name__)
@@ -25,8 +25,7 @@ logger = logging.getLogger(__name__)
 LETTERS = {1: "R", 2: "S", 4: "T", 8: "D"}
 """Letters of the kinds of interaction: reflection, scattering, transmission, diffraction."""
 ANGLES = ("azimuth", "elevation")
-SEPARATOR = ";"
-"""Between the interactions, vertices and objects of a path."""
+SEPARATOR = ";"  # between the interactions, vertices and objects of a path
 
 
 def path_columns(traced: TraceResult) -> dict[str, Any]:
@@ -59,14 +58,14 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
 
 def _traced(source: Source, options: ExportOptions) -> TraceResult:
     """Stored paths of a run, or paths of a scene that are traced now."""
-    given = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
-    if source.is_run:
+    ends = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
+    if source.kind == RUN:
         more = {"--material": options.material, "--paths": options.kinds, "--depth": options.depth}
-        if stated := [name for name, value in (given | more).items() if value is not None]:
+        if stated := [name for name, value in (ends | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
         return source.trace()
     if options.tx_pos_m is None or options.rx_pos_m is None or options.frequency_hz is None:
-        lacking = ", ".join(name for name, value in given.items() if value is None)
+        lacking = ", ".join(name for name, value in ends.items() if value is None)
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"depth": options.depth}
@@ -130,20 +129,11 @@ def read_paths(file: str | Path) -> Paths:
             raise InputError(
                 f"{file}, row {path + 1}: interactions, vertices and objects do not fit; restore it"
             ) from None
-    return Paths(
-        tx,
-        rx,
-        table.numbers("gain_re") + 1j * table.numbers("gain_im"),
-        table.numbers("length_m"),
-        _directions(table, "departure"),
-        _directions(table, "arrival"),
-        interactions,
-        vertices,
-        objects,
-        tuple(names),
-        int(tx.max(initial=-1)) + 1,
-        int(rx.max(initial=-1)) + 1,
-    )
+    gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
+    directions = _directions(table, "departure"), _directions(table, "arrival")
+    bounces: Any = (interactions, vertices, objects, tuple(names))
+    counts = (int(numbers.max(initial=-1)) + 1 for numbers in (tx, rx))
+    return Paths(tx, rx, gain, table.numbers("length_m"), *directions, *bounces, *counts)
 
 
 def _directions(table: CsvTable, end: str) -> FloatArray:

@@ -50,8 +50,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     lists the constants at the carrier, and exponents of conductivities.
 
     Raises:
-        InputError: a carrier that is not known, a material that is neither slab nor absorber or not known there, or a
-            folder that exists.
+        InputError: an unknown carrier, a material that is neither slab nor absorber, or a folder that exists.
     """
     frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
     if frequency_hz is None:

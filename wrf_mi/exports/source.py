@@ -23,20 +23,10 @@ from .format import DATASET, RUN, SCENE, ExportOptions
 
 @dataclass(frozen=True)
 class Source:
-    """Source of an export.
+    """Source of an export."""
 
-    Attributes:
-        name: as given: a path or a name.
-        kind: what it is exported as: a run, a scene or a data set.
-    """
-
-    name: str
-    kind: str
-
-    @property
-    def is_run(self) -> bool:
-        """Whether it is a run folder."""
-        return self.kind == RUN
+    name: str  # as given: a path or a name
+    kind: str  # what it is exported as: a run, a scene or a data set
 
     @property
     def run(self) -> Run:
@@ -50,11 +40,7 @@ class Source:
         return load_record(self.name, progress=progress)
 
     def trace(self) -> TraceResult:
-        """The stored paths of a run.
-
-        Raises:
-            InputError: a run that stores none.
-        """
+        """The stored paths of a run; `InputError`: a run that stores none."""
         path = Path(self.name) / PATHS
         if not path.exists():
             text = f"{self.name}: a run of {self.run.config.model} that stores no paths"
@@ -67,7 +53,7 @@ class Source:
         Raises:
             InputError: a run without a scene.
         """
-        if not self.is_run:
+        if self.kind != RUN:
             return self.name, None
         corrected, config = Path(self.name) / CORRECTED, self.run.config
         if corrected.is_dir():
@@ -80,7 +66,7 @@ class Source:
         """Carrier of a run's data, Hz: the middle one where rows have several; None for a scene."""
         from ..tasks.conditions import scene_carrier
 
-        return scene_carrier(self.run.problem.record) if self.is_run else None
+        return scene_carrier(self.run.problem.record) if self.kind == RUN else None
 
 
 Write = Callable[[Source, Path, ExportOptions], dict[str, Any]]
@@ -88,13 +74,10 @@ Write = Callable[[Source, Path, ExportOptions], dict[str, Any]]
 
 
 def kinds_of(name: str | Path) -> tuple[str, ...]:
-    """Kinds that a source may be of, in the order of preference.
+    """Kinds that a source may be of, in the order of preference; `InputError` for neither a path nor a known name.
 
     A folder is a run if it holds ``config.yaml``, else a scene if it holds ``scene.yml``, else a data set. A file is a
     scene or a data set by its ending.
-
-    Raises:
-        InputError: neither a path nor a known name.
     """
     path, text = Path(name), str(name)
     if path.is_dir():

@@ -28,36 +28,49 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core import InputError
+from ..core import InputError, Prediction
+from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
+from ..models import Inputs
+from ..receivers.spreads import PathStatistics
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
+from .coverage import coverage_probability
 from .dataset import map_dataset, maps_package
 from .grid import (
+    HEADINGS,
     Grid,
     SurfaceMesh,
     area_of,
     check_height,
     grid_over,
+    outside_solids,
     surface_of,
     usual_height,
     warn_of_points_outside,
 )
-from .values import HEADINGS, Conditions, map_values
 
 if TYPE_CHECKING:
     import xarray
 
-STEP_M = 0.1
+STEP_M = 0.1  # default spacing of a grid
 THRESHOLD_DBM = -90.0
+CHUNK_SIZE = 10_000
+"""Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
+CHUNK_BYTES = 1 << 28  # bytes of a chunk's observations, with the copies that models make of them
+VALUE_BYTES = 32  # of each value of an observation: mean and standard deviation in float64, and a copy of each
 
 
 def radio_map(
@@ -101,7 +114,7 @@ def radio_map(
     task = task_of(opened.problem.record)
     _check(opened, task, surface, height_m, transmit_dbm, threshold_dbm)
     known = opened.receivers
-    numbers = range(len(known)) if receivers is None else [receiver_index(known, one) for one in receivers]
+    numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
     if task.level_kind != "relative" and threshold_dbm is None:
         threshold_dbm = THRESHOLD_DBM
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
@@ -112,19 +125,12 @@ def radio_map(
     return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
 
 
-def _check(
-    run: Run,
-    task: Task,
-    surface: str | Path | None,
-    height_m: float | None,
-    transmit_dbm: float,
-    threshold_dbm: float | None,
-) -> None:
+def _check(run: Run, task: Task, surface: Any, height_m: float | None, transmit_dbm: float, threshold: Any) -> None:
     if run.model.uplink == "required":
         raise InputError(f"{run.folder}: {run.config.model} predicts from the uplink, not from positions; no map of it")
     if surface is not None and height_m is not None:
         raise InputError("map: a height belongs to a grid; omit it, or the surface")
-    numbers = (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold_dbm))
+    numbers = (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold))
     for name, value in numbers:
         if value is not None and not np.isfinite(value):
             raise InputError(f"{name} {value:g}: give a finite number")
@@ -158,23 +164,129 @@ def _places(run: Run, height_m: float | None, step_m: float | None, surface: str
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
     """Attributes of the whole dataset."""
     config, headings = run.config, conditions.headings_rad
-    found: dict[str, Any] = {
+    absolute = task.level_kind != "relative"
+    attributes: dict[str, Any] = {
         "title": f"Radio map of {run.problem.record.name} by {config.model}",
         "source": f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}",
         "dataset": run.problem.record.name,
         "model": config.model,
         "task": task.name,
         "level": task.level_note or task.quantity,
-        "level_is_absolute": int(task.level_kind != "relative"),
+        "level_is_absolute": int(absolute),
     }
-    absolute = task.level_kind != "relative"
     if absolute:
-        found["transmit_power_dbm"] = conditions.transmit_dbm
+        attributes["transmit_power_dbm"] = conditions.transmit_dbm
     if conditions.threshold_db is not None:
-        found["threshold_dbm" if absolute else "threshold_db"] = conditions.threshold_db
+        attributes["threshold_dbm" if absolute else "threshold_db"] = conditions.threshold_db
     if headings:
         words = f"mean over {len(headings)} headings" if heading_deg is None else f"{heading_deg:g} degrees"
-        found["transmitter_heading"] = words
+        attributes["transmitter_heading"] = words
     if conditions.frequency_hz is not None:
-        found[FREQUENCY] = conditions.frequency_hz
-    return found
+        attributes[FREQUENCY] = conditions.frequency_hz
+    return attributes
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`."""
+
+    threshold_db: float | None
+    transmit_dbm: float
+    # headings of the transmitter that are averaged over; empty: the model does not know it
+    headings_rad: tuple[float, ...] = ()
+    frequency_hz: float | None = None
+
+
+def map_values(
+    run: Run, positions_m: FloatArray, receivers: Sequence[int], conditions: Conditions, on_progress: OnProgress
+) -> dict[str, NDArray[np.float32]]:
+    """Variables [receivers, m] of `wrf_mi.maps.dataset.VARIABLES` that a run's model states at positions [m, 3] in
+    metres, computed chunk by chunk; NaN inside solid objects of the scene.
+
+    Raises:
+        InputError: inputs that the model does not predict from.
+    """
+    size = _chunk_size(run, len(conditions.headings_rad))
+    variables = dict[str, NDArray[np.float32]]()
+    scene = run.problem.opened_scene
+    outside = np.ones(len(positions_m), bool) if scene is None else outside_solids(scene, positions_m)
+    with _each_warning_once():
+        for start in range(0, len(positions_m), size):
+            rows = start + np.flatnonzero(outside[start : start + size])
+            if len(rows):
+                for place, receiver in enumerate(receivers):
+                    for name, values in _of_chunk(run, positions_m[rows], receiver, conditions).items():
+                        if name not in variables:
+                            variables[name] = np.full((len(receivers), len(positions_m)), np.nan, np.float32)
+                        variables[name][place, rows] = values
+            on_progress("mapping", min(start + size, len(positions_m)) / len(positions_m))
+    if not variables:
+        raise InputError(f"{run.folder}: all positions of the map lie in solid objects; give another height")
+    return variables
+
+
+def _chunk_size(run: Run, headings: int) -> int:
+    values = int(np.prod(run.problem.record.observation.shape[2:]))
+    size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * values))
+    size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
+    return max(1, size // max(headings, 1))
+
+
+def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:
+    task, count = task_of(run.problem.record), len(positions_m)
+    inputs = _inputs(positions_m, conditions)
+    run.check_inputs(inputs)
+    parts = run.fitted.decompose(inputs, receiver)
+    added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0
+
+    def of_headings(values: Any) -> FloatArray:
+        return np.asarray(values, float).reshape(count, -1)
+
+    level = task.level(parts.whole)
+    means = of_headings(level.mean)
+    variables: dict[str, Any] = {"power_dbm": means.mean(axis=1) + added}
+    if level.std is not None:
+        # The law of total variance: within a heading, and between headings.
+        std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
+        variables["power_std_db"] = std_db
+        if conditions.threshold_db is not None:
+            probability = coverage_probability(variables["power_dbm"], std_db, conditions.threshold_db)
+            variables["coverage_probability"] = probability
+    if parts.traced is not None and parts.learned is not None:
+        traced, learned = (
+            of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added
+            for side in (parts.traced, parts.learned)
+        )
+        variables |= {"traced_share": traced, "learned_share": learned, "share_difference_db": traced - learned}
+    if parts.paths is not None:
+        names = [field.name for field in fields(PathStatistics)]
+        variables |= {name: of_headings(getattr(parts.paths, name)).mean(axis=1) for name in names}
+    if task.level_kind != "relative":
+        variables["path_gain_db"] = variables["power_dbm"] - conditions.transmit_dbm
+    return variables
+
+
+def _inputs(positions_m: FloatArray, conditions: Conditions) -> Inputs:
+    """Each position with all headings one after the other, at the carrier."""
+    turns = np.asarray(conditions.headings_rad)
+    positions = np.repeat(positions_m, max(len(turns), 1), axis=0)
+    headings = np.tile(turns, len(positions_m)) if len(turns) else None
+    hz = conditions.frequency_hz
+    return Inputs(positions, headings, carriers_hz=None if hz is None else np.full(len(positions), hz))
+
+
+@contextmanager
+def _each_warning_once() -> Iterator[None]:
+    """Chunks would repeat the tracer's warnings of antennas near surfaces and outside the scene."""
+    logger, seen = logging.getLogger("wrf_mi.tracing.search.devices"), set[str]()
+
+    def new(record: logging.LogRecord) -> bool:
+        known = record.msg in seen
+        seen.add(record.msg)
+        return not known
+
+    logger.addFilter(new)
+    try:
+        yield
+    finally:
+        logger.removeFilter(new)

@@ -17,12 +17,9 @@ from ..core.angles import FloatArray
 from ..runs.results import read_run
 from ..tasks import TASKS
 
-BINS = 10
-"""Number of bins of the predicted probability."""
-QUANTILES = np.linspace(0.1, 0.9, 9)
-"""Quantiles of the measured levels that are thresholds where none is stated."""
-FEWEST = 20
-"""Least number of pairs in a bin that is drawn."""
+BINS = 10  # number of bins of the predicted probability
+QUANTILES = np.linspace(0.1, 0.9, 9)  # quantiles of the measured levels that are thresholds where none is stated
+FEWEST = 20  # least number of pairs in a bin that is drawn
 
 
 def coverage_probability(level_db: ArrayLike, std_db: ArrayLike, threshold_db: float) -> FloatArray:
@@ -61,16 +58,10 @@ class Reliability:
 def reliability(
     level_db: FloatArray, std_db: FloatArray, measured_db: FloatArray, threshold_db: FloatArray | None = None
 ) -> Reliability:
-    """Reliability of probabilities of coverage.
+    """Reliability of probabilities of coverage from predicted levels, their deviations and measured levels, any shape.
 
-    Args:
-        level_db: predicted levels, any shape.
-        std_db: their standard deviations, likewise.
-        measured_db: measured levels, likewise; NaN where nothing was received, which is left out.
-        threshold_db: thresholds [t]; None: the quantiles `QUANTILES` of the measured levels.
-
-    Raises:
-        InputError: nothing was measured.
+    Measured levels are NaN where nothing was received. Thresholds [t] are by default `QUANTILES` of the measured
+    levels. `InputError` where nothing was measured.
     """
     known = np.isfinite(measured_db)
     level, std, measured = (np.asarray(values, float)[known] for values in (level_db, std_db, measured_db))
@@ -105,22 +96,22 @@ def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) 
 
     def levels(values: Any, std: Any = None) -> Prediction:
         rows = int(np.prod(values.shape[:2]))
-        given = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
-        return task.level(Prediction(values.reshape(rows, *values.shape[2:]), given))
+        deviations = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
+        return task.level(Prediction(values.reshape(rows, *values.shape[2:]), deviations))
 
     stated = levels(results.prediction, results.std)
     return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db)
 
 
-def reliability_figure(found: Mapping[str, Reliability]) -> Figure:
+def reliability_figure(results: Mapping[str, Reliability]) -> Figure:
     """Observed share against predicted probability of coverage; bins of fewer than `FEWEST` pairs are left out."""
     figure = Figure(figsize=(4.6, 4.4), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--", label="calibrated")
-    for name, one in found.items():
-        shown = one.count >= FEWEST
-        label = f"{name} (error {one.error:.3f})"
-        axes.plot(one.predicted[shown], one.observed[shown], marker="o", markersize=4, linewidth=1.2, label=label)
+    for name, result in results.items():
+        shown = result.count >= FEWEST
+        label = f"{name} (error {result.error:.3f})"
+        axes.plot(result.predicted[shown], result.observed[shown], marker="o", markersize=4, linewidth=1.2, label=label)
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
     axes.set_xlabel("predicted P(level > threshold)")
     axes.set_ylabel("observed share of test values")

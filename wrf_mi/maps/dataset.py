@@ -33,8 +33,7 @@ VARIABLES = {
 """Variables of each receiver and position, in the order of a file: unit in the notation of UDUNITS, but for powers in
 decibels, which name theirs as CF does, and description. A map has those that its model states.
 """
-LEVELS = (POWER, "traced_share", "learned_share")
-"""Variables in the unit of the task's level."""
+LEVELS = (POWER, "traced_share", "learned_share")  # variables in the unit of the task's level
 NETCDF, ZARR, CSV = ".nc", ".zarr", ".csv"
 # h5netcdf is imported without the h5py that it needs to open a file.
 PACKAGES = {NETCDF: ("xarray", "h5netcdf", "h5py"), ZARR: ("xarray", "zarr"), CSV: ("xarray", "pandas")}
@@ -44,11 +43,7 @@ COMPRESSION = {"zlib": True, "complevel": 4, "shuffle": True}
 
 
 def maps_package(name: str, extra: str = "maps") -> Any:
-    """A package that maps need, installed by an extra of this one.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """A package that maps need, installed by an extra of this one; `InputError`: it is not installed."""
     try:
         return import_module(name)
     except ModuleNotFoundError:
@@ -56,21 +51,13 @@ def maps_package(name: str, extra: str = "maps") -> Any:
 
 
 def require_packages(path: Path, extra: str = "maps") -> None:
-    """Refuse a map file whose packages are not installed; any suffix but ``.zarr`` and ``.csv`` is NetCDF.
-
-    Raises:
-        InputError: naming the first package that is missing.
-    """
+    """Refuse by `InputError` a map file whose packages are missing; any suffix but ``.zarr`` and ``.csv`` is NetCDF."""
     for name in PACKAGES.get(path.suffix.lower(), PACKAGES[NETCDF]):
         maps_package(name, extra)
 
 
 def check_map_file(out: Path) -> None:
-    """Refuse a file name of another format than NetCDF, Zarr and CSV, and a missing package.
-
-    Raises:
-        InputError: naming suffixes, or the package.
-    """
+    """Refuse by `InputError` a file name of another format than NetCDF, Zarr and CSV, and a missing package."""
     suffix = out.suffix.lower()
     if suffix not in PACKAGES:
         raise InputError(f"{out}: maps are written as NetCDF ({NETCDF}), Zarr ({ZARR}) or {CSV}; give such a name")
@@ -88,20 +75,12 @@ def map_dataset(
     level_unit: str,
     attributes: Mapping[str, Any],
 ) -> xarray.Dataset:
-    """Dataset of a map.
+    """Dataset of arrays [receivers, m] by the names of `VARIABLES`; levels in ``dBm``, or ``dB`` without calibration.
 
-    Args:
-        places: positions of the map.
-        receivers: receivers of the map.
-        values: arrays [receivers, m] by the names of `VARIABLES`.
-        level_unit: unit of received powers: ``dBm``, or ``dB`` without an absolute calibration.
-        attributes: attributes of the whole.
-
-    Returns:
-        Variables with dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, and
-        ``best_receiver`` without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``,
-        ``receiver_z``; ``x``, ``y``, ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are
-        ``triangle`` (point, corner, axis). Metres, in the frame of the data.
+    Variables have dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, ``best_receiver`` is
+    without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``, ``receiver_z``; ``x``, ``y``,
+    ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are ``triangle`` (point, corner, axis). Metres,
+    in the frame of the data.
     """
     xr = maps_package("xarray")
     at = np.stack([receiver.position_m for receiver in receivers])

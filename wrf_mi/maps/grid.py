@@ -23,17 +23,15 @@ from ..scene.mesh.files import mesh_parts
 
 logger = logging.getLogger(__name__)
 
-LARGEST = 10_000_000
-"""Largest number of positions of a grid: 240 MB of coordinates."""
-MARGIN_M = 0.5
-"""Margin around transmitter positions where no scene states the area."""
-ROUNDS = 20
-"""Largest number of times that an edge is halved: a kilometre into millimetres."""
-MOUNTED_M = 0.02
-"""Distance from a surface up to which a receiver is taken to lie before it."""
+LARGEST = 10_000_000  # largest number of positions of a grid: 240 MB of coordinates
+MARGIN_M = 0.5  # margin around transmitter positions where no scene states the area
+ROUNDS = 20  # largest number of times that an edge is halved: a kilometre into millimetres
+MOUNTED_M = 0.02  # distance from a surface up to which a receiver is taken to lie before it
 
-CANDIDATE_STEP_M = 0.25
-"""Least distance of neighbouring candidates by default."""
+HEADINGS = 8
+"""Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
+
+CANDIDATE_STEP_M = 0.25  # least distance of neighbouring candidates by default
 USUAL_CANDIDATES, MOST_CANDIDATES = 4000, 10_000
 """Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between
 all of them take 0.8 GB.
@@ -42,17 +40,11 @@ all of them take 0.8 GB.
 
 @dataclass(frozen=True)
 class Grid:
-    """Positions at one height.
+    """Positions at one height."""
 
-    Attributes:
-        x_m: coordinates along x [nx], ascending, metres.
-        y_m: coordinates along y [ny], ascending, metres.
-        height_m: height z of all positions, metres.
-    """
-
-    x_m: FloatArray
-    y_m: FloatArray
-    height_m: float
+    x_m: FloatArray  # coordinates along x [nx], ascending, metres
+    y_m: FloatArray  # coordinates along y [ny], ascending, metres
+    height_m: float  # height z of all positions, metres
 
     @property
     def positions_m(self) -> FloatArray:
@@ -63,13 +55,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """Triangles at whose centres a map is computed.
+    """Triangles at whose centres a map is computed."""
 
-    Attributes:
-        triangles_m: corners of the triangles [m, 3, 3], metres.
-    """
-
-    triangles_m: FloatArray
+    triangles_m: FloatArray  # corners of the triangles [m, 3, 3], metres
 
     @property
     def positions_m(self) -> FloatArray:
@@ -78,16 +66,10 @@ class SurfaceMesh:
 
 
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
-    """Grid over a rectangle: square cells from its lower corner on, whose centres lie in it.
+    """Grid over a rectangle between two corners [2 or more], metres: square cells whose centres lie in it.
 
     Where an extent is no multiple of the step, it is rounded to the nearest one, half down: of a last cell that the
     upper side cuts, the centre decides. An extent of up to half a step has one position, in its middle.
-
-    Args:
-        low_m: lower corner of the rectangle [2 or more], metres; coordinates beyond the second are ignored.
-        high_m: upper corner, likewise.
-        step_m: distance between neighbouring positions, metres.
-        height_m: height of all positions, metres.
 
     Raises:
         InputError: a step that is not positive and finite, or more than `LARGEST` positions.
@@ -108,11 +90,7 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
 
 
 def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
-    """Triangles of a mesh file, halved until no edge is longer than a step.
-
-    Args:
-        mesh: a format of `wrf_mi.scene.mesh.files.mesh_parts`, in metres and the frame of the data.
-        step_m: longest edge of a triangle, metres; None: the faces as they are.
+    """Triangles of a mesh file in metres, halved until no edge is longer than a step; None: the faces as they are.
 
     Raises:
         InputError: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
@@ -178,11 +156,6 @@ def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
 def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
     """Refuse a plane that the scene's floor or ceiling hides from all receivers; warn of one outside of what is known.
 
-    Args:
-        run: a finished run.
-        height_m: height z of the plane, metres.
-        tx_pos_m: positions of the transmitters of the data [n, 3], metres.
-
     Raises:
         InputError: a height above or below a scene with a surface between it and every receiver, with the scene's.
     """
@@ -223,15 +196,10 @@ def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Positions that a transmitter may have.
+    """Positions that a transmitter may have."""
 
-    Attributes:
-        grid: grid over the area's rectangle.
-        inside: positions of the grid that are candidates [ny * nx].
-    """
-
-    grid: Grid
-    inside: NDArray[np.bool_]
+    grid: Grid  # grid over the area's rectangle
+    inside: NDArray[np.bool_]  # positions of the grid that are candidates [ny * nx]
 
     @cached_property
     def positions_m(self) -> FloatArray:
@@ -257,10 +225,7 @@ class Candidates:
 def candidates_of(run: Run, step_m: float | None = None, height_m: float | None = None) -> Candidates:
     """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
 
-    Args:
-        run: a finished run.
-        step_m: distance between neighbours; None: `CANDIDATE_STEP_M`, more for large areas.
-        height_m: their height; None: the median of the training rows.
+    By default their step is `CANDIDATE_STEP_M`, more for large areas, and their height the training rows' median.
 
     Raises:
         InputError: a step that is not positive or too small, no candidate, or neither scene nor known positions.

@@ -150,16 +150,7 @@ def locate(
     run = located_run(run)
     record = run.problem.record
     observed = np.asarray(observed_dbm, float)
-    if observed.ndim != 2 or len(observed) != len(record.receivers):
-        text = f"observations of shape {list(observed.shape)}; give strengths [{len(record.receivers)}, m] in dBm"
-        raise InputError(f"{run.folder}: {text}, one row for each receiver")
-    silent = np.flatnonzero(~np.isfinite(observed).any(axis=0))
-    if len(silent):
-        raise InputError(f"{run.folder}: no receiver received transmitter {silent[0]}; leave it out")
-    if not 0 < level < 1:
-        raise InputError(f"level {level:g}: give a probability between 0 and 1, such as 0.9")
-    if offset_db is not None and not (np.isfinite(offset_db) and offset_db >= 0):
-        raise InputError(f"offset {offset_db:g} dB: give a standard deviation of 0 or more")
+    _check(run, observed, level, offset_db)
     candidates = candidates_of(run, step_m, height_m)
     session = Session(run.folder, run.folder, on_progress, stop)
     headings = headings_of(run)
@@ -180,8 +171,9 @@ def locate(
     for number, strengths in enumerate(observed.T):
         if stop():
             raise Interrupted(f"stopped after {number} of {m} positions; nothing is written")
-        probability[number] = found = softmax(likelihood.log(strengths, *predicted))
-        best, radius[number], inside[number] = region_of(found, candidates.distance_m, level)
+        probabilities = softmax(likelihood.log(strengths, *predicted))
+        best, radius[number], inside[number] = region_of(probabilities, candidates.distance_m, level)
+        probability[number] = probabilities
         estimate[number, :2] = candidates.positions_m[best, :2]
         session.report("locating", (number + 1) / m)
     area = inside.sum(axis=1) * candidates.cell_m2
@@ -189,3 +181,17 @@ def locate(
     if calibration.neighbours is not None:
         near = calibration.neighbours.locate(record, load_rows(run.folder, record).all_train, observed)
     return Positions(estimate, radius, area, probability, inside, near, level, candidates, calibration)
+
+
+def _check(run: Run, observed_dbm: FloatArray, level: float, offset_db: float | None) -> None:
+    count = len(run.problem.record.receivers)
+    if observed_dbm.ndim != 2 or len(observed_dbm) != count:
+        text = f"observations of shape {list(observed_dbm.shape)}; give strengths [{count}, m] in dBm"
+        raise InputError(f"{run.folder}: {text}, one row for each receiver")
+    silent = np.flatnonzero(~np.isfinite(observed_dbm).any(axis=0))
+    if len(silent):
+        raise InputError(f"{run.folder}: no receiver received transmitter {silent[0]}; leave it out")
+    if not 0 < level < 1:
+        raise InputError(f"level {level:g}: give a probability between 0 and 1, such as 0.9")
+    if offset_db is not None and not (np.isfinite(offset_db) and offset_db >= 0):
+        raise InputError(f"offset {offset_db:g} dB: give a standard deviation of 0 or more")

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,79 +36,57 @@ from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..training.selection import hold_out
-from .grid import Candidates
-from .locate_knn import Neighbours, choose_neighbours
-from .locate_likelihood import Likelihood, Silence, region_of
-from .values import HEADINGS
+from .grid import HEADINGS, Candidates
+from .locate_likelihood import Likelihood, Neighbours, Silence, choose_neighbours, region_of
 
 logger = logging.getLogger(__name__)
 
 DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
 """Forms of the likelihood to choose from."""
-WIDE = 0.95
-"""Probability of the quantile by which the widths of distributions are compared."""
-MOST_ROWS = 300
-"""Most held-out rows that are located."""
-LEVEL = 0.9
-"""Probability of a region by default, and of those whose held-out coverage is stated."""
-FOLDS = 3
-"""Hold-outs with other seeds: one alone has few positions, near each other."""
-FOLDER, FILE = "locate", "locate.json"
-"""Folder of finished folds in the run folder, and file of the choice."""
+WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
+MOST_ROWS = 300  # most held-out rows that are located
+LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
+FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
+FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Likelihood and nearest neighbours of a run, with what held-out rows say of them.
+    """Likelihood and nearest neighbours of a run, with what held-out rows say of them."""
 
-    Attributes:
-        likelihood: form of the likelihood.
-        neighbours: nearest neighbours; None: the run has no training rows to compare with.
-        rows: number of located held-out rows; 0: the form is the default one, as nothing could be held out.
-        error_m: their mean distance from the estimate, metres.
-        inside: share of them inside the regions of probability `LEVEL`.
-        neighbours_error_m: mean held-out distance of nearest neighbours, metres.
-        scores: mean log posterior density at the true positions of each form that was tried, per square metre.
-    """
-
-    likelihood: Likelihood
-    neighbours: Neighbours | None = None
-    rows: int = 0
-    error_m: float = np.nan
-    inside: float = np.nan
-    neighbours_error_m: float = np.nan
+    likelihood: Likelihood  # form of the likelihood
+    neighbours: Neighbours | None = None  # nearest neighbours; None: the run has no training rows to compare with
+    rows: int = 0  # number of located held-out rows; 0: the form is the default one, as nothing could be held out
+    error_m: float = np.nan  # their mean distance from the estimate, metres
+    inside: float = np.nan  # share of them inside the regions of probability `LEVEL`
+    neighbours_error_m: float = np.nan  # mean held-out distance of nearest neighbours, metres
+    # mean log posterior density at the true positions of each form that was tried, per square metre
     scores: dict[str, float] | None = None
 
 
 def predict_candidates(
     fitted: Fitted, count: int, headings: int, candidates: Candidates, report: Callable[[float], None]
 ) -> NDArray[np.float32]:
-    """Predictions of a fitted model for all its receivers, ``count``, at equally spaced headings where it uses them.
+    """Means in dBm and standard deviations in dB [2, headings, n_rx, p] of a fitted model at the candidates.
 
-    Returns:
-        Means in dBm and standard deviations in dB [2, headings, n_rx, p].
-
-    Raises:
-        InputError: the model states no standard deviation.
+    Headings are equally spaced where the model uses them. `InputError` where it states no standard deviation.
     """
     positions = candidates.positions_m
     predicted = np.empty((2, headings, count, len(positions)), np.float32)
     for number in range(headings):
         turned = np.full(len(positions), 2 * np.pi * number / headings) if headings > 1 else None
         for receiver in range(count):
-            found = fitted.predict(Inputs(positions, turned), receiver)
-            if found.std is None:
+            prediction = fitted.predict(Inputs(positions, turned), receiver)
+            if prediction.std is None:
                 raise InputError("its model states no standard deviation; train it with --intervals")
-            predicted[:, number, receiver] = found.mean, found.std
+            predicted[:, number, receiver] = prediction.mean, prediction.std
             report((number * count + receiver + 1) / (headings * count))
     return predicted
 
 
 def headings_of(run: Run) -> int:
     """Number of headings at which a run's model is evaluated; 1 where it does not use the heading."""
-    stated = run.fitted.uses_heading
-    uses = run.model.headings if stated is None else stated
-    return HEADINGS if uses and run.problem.record.tx_heading_rad is not None else 1
+    return HEADINGS if run.takes_heading and run.problem.record.tx_heading_rad is not None else 1
 
 
 @dataclass(frozen=True)
@@ -125,11 +104,8 @@ class Located:
 def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibration:
     """The stored choice of a run for these candidates, else a new one, which is stored in the run folder.
 
-    Finished folds are kept until all are, so that a stopped choice goes on.
-
-    Raises:
-        InputError: a fold that the model cannot be fitted to.
-        Interrupted: stopped.
+    Finished folds are kept until all are, so that a stopped choice (`Interrupted`) goes on. `InputError` of a fold
+    that the model cannot be fitted to.
     """
     grid, file = candidates.grid, run.folder / FILE
     key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}
@@ -143,34 +119,42 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
     folds = folds_of(record, split)
     if not folds:
         return Calibration(Likelihood())
-    parts, headings, place = [], headings_of(run), run.folder / FOLDER
+    parts = []
     for number, fold in enumerate(folds):
-        kept = place / f"fold{number}.npz"
         label = f"calibrating, fold {number + 1} of {len(folds)}"
-        report = partial(session.report, f"{label}: map")
-        arrays = stored_arrays(kept) if kept.exists() else {}
-        if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
-            folder = place / f"fold{number}"
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
-            inner = labelled(replace(session, folder=folder, run=folder), label)
-            with threadpool_limits(1, "blas"):
-                fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
-                found = predict_candidates(fitted, len(numbers), headings, candidates, report)
-            shutil.rmtree(folder)
-            arrays = {"predicted": found, "positions_m": candidates.positions_m, "receivers": numbers}
-            write_arrays(kept, arrays)
-        receivers = arrays["receivers"]
+        receivers, predicted = _predicted_fold(
+            run, fold, run.folder / FOLDER / f"fold{number}", candidates, session, label
+        )
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         most = max(1, MOST_ROWS // len(folds))
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
-        parts.append(Located(arrays["predicted"], receivers, test, candidates.nearest(record.tx_pos_m[test])))
+        parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
     neighbours, error_m = choose_neighbours(record, folds)
     chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
     chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
     write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
-    shutil.rmtree(place)
+    shutil.rmtree(run.folder / FOLDER)
     return chosen
+
+
+def _predicted_fold(
+    run: Run, fold: Split, folder: Path, candidates: Candidates, session: Session, label: str
+) -> tuple[IntArray, NDArray[np.float32]]:
+    """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fold is read."""
+    file = folder.with_suffix(".npz")
+    arrays = stored_arrays(file) if file.exists() else {}
+    if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        inner = labelled(replace(session, folder=folder, run=folder), label)
+        with threadpool_limits(1, "blas"):
+            fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
+            report = partial(session.report, f"{label}: map")
+            predicted = predict_candidates(fitted, len(numbers), headings_of(run), candidates, report)
+        shutil.rmtree(folder)
+        arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
+        write_arrays(file, arrays)
+    return arrays["receivers"], arrays["predicted"]
 
 
 def folds_of(record: Record, split: Split) -> list[Split]:
@@ -202,16 +186,16 @@ def choose(
     scores: dict[str, float] = {}
 
     def score(likelihoods: Sequence[Likelihood]) -> FloatArray:
-        found = [_scores(record, part, one, candidates) for part, one in zip(parts, likelihoods, strict=True)]
+        of_parts = [_scores(record, part, form, candidates) for part, form in zip(parts, likelihoods, strict=True)]
         report((len(scores) + 1) / steps)
-        return np.concatenate(found)
+        return np.concatenate(of_parts)
 
     def scored(tried: Sequence[Likelihood]) -> list[FloatArray]:
-        found = []
-        for one in tried:
-            found.append(score([one] * len(parts)))
-            scores[_words(one)] = float(found[-1].mean())
-        return found
+        of_forms = []
+        for form in tried:
+            of_forms.append(score([form] * len(parts)))
+            scores[_words(form)] = float(of_forms[-1].mean())
+        return of_forms
 
     best = widest(forms, scored(forms))
     shared = [replace(best, offset_db=offset) for offset in OFFSETS_DB]
@@ -219,16 +203,17 @@ def choose(
     gains = [0.0, *(_clear_gain(other - plain) for other in others)]
     best = shared[int(np.argmax(gains))]
     silences = [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
-    if (whole := fit_silence(record, parts)) is not None:
-        gain = score([replace(best, silence=one) for one in silences]) - score([best] * len(parts))
+    if (silence := fit_silence(record, parts)) is not None:
+        # Each fold is scored by the probability of the other folds, so that it cannot describe itself.
+        gain = score([replace(best, silence=others) for others in silences]) - score([best] * len(parts))
         scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
         if _clear_gain(gain) > 0:
-            best = replace(best, silence=whole)
+            best = replace(best, silence=silence)
     errors, inside = [], []
     for part in parts:
         for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
-            found = softmax(best.log(_strengths(record, part, row), *part.predicted))
-            estimate, _, region = region_of(found, candidates.distance_m, LEVEL)
+            probability = softmax(best.log(_strengths(record, part, row), *part.predicted))
+            estimate, _, region = region_of(probability, candidates.distance_m, LEVEL)
             errors.append(np.linalg.norm((candidates.positions_m[estimate] - place)[:2]))
             inside.append(region[truth])
     report(1.0)
@@ -242,8 +227,8 @@ def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelih
     located have errors of another day (Breiman et al., "Classification and regression trees" (1984), section 3.4.3: the
     rule of one standard error).
     """
-    best = scores[int(np.argmax([one.mean() for one in scores]))]
-    able = [form for form, one in zip(forms, scores, strict=True) if _clear_gain(best - one) <= 0]
+    best = scores[int(np.argmax([of_form.mean() for of_form in scores]))]
+    able = [form for form, of_form in zip(forms, scores, strict=True) if _clear_gain(best - of_form) <= 0]
     return max(
         able, key=lambda form: form.scale * (norm() if form.degrees is None else student_t(form.degrees)).ppf(WIDE)
     )
@@ -256,7 +241,6 @@ def _clear_gain(difference: FloatArray) -> float:
 
 
 def _strengths(record: Record, part: Located, row: int) -> FloatArray:
-    """Signal strengths of a row of the record at the receivers of a fold."""
     return np.asarray(record.observation[part.receivers, row], float)
 
 
@@ -268,11 +252,11 @@ def _words(form: Likelihood) -> str:
 
 def _scores(record: Record, part: Located, form: Likelihood, candidates: Candidates) -> FloatArray:
     """Log posterior density [m] at the true positions of held-out rows, per square metre."""
-    found = []
+    densities = []
     for row, truth in zip(part.rows, part.truth, strict=True):
         log = form.log(_strengths(record, part, row), *part.predicted)
-        found.append(log[truth] - np.logaddexp.reduce(log))
-    return np.asarray(found) - np.log(candidates.cell_m2 or 1.0)
+        densities.append(log[truth] - np.logaddexp.reduce(log))
+    return np.asarray(densities) - np.log(candidates.cell_m2 or 1.0)
 
 
 def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:

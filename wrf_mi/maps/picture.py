@@ -31,24 +31,18 @@ from .dataset import POWER
 if TYPE_CHECKING:
     import xarray
 
-PANEL_IN, COLUMNS = 3.2, 3
-"""Width of a panel, and number of panels in a line."""
-MOST_PANELS = 12
-"""Largest number of receivers that are drawn, the first ones."""
-MOST_POINTS = 200
-"""Largest number of training rows of a panel, and of other measured rows."""
-TAIL = 1.0
-"""Percentage of values beyond either end of the colour scale."""
-MEASURED_TAIL = 10.0
-"""The same of measured levels, among which are single deep fades."""
+PANEL_IN, COLUMNS = 3.2, 3  # width of a panel, and number of panels in a line
+MOST_PANELS = 12  # largest number of receivers that are drawn, the first ones
+MOST_POINTS = 200  # largest number of training rows of a panel, and of other measured rows
+TAIL = 1.0  # percentage of values beyond either end of the colour scale
+MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
 STRONGEST = "strongest receiver"
 TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
 OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
 MARKS = "circles: training rows, squares: other measured rows, crosses: receivers"
 LETTERS_PER_INCH, LETTERS_OF_BAR, LINE_IN = 14, 32, 0.16
 """Of the text above the panels; length of the colour scale's label, and height of a line, inches."""
-SAME_CARRIER = 1e-9
-"""Relative difference of frequencies that are the same."""
+SAME_CARRIER = 1e-9  # relative difference of frequencies that are the same
 
 
 class _Measured(NamedTuple):

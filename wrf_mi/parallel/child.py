@@ -11,8 +11,7 @@ import signal
 import sys
 import threading
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
+INTERRUPTED = 130  # exit status after Ctrl-C
 
 
 def _end_with_parent() -> None:

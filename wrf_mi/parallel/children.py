@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from .worker import given_up, worker_threads
 
 POLL_S = 0.5
-GRACE_S = 30.0
-"""Time for a child that is stopped to finish its step and write a checkpoint."""
+GRACE_S = 30.0  # time for a child that is stopped to finish its step and write a checkpoint
 
 
 def run_module(
@@ -37,10 +36,10 @@ def run_module(
         KeyboardInterrupt: in this process; the child has ended then.
     """
     threads = worker_threads()
-    kept = threads is not None if quiet is None else quiet
+    captured = threads is not None if quiet is None else quiet
     call = [sys.executable, "-m", "wrf_mi.parallel.child", str(threads or 0), module, *arguments]
     with tempfile.TemporaryFile("w+", errors="replace") as errors:
-        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": errors if kept else None}
+        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": errors if captured else None}
         # In a separate process group: Ctrl-C on a terminal reaches this process alone, which passes it on once.
         # It inherits that Ctrl-C is blocked, until it can end without a traceback.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -18,13 +18,10 @@ from ..core.files import one_line
 from .threads import processors
 from .worker import run_part, worker_environment
 
-CONNECT_S = 10.0
-"""Time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds."""
+CONNECT_S = 10.0  # time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds
 POLL_S = 1.0
-PARTS_EACH = 8
-"""Parts for each worker: a slow or late worker leaves the others at most an eighth of its share."""
-LINES = 10
-"""Lines of progress in all where standard error is a file."""
+PARTS_EACH = 8  # parts for each worker: a slow or late worker leaves the others at most an eighth of its share
+LINES = 10  # lines of progress in all where standard error is a file
 
 
 class SchedulerFailed(RuntimeError):
@@ -44,13 +41,7 @@ def row_parts(count: int, workers: int, least: int = 1, most: int = 1024) -> lis
 
 
 class PartsProgress(Progress):
-    """Progress over parts on standard error: a bar on a terminal; elsewhere a line at each tenth.
-
-    Args:
-        what: present participle for the description.
-        total: rows in all parts.
-        lines: whether to print these lines.
-    """
+    """Progress over ``total`` rows on standard error: a bar on a terminal; else, with ``lines``, one each tenth."""
 
     def __init__(self, what: str, total: int, lines: bool) -> None:
         console = Console(stderr=True)
@@ -125,40 +116,52 @@ class Scheduler:
             InputError: raised by a part; the parts that are left are cancelled.
             SchedulerFailed: the scheduler, or several workers in a row that computed the same part, were lost.
         """
-        results: list[Any] = [None] * len(parts)
+        report = each or (lambda index, result: None)
         if self._client is None:
-            first = () if opener is None else (opener(),)
+            opened, results = () if opener is None else (opener(),), []
             for k, part in enumerate(parts):
-                results[k] = function(*first, part)
-                if each is not None:
-                    each(k, results[k])
+                results.append(function(*opened, part))
+                report(k, results[k])
             return results
         token = uuid.uuid4().hex
         task = partial(run_part, worker_environment(), token, opener, function)
+        keys = [f"{what.replace(' ', '-')}-{token}-{k}" for k in range(len(parts))]
+        futures = {future.key: future for future in self._client.map(task, parts, key=keys, pure=False)}
         sizes = [1] * len(parts) if sizes is None else sizes
-        done: queue.SimpleQueue[str] = queue.SimpleQueue()
-        index = {f"{what.replace(' ', '-')}-{token}-{k}": k for k in range(len(parts))}
-        futures = {future.key: future for future in self._client.map(task, parts, key=list(index), pure=False)}
         try:
-            for future in futures.values():
-                future.add_done_callback(lambda future: done.put(future.key))
             with PartsProgress(what, sum(sizes), lines=each is None if lines is None else lines) as progress:
-                while futures:
-                    try:
-                        key = done.get(timeout=POLL_S)
-                    except queue.Empty:  # for however long: a cluster may have to start workers first
-                        if self._client.status == "running" and not self._client.nthreads():
-                            progress.waiting()
-                        continue
-                    k = index[key]
-                    # Dask forgets a result that was fetched: a worker that is lost later takes none with it.
-                    results[k] = _result(futures.pop(key), what)
-                    progress.add(sizes[k], self.workers)
-                    if each is not None:
-                        each(k, results[k])
+                return self._collect(futures, keys, sizes, what, progress, report)
         except BaseException:
             self._client.cancel(list(futures.values()), force=True)
             raise
+
+    def _collect(
+        self,
+        futures: dict[str, Any],
+        keys: Sequence[str],
+        sizes: Sequence[int],
+        what: str,
+        progress: PartsProgress,
+        report: Callable[[int, Any], None],
+    ) -> list[Any]:
+        """Results of futures in the order of their keys; they are reported in the order in which they are done."""
+        client: Any = self._client
+        done, results = queue.SimpleQueue[str](), [None] * len(keys)
+        index = {key: k for k, key in enumerate(keys)}
+        for future in futures.values():
+            future.add_done_callback(lambda future: done.put(future.key))
+        while futures:
+            try:
+                key = done.get(timeout=POLL_S)
+            except queue.Empty:  # for however long: a cluster may have to start workers first
+                if client.status == "running" and not client.nthreads():
+                    progress.waiting()
+                continue
+            k = index[key]
+            # Dask forgets a result that was fetched: a worker that is lost later takes none with it.
+            results[k] = _result(futures.pop(key), what)
+            progress.add(sizes[k], self.workers)
+            report(k, results[k])
         return results
 
     def __enter__(self) -> Self:
@@ -242,7 +245,6 @@ def open_scheduler(text: str | None) -> Scheduler:
 
 
 def _local_workers(text: str) -> int | None:
-    """Number of workers on this machine; None for an address."""
     name, colon, number = text.partition(":")
     if name != "local":
         return None

@@ -16,8 +16,7 @@ from ..backend import choose, init
 from ..backend.probe import installed_version
 from ..core import InputError
 
-VARIABLES = "WRF_MI_"
-"""Environment variables with this beginning are set in workers as they are in the client."""
+VARIABLES = "WRF_MI_"  # environment variables with this beginning are set in workers as they are in the client
 THREADS = "OMP_NUM_THREADS"
 """Number of threads of Dr.Jit in a worker. Dask sets it to 1 unless it is set where the worker is started."""
 PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")
@@ -26,27 +25,16 @@ PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """Environment of the client, which workers adopt before each part.
+    """Environment of the client, which workers adopt before each part."""
 
-    Attributes:
-        folder: working directory, to which relative paths refer.
-        variables: environment variables that begin with `VARIABLES`.
-        backend: ``"llvm"`` or ``"cuda"``.
-        versions: versions of Python and `PACKAGES`.
-    """
-
-    folder: str
-    variables: tuple[tuple[str, str], ...]
-    backend: str
-    versions: tuple[tuple[str, str], ...]
+    folder: str  # working directory, to which relative paths refer
+    variables: tuple[tuple[str, str], ...]  # environment variables that begin with `VARIABLES`
+    backend: str  # ``"llvm"`` or ``"cuda"``
+    versions: tuple[tuple[str, str], ...]  # versions of Python and `PACKAGES`
 
 
 def worker_environment() -> WorkerEnvironment:
-    """The environment of this process.
-
-    Raises:
-        BackendError: neither LLVM nor CUDA can be used here.
-    """
+    """The environment of this process; `BackendError`: neither LLVM nor CUDA can be used here."""
     variables = tuple(sorted((k, v) for k, v in os.environ.items() if k.startswith(VARIABLES)))
     # The import of Mitsuba can wait where nothing has imported it yet.
     backend = init() if "mitsuba" in sys.modules else choose()

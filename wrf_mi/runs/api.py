@@ -67,7 +67,10 @@ from ..training.session import Interrupted, OnProgress, quiet
 from .evaluate import Part, score_other, score_part, score_run
 from .folder import (
     FITTED,
+    GIVEN,
     RunConfig,
+    RunRequest,
+    Settings,
     check_new,
     clear_begun,
     load_rows,
@@ -80,68 +83,51 @@ from .run import Run, load_fitted, open_run, predict_to_file
 
 logger = logging.getLogger(__name__)
 
-Settings = Iterable[str] | object
-"""``key=value`` of the model's settings, or all settings as its dataclass."""
-
-
-def _settings_of(model: Model, settings: Settings, given: dict[str, Any]) -> Any:
-    """All settings of a model; ``given`` are arguments of `train` that may be settings, too."""
-    kind: Any = model.settings
-    if is_dataclass(settings) and not isinstance(settings, type):
-        if not issubclass(kind, type(settings)):
-            raise InputError(f"settings of {model.name}: {type(settings).__name__}; give {kind.__name__}")
-        found: Any = kind(**{field.name: getattr(settings, field.name) for field in fields(settings)})
-    else:
-        assert isinstance(settings, Iterable)
-        found = default_settings(model, settings, given)
-    if "model" in model.train_arguments and found.model != model.name:
-        raise InputError(f"setting model: {found.model}, where the model is {model.name}; choose it with --model")
-    return found
-
 
 def plan_run(
-    dataset: str | Path | Record,
-    model: str = "hybrid",
-    *,
-    scene: str | Path | None = None,
-    material: str | None = None,
-    antennas: AntennaOptions = AS_STATED,
-    receiver: str | None = None,
-    evaluation: str | None = None,
-    split: str | Split = "official",
-    n_train: int | float | None = None,
-    seed: int = 0,
-    settings: Settings = (),
-    deterministic: bool = False,
-    intervals: bool = False,
-    progress: bool = False,
+    dataset: str | Path | Record, request: RunRequest, progress: bool = False
 ) -> tuple[Problem, RunConfig, list[Split]]:
-    """Problem, configuration and splits of a run; arguments and errors as those of `train`. Nothing is written."""
-    entry, scene_name = known_model(model), None if scene is None else str(scene)
+    """Problem, configuration and splits of a run; errors as those of `train`. Nothing is written."""
+    scene = None if request.scene is None else str(request.scene)
+    entry = known_model(request.model)
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
-    chosen = entry.serving(record.task, scene is not None)
-    given = {"model": model, "seed": seed, "deterministic": deterministic, "receiver": receiver}
-    given["evaluation"] = evaluation
+    model = entry.serving(record.task, scene is not None)
     for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
-        if given[option] is not None and option not in chosen.train_arguments:
+        if getattr(request, option) is not None and option not in model.train_arguments:
             able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
-            raise InputError(f"--{option} belongs to {data} ({able}), not to {model}")
-    _check_scene(chosen, record, scene_name, material, antennas)
-    found = _settings_of(chosen, settings, given)
-    if "seed" in chosen.train_arguments:
-        seed, deterministic = found.seed, found.deterministic
-    record, splits, left_out = _split_rows(record, split, seed, n_train)
+            raise InputError(f"--{option} belongs to {data} ({able}), not to {request.model}")
+    _check_scene(model, record, scene, request)
+    settings, seed, deterministic = _settings_of(model, request), request.seed, request.deterministic
+    if "seed" in model.train_arguments:
+        seed, deterministic = settings.seed, settings.deterministic
+    record, splits, left_out = _split_rows(record, request.split, seed, request.n_train)
     for rows in splits:
-        check_held_receivers(record, rows, chosen, MODELS.values())
-        check_observations(record, rows, complete=chosen.complete)
-    problem = Problem(record, found, seed, scene_name, material, antennas)
-    checked = WithIntervals(chosen) if intervals else chosen
+        check_held_receivers(record, rows, model, MODELS.values())
+        check_observations(record, rows, complete=model.complete)
+    problem = Problem(record, settings, seed, scene, request.material, request.antennas)
+    checked = WithIntervals(model) if request.intervals else model
     checked.check(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
-    name = split.name if isinstance(split, Split) else split
-    options = (seed, scene_name, material, antennas, deterministic, intervals, found, left_out)
-    return problem, RunConfig(model, source, record.task, name, n_train, *options), splits
+    name = request.split.name if isinstance(request.split, Split) else request.split
+    options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
+    return problem, RunConfig(request.model, source, record.task, name, request.n_train, *options), splits
+
+
+def _settings_of(model: Model, request: RunRequest) -> Any:
+    """All settings of a model."""
+    kind: Any = model.settings
+    stated = request.settings
+    if is_dataclass(stated) and not isinstance(stated, type):
+        if not issubclass(kind, type(stated)):
+            raise InputError(f"settings of {model.name}: {type(stated).__name__}; give {kind.__name__}")
+        settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
+    else:
+        assert isinstance(stated, Iterable)
+        settings = default_settings(model, stated, {name: getattr(request, name) for name in GIVEN})
+    if "model" in model.train_arguments and settings.model != model.name:
+        raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
+    return settings
 
 
 def _split_rows(
@@ -167,17 +153,15 @@ def _split_rows(
     return record, splits, left_out
 
 
-def _check_scene(
-    model: Model, record: Record, scene: str | None, material: str | None, antennas: AntennaOptions
-) -> None:
+def _check_scene(model: Model, record: Record, scene: str | None, request: RunRequest) -> None:
     if scene is None:
         if model.scene == "required":
             raise InputError(f"{model.name} needs a scene; give --scene SCENE, or choose kriging, which takes none")
-        if material is not None or antennas:
+        if request.material is not None or request.antennas:
             raise InputError("--material and antenna options belong to a scene that is traced; give --scene")
     elif model.scene == "none":
         raise InputError(f"{model.name} on {place_of(record)}: takes no scene; omit --scene")
-    elif antennas and not model.uses_antennas:
+    elif request.antennas and not model.uses_antennas:
         raise InputError(f"{model.name} on {record.name}: takes no antenna options: its channels are of isotropic ones")
 
 
@@ -239,22 +223,9 @@ def train(
     check_new(folder)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
-    problem, config, splits = plan_run(
-        dataset,
-        model,
-        scene=scene,
-        material=material,
-        antennas=antennas,
-        receiver=receiver,
-        evaluation=evaluation,
-        split=split,
-        n_train=n_train,
-        seed=seed,
-        settings=settings,
-        deterministic=deterministic,
-        intervals=intervals,
-        progress=progress,
-    )
+    what = RunRequest(model, scene, material, antennas, receiver, evaluation, split, n_train, seed, settings)
+    request = replace(what, deterministic=deterministic, intervals=intervals)
+    problem, config, splits = plan_run(dataset, request, progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out)
     _warn_of_known_rows(problem, splits)

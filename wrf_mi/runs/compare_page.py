@@ -1,14 +1,15 @@
-"""Page of a comparison: one HTML file that needs no network, for laptops and telephones."""
+"""Page of a comparison, one HTML file that needs no network, for laptops and telephones; commands that repeat runs."""
 
 from __future__ import annotations
 
 import base64
 import html
+import json
 import os
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
@@ -16,59 +17,44 @@ from typing import Any
 
 from PIL import Image
 
+from ..core import AntennaOptions
+from ..core.settings import flat
 from ..datasets.registry import KNOWN
+from ..models.model import default_settings
 from ..tasks import TASKS
-from .compare_tables import (
-    BETTER,
-    COLUMNS,
-    DIFFERENCES,
-    WORSE,
-    Difference,
-    best_run,
-    common,
-    difference_rows,
-)
-from .repeat import changed_settings, command, known_config, model_words, stored_versions
+from .compare_tables import BETTER, COLUMNS, DIFFERENCES, WORSE, Difference, best_run, common, difference_rows
+from .folder import RunConfig, known_config, stored_versions
 from .results import Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
-CONSTANT = ("dataset", "metric")
-"""Columns that are equal in a section, whose heading states them."""
-FIRST = ("run", "median", "mean", "common_mean")
-"""Columns that narrow screens show without scrolling."""
+CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
+FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
 
 
 @dataclass(frozen=True)
 class Section:
-    """Runs of a data set with their tables and pictures.
+    """Runs of a data set with their tables and pictures."""
 
-    Attributes:
-        slug: name of the section in links, and beginning of its files' names.
-        runs: the runs.
-        scores: rows of the table of scores, by `COLUMNS`.
-        differences: paired differences.
-        pictures: file and heading of each picture.
-    """
-
-    slug: str
-    runs: Sequence[Results]
-    scores: Sequence[Mapping[str, Any]]
-    differences: Sequence[Difference]
-    pictures: Sequence[tuple[Path, str]]
+    slug: str  # name of the section in links, and beginning of its files' names
+    runs: Sequence[Results]  # the runs
+    scores: Sequence[Mapping[str, Any]]  # rows of the table of scores, by `COLUMNS`
+    differences: Sequence[Difference]  # paired differences
+    pictures: Sequence[tuple[Path, str]]  # file and heading of each picture
 
     @property
     def title(self) -> str:
         """Data set and task."""
-        return f"{_data_name(self.runs[0])}: {TASKS[self.runs[0].task].heading}"
+        name = Path(self.runs[0].dataset).name or "unknown data"
+        return f"{name}: {TASKS[self.runs[0].task].heading}"
 
 
 def page(sections: Sequence[Section], folder: Path) -> str:
     """HTML of a comparison in a folder; the pictures must have been written."""
     runs = [run for section in sections for run in section.runs]
     count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
-    links = " · ".join(f'<a href="#{_text(one.slug)}">{_text(one.title)}</a>' for one in sections)
+    links = " · ".join(f'<a href="#{_text(part.slug)}">{_text(part.title)}</a>' for part in sections)
     contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
-    made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    today = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     again = shlex.join(["wrf-mi", "compare", *(str(run.path) for run in runs), "--out", str(folder)])
     style, script = (files(__package__).joinpath(f"compare_page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     return f"""<!DOCTYPE html>
@@ -79,7 +65,7 @@ def page(sections: Sequence[Section], folder: Path) -> str:
 <style>
 {style}</style>
 <h1>Comparison of {count}</h1>
-<p class="note">Made {made} by <code>{_text(again)}</code></p>
+<p class="note">Made {today} by <code>{_text(again)}</code></p>
 {contents}
 {"".join(map(_section, sections))}
 <h2>Versions and machines</h2>
@@ -98,6 +84,11 @@ def _section(section: Section) -> str:
     numeric = frozenset(("rows", "difference", "low", "high"))
     images = "\n".join(_image(path, title) for path, title in section.pictures)
     best = best_run(section.runs).name
+    configs = [known_config(run.path) for run in section.runs]
+    commands = "\n".join(
+        f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path)
+        for run, config in zip(section.runs, configs, strict=True)
+    )
     rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
     return f"""
 <h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
@@ -115,12 +106,8 @@ narrow.</p>
 {_table(DIFFERENCES, gains, numeric)}
 {images}
 <h3>Commands</h3>
-{_commands(section.runs)}
+<pre>{_text(commands)}</pre>
 """
-
-
-def _data_name(run: Results) -> str:
-    return Path(run.dataset).name or "unknown data"
 
 
 def _better(run: Results) -> str:
@@ -152,7 +139,11 @@ def _facts(runs: Sequence[Results]) -> str:
     scenes = dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene"))
     if scenes:
         facts["scene"] = "; ".join(scenes)
-    return "<dl>" + "".join(f"<dt>{key}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+    return _definitions(facts)
+
+
+def _definitions(facts: Mapping[str, str]) -> str:
+    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
 
 
 def _models(runs: Sequence[Results]) -> str:
@@ -170,33 +161,25 @@ def _models(runs: Sequence[Results]) -> str:
     return _table(columns, rows, frozenset())
 
 
-def _commands(runs: Sequence[Results]) -> str:
-    lines = []
-    for run in runs:
-        config = known_config(run.path)
-        lines.append(f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path))
-    return f"<pre>{_text(chr(10).join(lines))}</pre>"
-
-
 def _versions(runs: Sequence[Results]) -> str:
     """Versions with which the runs were made, grouped, and the machine of this page."""
     groups: dict[str, list[str]] = {}
     for run in runs:
-        found = ", ".join(f"{name} {value}" for name, value in stored_versions(run.path).items())
-        groups.setdefault(found or "not stored", []).append(run.name)
-    here = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    facts = {", ".join(names): words for words, names in groups.items()} | {"this page": here}
-    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+        versions = ", ".join(f"{name} {value}" for name, value in stored_versions(run.path).items())
+        groups.setdefault(versions or "not stored", []).append(run.name)
+    machine = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    facts = {", ".join(names): words for words, names in groups.items()} | {"this page": machine}
+    return _definitions(facts)
 
 
 def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
     """Table that sorts by a click on a heading; columns without a value are left out."""
-    kept = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
+    filled = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
     head = "".join(
         f'<th scope="col"{_class(key, numeric)}><button type="button">{_text(title)}</button></th>'
-        for key, title in kept.items()
+        for key, title in filled.items()
     )
-    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in kept) + "</tr>" for row in rows)
+    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in filled) + "</tr>" for row in rows)
     return (
         f'<div class="scroll"><table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
     )
@@ -230,3 +213,43 @@ def _image(path: Path, title: str) -> str:
 
 def _text(value: Any) -> str:
     return html.escape(str(value))
+
+
+def model_words(config: RunConfig) -> str:
+    """The model in words, with its scene."""
+    return config.entry.described(config.scene is not None)
+
+
+def changed_settings(config: RunConfig) -> dict[str, Any]:
+    """Settings, by dotted name, that differ from the model's defaults for these data; not arguments of `train`."""
+    entry = config.entry
+    stated = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
+    standard = dict(flat(asdict(default_settings(entry, (), stated))))
+    return {
+        name: value
+        for name, value in flat(asdict(config.settings))
+        if value != standard[name] and name not in entry.train_arguments
+    }
+
+
+def command(config: RunConfig, folder: Path) -> str:
+    """The line that repeats a run; data sets passed as objects are named by their folder, rows by their split."""
+    entry, settings = config.entry, config.settings
+    options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
+    options |= {field.name: getattr(config.antennas, field.name) for field in fields(AntennaOptions)}
+    for name in ("receiver", "evaluation"):
+        value = getattr(settings, name) if name in entry.train_arguments else None
+        if value is not None and value != getattr(default_settings(entry, (), {}), name):
+            options[name] = value
+    changed = changed_settings(config)
+    if config.seed:
+        options["seed"] = config.seed
+        if "seed" not in entry.train_arguments and hasattr(settings, "seed"):
+            changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
+    words = ["wrf-mi", "train", config.dataset, "--model", config.model, "--split", config.split]
+    for name, value in options.items():
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    words += [f"--{name}" for name in ("deterministic", "intervals") if getattr(config, name)]
+    for name, value in changed.items():
+        words += ["--set", f"{name}={json.dumps(value)}"]
+    return shlex.join([*words, "--out", str(folder)])

@@ -12,7 +12,7 @@ import numpy as np
 from ..core.angles import FloatArray
 from ..tasks import TASKS
 from ..tasks.scores import bootstrap
-from .repeat import known_config
+from .folder import known_config
 from .results import Results
 
 COLUMNS = {
@@ -47,31 +47,22 @@ DIFFERENCES = {
 }
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
-FEWEST = 2
-"""Least number of common rows of a difference with an interval."""
+FEWEST = 2  # least number of common rows of a difference with an interval
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Paired difference of a run and a run or reference, in favour of the first where it is positive.
+    """Paired difference of a run and a run or reference, in favour of the first where it is positive."""
 
-    Attributes:
-        run: name of the run.
-        against: name of the other run or of the reference.
-        rows: number of common rows.
-        difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows.
-        verdict: `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`.
-        seeds: number of seeds of which the verdict is.
-    """
-
-    run: str
-    against: str
-    rows: int
-    verdict: str
+    run: str  # name of the run
+    against: str  # name of the other run or of the reference
+    rows: int  # number of common rows
+    verdict: str  # `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`
+    # difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows
     difference: float | None = None
     low: float | None = None
     high: float | None = None
-    seeds: int = 1
+    seeds: int = 1  # number of seeds of which the verdict is
 
 
 def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
@@ -118,22 +109,22 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
         rival = next((other for other in seeds_of(best) if other.seed == run.seed), best)
         return rival.name, _paired(run, rival)
 
-    found: list[Difference] = []
+    of_runs: list[Difference] = []
     for run in runs:
         if run is not best and methods[run.name] == methods[best.name]:
-            found.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
+            of_runs.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
         elif run is not best:
-            found.append(_of_seeds(run, seeds_of(run), to_best))
-        found.append(_of_seeds(run, seeds_of(run), _to_reference))
-    return found
+            of_runs.append(_of_seeds(run, seeds_of(run), to_best))
+        of_runs.append(_of_seeds(run, seeds_of(run), _to_reference))
+    return of_runs
 
 
 def _of_seeds(
     run: Results, seeds: Sequence[Results], paired: Callable[[Results], tuple[str, FloatArray]]
 ) -> Difference:
-    each = {one.name: _of_rows(one, *paired(one)) for one in seeds}
-    words = {one.verdict for one in each.values()}
-    return replace(each[run.name], verdict=words.pop() if len(words) == 1 else TIE, seeds=len(seeds))
+    by_run = {seed.name: _of_rows(seed, *paired(seed)) for seed in seeds}
+    words = {seed.verdict for seed in by_run.values()}
+    return replace(by_run[run.name], verdict=words.pop() if len(words) == 1 else TIE, seeds=len(seeds))
 
 
 def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
@@ -187,27 +178,28 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
         for run in runs
     ]
     for name, (run, key) in references(runs).items():
-        kept = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
-        rows.append(kept | run.metrics["reference"][key] | {"run": name, "model": key})
+        counts = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
+        rows.append(counts | run.metrics["reference"][key] | {"run": name, "model": key})
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
     return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
 
 
-def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
+def difference_rows(differences: Sequence[Difference]) -> list[dict[str, Any]]:
     """Rows of the table of differences."""
     return [
-        asdict(one) | {"verdict": one.verdict + (f" ({one.seeds} seeds)" if one.seeds > 1 else "")} for one in found
+        asdict(gain) | {"verdict": gain.verdict + (f" ({gain.seeds} seeds)" if gain.seeds > 1 else "")}
+        for gain in differences
     ]
 
 
 def references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
     """A run and the key of each reference by name, once for runs with the same training and test rows."""
-    found: dict[str, tuple[Results, str]] = {}
+    by_name: dict[str, tuple[Results, str]] = {}
     for run in runs:
         for key, scores in run.reference_scores.items():
-            known = (r.reference_scores[key] for r, k in found.values() if k == key)
+            known = (r.reference_scores[key] for r, k in by_name.values() if k == key)
             if any(np.array_equal(scores, other, equal_nan=True) for other in known):
                 continue
             name = f"{TASKS[run.task].references[key]}, {run.metrics['split']}"
-            found[f"{name} of {run.name}" if name in found else name] = run, key
-    return found
+            by_name[f"{name} of {run.name}" if name in by_name else name] = run, key
+    return by_name

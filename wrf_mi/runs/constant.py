@@ -12,22 +12,16 @@ from ..core.angles import FloatArray
 from ..tasks import TASKS, Task
 from ..tasks.scores import summary
 
-CONSTANT = "constant"
-"""Key of the block in ``metrics.json``."""
+CONSTANT = "constant"  # key of the block in ``metrics.json``
 SCORES = "constant_score"
 """Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
 
 
 def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> FloatArray:
-    """Scores [n_rx, m] of a constant prediction (`wrf_mi.tasks.Task.constant`) for the test rows of a split.
+    """Scores [n_rx, m] of a constant prediction (`wrf_mi.tasks.Task.constant`) of the test rows' truth [n_rx, m, ...].
 
-    The constant is that of the training rows that a receiver received; a receiver without any, which the split holds
-    out, takes that of all receivers.
-
-    Args:
-        record: data.
-        split: its training rows, validation rows included, determine the constant.
-        truth: observations of the test rows [n_rx, m, ...], NaN where they are not scored.
+    The constant is that of the training rows, validation rows included, that a receiver received; a receiver without
+    any, which the split holds out, takes that of all receivers. Truth is NaN where it is not scored.
     """
     task, rows = TASKS[record.task], split.all_train
     observed = record.seen(split).observation[:, rows]
@@ -40,12 +34,7 @@ def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> FloatA
 
 
 def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> dict[str, Any]:
-    """Block of ``metrics.json``: whether scores are clearly better than those of the constant prediction.
-
-    Args:
-        task: task of the scores.
-        scores: scores of a model [n_rx, m], NaN where nothing is scored.
-        constant: scores of the constant prediction on the same rows.
+    """Block of ``metrics.json``: whether a model's scores [n_rx, m] are clearly better than the constant prediction's.
 
     Returns:
         `wrf_mi.tasks.scores.summary` of the constant prediction, ``gain``, by which the model's mean score is better,

@@ -20,7 +20,7 @@ from ..core.memory import peak_memory_mb
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import scorable
-from ..models import Fitted, Problem, Session
+from ..models import Fitted, Inputs, Problem, Session
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
@@ -41,14 +41,10 @@ NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
-SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")
-"""Arrays of ``predictions.npz`` without an axis of receivers."""
-REPEATS = 20
-"""Largest number of single predictions that are timed."""
-MOST_OF_STAGES = 400
-"""Test rows by which the stages of a fit are scored."""
-TIMED_S = 2.0
-"""Time after which no further single prediction is begun: some models optimise for each sample."""
+SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")  # arrays of ``predictions.npz`` without an axis of receivers
+REPEATS = 20  # largest number of single predictions that are timed
+MOST_OF_STAGES = 400  # test rows by which the stages of a fit are scored
+TIMED_S = 2.0  # time after which no further single prediction is begun: some models optimise for each sample
 
 
 class Part(NamedTuple):
@@ -74,11 +70,8 @@ def _milliseconds_per_sample(predict: Predict, rows: IntArray, receiver: int) ->
 def evaluate(record: Record, split: Split, predict: Predict, single: Predict | None = None) -> Scores:
     """Score predictions on the test rows of a split, together with the references that the data allow.
 
-    Args:
-        record: data of any task in `wrf_mi.tasks.TASKS`.
-        split: rows; references (`reference_predictions`) use all its training rows, validation rows included.
-        predict: predictions to score; finite wherever something was received.
-        single: prediction that is timed at one row; None: ``predict``.
+    References (`reference_predictions`) use all training rows of the split, validation rows included. ``single`` is
+    timed at one row; None: ``predict``.
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
@@ -100,10 +93,10 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     truth[trained] = np.nan
     if np.isnan(truth).all():
         raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    given = [predict(rows, receiver) for receiver in scored]
-    found = [one if isinstance(one, Prediction) else Prediction(one) for one in given]
-    prediction = np.full((len(truth), *found[0].mean.shape), np.nan, truth.dtype)
-    prediction[list(scored)] = [one.mean for one in found]
+    predicted = [predict(rows, receiver) for receiver in scored]
+    stated = [p if isinstance(p, Prediction) else Prediction(p) for p in predicted]
+    prediction = np.full((len(truth), *stated[0].mean.shape), np.nan, truth.dtype)
+    prediction[list(scored)] = [p.mean for p in stated]
     arrays = {
         "row": rows,
         "prediction": prediction,
@@ -114,9 +107,9 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         SCORES: constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
-    if found[0].std is not None:
+    if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
-        arrays["std"][list(scored)] = [one.stated_std for one in found]
+        arrays["std"][list(scored)] = [p.stated_std for p in stated]
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
         "n_train": len(split.all_train),
@@ -219,28 +212,28 @@ def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: d
     They are the mean score of test rows and the milliseconds of a prediction by the stages up to each; of many test
     rows `MOST_OF_STAGES`, evenly spaced, are scored.
     """
-    reports = [dict(one) for one in part.fitted.facts().get("stages", [])]
-    kept = [one for one in reports if one["kept"]]
-    if not kept:
+    reports = [dict(report) for report in part.fitted.facts().get("stages", [])]
+    used = [report for report in reports if report["kept"]]
+    if not used:
         return {}
     predictions = part.fitted.by_stage(part.split)
     task, rows = TASKS[record.task], arrays["row"]
-    some = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
-    truth = arrays["truth"][:, some]
-    for one in kept:
-        if one["stage"] in predictions:
-            predict = predictions[one["stage"]]
-            found = np.asarray(predict(inputs_of(record, rows[some])))
+    spaced = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
+    truth = arrays["truth"][:, spaced]
+    for report in used:
+        if report["stage"] in predictions:
+            predict = predictions[report["stage"]]
+            prediction = np.asarray(predict(inputs_of(record, rows[spaced])))
 
             def single(row: IntArray, receiver: int, predict: PredictAll = predict) -> NDArray[Any]:
                 return predict(inputs_of(record, row))
 
             milliseconds = _milliseconds_per_sample(single, rows, 0) / len(truth)
-        elif one is kept[-1]:
-            found, milliseconds = arrays["prediction"][:, some], metrics["ms_per_sample"]
+        elif report is used[-1]:
+            prediction, milliseconds = arrays["prediction"][:, spaced], metrics["ms_per_sample"]
         else:
             continue
-        one |= {"test": float(np.nanmean(task.of_rows(found, truth))), "ms": milliseconds}
+        report |= {"test": float(np.nanmean(task.of_rows(prediction, truth))), "ms": milliseconds}
     return {"stages": reports}
 
 
@@ -261,16 +254,13 @@ def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any])
 
 
 def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Write predictions as ``.npz``, observations without their first axis where there is one receiver.
+    """Write predictions as ``.npz``, without the first axis where there is one receiver; return the arrays.
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
     [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
     [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
     deviation of the same shape, real.
-
-    Returns:
-        The arrays as written.
     """
     single = len(arrays["receiver_name"]) == 1
     written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}
@@ -300,27 +290,30 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
             received no training row.
     """
     task, kind, rows = TASKS[record.task], record.observation.dtype, split.test
-    found: dict[str, Any] = {}
+    predictions: dict[str, Any] = {}
     if record.uplink is not None and task.from_uplink:
-        found[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers)).astype(kind)
+        predictions[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers))
     if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
         alone = split.held_receivers and not len(split.left)
         key, entry = (LAW, MRI) if alone else (task.reference, IDW)
         plain = replace(split, train=split.all_train, validation=split.validation[:0])
         problem = Problem(record, default_settings(entry, (), {})).seen(split)
         fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
-        inputs, receivers = inputs_of(record, rows), range(len(record.receivers))
-        found[key] = np.stack([fitted.predict(inputs, receiver).mean for receiver in receivers]).astype(kind)
+
+        def of_all(inputs: Inputs) -> NDArray[Any]:
+            return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])
+
+        inputs = inputs_of(record, rows)
+        predictions[key] = of_all(inputs)
         if record.carriers_hz is not None and inputs.carriers_hz is not None:
             known = np.unique(record.carriers_hz[split.all_train])
             nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
             if (nearest != inputs.carriers_hz).any():
-                there = replace(inputs, carriers_hz=nearest)
-                found[CARRIER] = np.stack([fitted.predict(there, receiver).mean for receiver in receivers]).astype(kind)
-    if not found:
+                predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
+    if not predictions:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
-    return found
+    return {key: values.astype(kind) for key, values in predictions.items()}
 
 
 def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:

@@ -22,16 +22,11 @@ from ..models.hybrid.scene_side import STAGES
 if TYPE_CHECKING:
     from ..gaussians.footprint import Footprints
 
-PANEL_IN = 2.3
-"""Side of a polar plot in inches."""
-OUTLINE_POINTS = 64
-"""Corners of the polygon of a footprint's outline."""
-COLOURS = 10
-"""Number of colours in Matplotlib's cycle."""
-POINTS_AREA = 4000.0
-"""Area of all points of a map together, points squared: few positions are drawn larger."""
-MARKERS = "os^D"
-"""Markers of points, where colours repeat."""
+PANEL_IN = 2.3  # side of a polar plot in inches
+OUTLINE_POINTS = 64  # corners of the polygon of a footprint's outline
+COLOURS = 10  # number of colours in Matplotlib's cycle
+POINTS_AREA = 4000.0  # area of all points of a map together, points squared: few positions are drawn larger
+MARKERS = "os^D"  # markers of points, where colours repeat
 TAIL = 0.01
 """Fraction of each curve that may lie beyond either end of the axis, so that outliers do not compress the rest."""
 
@@ -87,21 +82,14 @@ def spectrum_table(rows: Rows, columns: Sequence[str]) -> Figure:
 
 
 def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, label: str) -> Figure:
-    """Table of maps of a value at transmitter positions, seen from above.
-
-    Args:
-        rows: a name and an array [m] per column; NaN leaves a position out. The maps of a row share their colours.
-        columns: title of each column.
-        tx_pos_m: positions [m, 3], metres.
-        label: name of the value, with its unit.
-    """
+    """Table of maps of values [m], NaN left out, at positions [m, 3] in metres; those of a row share their colours."""
     x, y, _ = np.asarray(tx_pos_m, float).T
     aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
     figure = Figure(figsize=(PANEL_IN * len(columns) + 0.8, PANEL_IN * aspect * len(rows) + 0.6), layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
     for r, (name, maps) in enumerate(rows):
-        given = np.concatenate([np.ravel(values) for values in maps if values is not None])
-        low, high = np.nanpercentile(given, [1, 99]) if np.isfinite(given).any() else (0.0, 1.0)
+        row_values = np.concatenate([np.ravel(values) for values in maps if values is not None])
+        low, high = np.nanpercentile(row_values, [1, 99]) if np.isfinite(row_values).any() else (0.0, 1.0)
         for c, (title, values) in enumerate(zip(columns, maps, strict=True)):
             axes = grid[r, c]
             axes.set_aspect("equal")
@@ -125,14 +113,7 @@ def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, labe
 
 
 def row_table(rows: Rows, columns: Sequence[str], row: ArrayLike, label: str) -> Figure:
-    """Values over row numbers, for data without positions: a plot for each name, a line for each column.
-
-    Args:
-        rows: a name and an array [m] per column; NaN leaves a point out.
-        columns: name of each line.
-        row: numbers of the rows [m].
-        label: name of the value, with its unit.
-    """
+    """Values [m] over row numbers [m], for data without positions: a plot for each name, a line for each column."""
     order = np.argsort(np.asarray(row))
     figure = Figure(figsize=(8, 2.2 * len(rows) + 0.6), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True)[:, 0]
@@ -148,14 +129,10 @@ def row_table(rows: Rows, columns: Sequence[str], row: ArrayLike, label: str) ->
 
 
 def footprint_sky(spectrum: ArrayLike, gaussians: Footprints, weight: ArrayLike, label: str = "weight") -> Figure:
-    """Spectrum beside the outlines of the Gaussians' footprints, at exp(-1/2) of their maximum.
+    """Spectrum [H, W] beside the outlines of the visible Gaussians' footprints, at exp(-1/2) of their maximum.
 
-    Args:
-        spectrum: grey values [H, W].
-        gaussians: footprints of n Gaussians (`wrf_mi.gaussians.footprint.project`); those that are not visible are left
-            out.
-        weight: colour of the outlines, the largest on top, shape [n]; for example |opacity x signal|.
-        label: name of the weight.
+    Outlines are coloured by ``weight`` [n], for example |opacity x signal|, the largest on top. Footprints are those of
+    `wrf_mi.gaussians.footprint.project`.
     """
     colour = np.asarray(weight, float)
     order = np.argsort(colour, kind="stable")
@@ -187,13 +164,7 @@ def _outlines(gaussians: Footprints, chosen: IntArray) -> FloatArray:
 
 
 def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLike], label: str = "SSIM") -> Figure:
-    """Cumulative distributions of a score over test rows; references are dashed.
-
-    Args:
-        scores: scores of each run by its name; NaN are left out.
-        references: scores of each reference by its name.
-        label: name of the score.
-    """
+    """Cumulative distributions of a score over test rows, NaN left out, by name; references are dashed."""
     figure = Figure(figsize=(7.5, 4), layout="constrained")
     axes = figure.subplots()
     curves = {name: np.ravel(values) for group in (scores, references) for name, values in group.items()}
@@ -211,12 +182,7 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
 
 
 def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "SSIM") -> Figure:
-    """Score on held-out validation rows over training time.
-
-    Args:
-        curves: pairs (seconds, score) of each run by its name.
-        label: name of the score.
-    """
+    """Score on held-out validation rows over training time, from pairs (seconds, score) of each run by its name."""
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for name, points in curves.items():
@@ -231,32 +197,26 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
 
 def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = "SSIM") -> Figure:
     """Mean scores by the stages up to each, of held-out training rows (line; hollow where a stage was not kept) and of
-    test rows (dashed); seconds of a stage's fit and milliseconds of a prediction beside.
-
-    Args:
-        stages: entries ``stages`` of ``metrics.json`` of each run by its name.
-        label: name of the score.
+    test rows (dashed); seconds of a stage's fit and milliseconds of a prediction beside. ``stages`` are those of
+    ``metrics.json`` of each run by its name.
     """
-    names = list(dict.fromkeys(one["stage"] for reports in stages.values() for one in reports))
+    names = list(dict.fromkeys(report["stage"] for reports in stages.values() for report in reports))
     order = sorted(names, key=[*STAGES, *names].index)
     figure = Figure(figsize=(1.2 * len(order) + 3.5, 4), layout="constrained")
     axes = figure.subplots()
     for name, reports in stages.items():
-        kept, color = [one for one in reports if one["kept"]], None
+        used, color = [report for report in reports if report["kept"]], None
         for key, style, what in (("held_out", "-", "held-out rows"), ("test", "--", "test rows")):
-            scored = [one for one in kept if one.get(key) is not None]
-            places, scores = [order.index(one["stage"]) for one in scored], [one[key] for one in scored]
+            places, scores = _scored(used, key, order)
             (line,) = axes.plot(places, scores, style, marker="o", color=color, label=f"{name}, {what}")
             color = line.get_color()
-        left = [one for one in reports if not one["kept"] and one["held_out"] is not None]
-        where, scores = [order.index(one["stage"]) for one in left], [one["held_out"] for one in left]
-        axes.scatter(where, scores, facecolors="none", edgecolors=color, zorder=3)
-        for one in reports:
-            costs = [f"{one[key]:.3g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if one.get(key)]
-            score = one["held_out"] if one["held_out"] is not None else one.get("test")
+        rejected = _scored([report for report in reports if not report["kept"]], "held_out", order)
+        axes.scatter(*rejected, facecolors="none", edgecolors=color, zorder=3)
+        for report in reports:
+            costs = [f"{report[key]:.3g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if report.get(key)]
+            score = report["held_out"] if report["held_out"] is not None else report.get("test")
             if costs and score is not None:
-                at = order.index(one["stage"]), score
-                text = ", ".join(costs)
+                at, text = (order.index(report["stage"]), score), ", ".join(costs)
                 axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
     axes.set_xticks(range(len(order)), order)
     axes.set_xlim(-0.2, len(order) - 0.5)  # the last label lies beside its point
@@ -266,21 +226,25 @@ def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = 
     return figure
 
 
-def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, float], label: str) -> Figure:
-    """Scores over times, a panel for each kind of time; runs without a time are left out of a panel.
+def _scored(reports: Sequence[Mapping[str, Any]], key: str, order: Sequence[str]) -> tuple[list[int], list[float]]:
+    """Places of the stages that state a score, and the scores."""
+    scored = [report for report in reports if report.get(key) is not None]
+    return [order.index(report["stage"]) for report in scored], [report[key] for report in scored]
 
-    Args:
-        times: times of each run by its name, by the words for the time.
-        scores: score of each run by its name.
-        label: name of the score.
-    """
+
+def _style(number: int) -> dict[str, Any]:
+    """Marker and colour of one of many series."""
+    return {"marker": MARKERS[number // COLOURS % len(MARKERS)], "color": f"C{number % COLOURS}", "linestyle": "none"}
+
+
+def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, float], label: str) -> Figure:
+    """Scores over times by run, a panel for each kind of time; runs without a time are left out of a panel."""
     figure = Figure(figsize=(3.4 * len(times) + 1.6, 3.6), layout="constrained")
     panels = figure.subplots(1, len(times), squeeze=False, sharey=True)[0]
     for axes, (words, of_runs) in zip(panels, times.items(), strict=True):
         for number, (name, score) in enumerate(scores.items()):
             if of_runs[name] > 0:
-                marker = MARKERS[number // COLOURS % len(MARKERS)]
-                axes.plot(of_runs[name], score, marker, color=f"C{number % COLOURS}", label=name)
+                axes.plot(of_runs[name], score, label=name, **_style(number))
         if any(seconds > 0 for seconds in of_runs.values()):
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter("{x:g}")  # the default is a formula, see `without_formulas`
@@ -298,25 +262,16 @@ def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, 
 
 
 def choice_map(chosen: ArrayLike, names: Sequence[str], tx_pos_m: ArrayLike) -> Figure:
-    """Map of the name that is chosen at each transmitter position, seen from above.
-
-    Args:
-        chosen: number of the name at each position [m]; -1 leaves a position out.
-        names: names, each with its colour.
-        tx_pos_m: positions [m, 3], metres.
-    """
+    """Map of the number [m] of a name at each position [m, 3] in metres, seen from above; -1 leaves one out."""
     which = np.asarray(chosen)
     x, y, _ = np.asarray(tx_pos_m, float).T
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for number, name in enumerate(names):
         at = which == number
-        marker = MARKERS[number // COLOURS % len(MARKERS)]
         label = f"{name}: {at.sum() / max((which >= 0).sum(), 1):.0%}"
-        axes.plot(x[at], y[at], marker, color=f"C{number % COLOURS}", markersize=4, label=label)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
+        axes.plot(x[at], y[at], markersize=4, label=label, **_style(number))
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, loc="outside lower center", ncols=min(3, len(names)))
     return figure

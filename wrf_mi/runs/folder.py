@@ -17,7 +17,7 @@ import importlib.metadata
 import json
 import platform
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -29,6 +29,7 @@ import yaml
 
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
+from ..core.antenna import AS_STATED
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import LEFTOVER, readable, write_atomically
 from ..core.locks import LOCK, locked_folder
@@ -44,28 +45,42 @@ from ..tasks import TASKS
 from ..training.fit_plan import check_rows
 from ..version import __version__
 
-FORMAT = 4
-"""Version of ``config.yaml`` and ``model.npz``."""
+FORMAT = 4  # version of ``config.yaml`` and ``model.npz``
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
-VERSION, SECONDS = "run/format", "run/train_seconds"
-"""Keys of ``model.npz`` beside the model's arrays."""
+VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
+
+
+Settings = Iterable[str] | object
+"""``key=value`` of the model's settings, or all settings as its dataclass."""
+GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # arguments of `train` that may be settings, too
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What is fitted to a data set: arguments of `wrf_mi.train`, which describes them."""
+
+    model: str = "hybrid"
+    scene: str | Path | None = None
+    material: str | None = None
+    antennas: AntennaOptions = AS_STATED
+    receiver: str | None = None
+    evaluation: str | None = None
+    split: str | Split = "official"
+    n_train: int | float | None = None
+    seed: int = 0
+    settings: Settings = ()
+    deterministic: bool = False
+    intervals: bool = False
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them.
-
-    Attributes:
-        task: task of the data set.
-        split: name of the split; that of a fold is, e.g., ``blocked:2``.
-        settings: all settings of the model.
-        left_out: training rows of the receivers that are left out for having too few, by name.
-    """
+    """Content of ``config.yaml``: the arguments of `wrf_mi.train`, and what follows from them."""
 
     model: str
     dataset: str
-    task: str
-    split: str
+    task: str  # task of the data set
+    split: str  # name of the split; that of a fold is, e.g., ``blocked:2``
     n_train: int | float | None
     seed: int
     scene: str | None
@@ -73,16 +88,13 @@ class RunConfig:
     antennas: AntennaOptions
     deterministic: bool
     intervals: bool
-    settings: Any
+    settings: Any  # all settings of the model
+    # training rows of the receivers that are left out for having too few, by name
     left_out: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def entry(self) -> Model:
-        """Registry entry of the model.
-
-        Raises:
-            InputError: no model of that name.
-        """
+        """Registry entry of the model; `InputError`: no model of that name."""
         entry = known_model(self.model).serving(self.task, self.scene is not None)
         return WithIntervals(entry) if self.intervals else entry
 
@@ -134,6 +146,23 @@ def read_config(folder: Path) -> RunConfig:
             raise InputError(f"{path}: task {shown(config.task)} with seed {config.seed}: not known; restore it")
         kind: Any = config.entry.settings
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))
+
+
+def known_config(folder: Path) -> RunConfig | None:
+    """Content of ``config.yaml``; None where there is none, or for a model or settings that this version lacks."""
+    try:
+        return read_config(folder)
+    except InputError:
+        return None
+
+
+def stored_versions(folder: Path) -> dict[str, str]:
+    """Versions of packages, backend and device with which a run was made; empty where they are not stored."""
+    try:
+        content = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+        return {str(name): str(value) for name, value in content["versions"].items()}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def check_format(folder: Path) -> None:
@@ -204,11 +233,11 @@ def run_parts(folder: Path) -> list[Path]:
 
 def is_finished(folder: Path) -> bool:
     """Whether a run has its metrics; what a process left there that was killed after them is removed."""
-    found = (folder / METRICS).exists()
-    if found and (folder / LOCK).exists():
+    finished = (folder / METRICS).exists()
+    if finished and (folder / LOCK).exists():
         with suppress(InputError), locked_folder(folder):  # refused while another process writes
             pass
-    return found
+    return finished
 
 
 def load_rows(folder: Path, record: Record) -> Split:

@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError
-from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_csv
@@ -26,21 +26,16 @@ from .evaluate import stored_metrics, write_predictions
 from .folder import METRICS
 
 NPZ, CSV = ".npz", ".csv"
-HEADING = "heading_rad"
-"""Column or array of headings."""
-POSITIONS, UPLINK = "tx_pos", "uplink"
-"""Arrays of positions and of uplink channels."""
-SPOOLED_BYTES = 1 << 26
-"""Size from which predictions are collected on the disk."""
+HEADING = "heading_rad"  # column or array of headings
+POSITIONS, UPLINK = "tx_pos", "uplink"  # arrays of positions and of uplink channels
+SPOOLED_BYTES = 1 << 26  # size from which predictions are collected on the disk
 
 
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
     """Read what a model predicts from; positions are NaN where only an uplink is given.
 
-    Args:
-        csv_file: file with columns x, y, z in metres and optionally heading_rad and frequency_hz; or
-        npz_file: file with arrays ``tx_pos`` [m, 3] and optionally ``heading_rad`` [m] and ``frequency_hz`` [m], or
-            with ``uplink`` [m, antennas, subcarriers] and optionally all of these.
+    A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
+    [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
 
     Raises:
         InputError: the file is missing, or a row is not made of finite numbers.
@@ -97,12 +92,7 @@ def _from_npz(path: Path) -> Inputs:
 
 
 def check_prediction_file(out: Path, run: Path) -> None:
-    """Refuse a file name whose format cannot hold the predictions of a run.
-
-    Raises:
-        InputError: a suffix other than ``.npz`` and ``.csv``, or ``.csv`` for a run that does not predict signal
-            strengths.
-    """
+    """Refuse by `InputError` a suffix but ``.npz`` and ``.csv``, and ``.csv`` for other than signal strengths."""
     suffix = out.suffix.lower()
     if suffix not in (NPZ, CSV):
         raise InputError(f"{out}: predictions are written as {NPZ}, or signal strengths as {CSV}; give such a name")
@@ -118,13 +108,7 @@ def check_prediction_file(out: Path, run: Path) -> None:
 def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
     """Array to be filled, in memory while small, else in a temporary file, which has no name: nothing is left of it.
 
-    Args:
-        folder: folder of the temporary file, which is made if need be.
-        shape: shape of the array.
-        kind: type of its numbers.
-
-    Raises:
-        InputError: the disk has no room for it.
+    The file lies in ``folder``, which is made if need be; `InputError` where the disk has no room for it.
     """
     needed = math.prod(shape) * kind.itemsize
     if needed <= SPOOLED_BYTES:
@@ -139,31 +123,34 @@ def spooled(folder: Path, shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArra
         return np.memmap(file, kind, "w+", shape=shape)
 
 
-def write_prediction_file(out: Path, arrays: dict[str, Any], tx_heading_rad: FloatArray | None) -> dict[str, Any]:
-    """Write predictions in the format of the suffix.
+def write_prediction_file(
+    out: Path, inputs: Inputs, receivers: Sequence[str], observations: dict[str, NDArray[Any]]
+) -> dict[str, Any]:
+    """Write predictions, ``prediction`` and optionally ``std`` with a first axis of the receivers, by the suffix.
 
-    Args:
-        out: ``.npz``: as `wrf_mi.runs.evaluate.write_predictions`. ``.csv``: one row for each position with columns
-            ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each
-            receiver and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
-        arrays: ``row``, ``tx_pos``, ``receiver_name`` and optionally ``frequency_hz``; ``prediction`` and optionally
-            ``std``, with a first axis of the receivers.
-        tx_heading_rad: yaw of each transmitter, [m], or None.
+    ``.npz`` is as of `wrf_mi.runs.evaluate.write_predictions`. ``.csv`` has one row for each position with columns
+    ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each receiver
+    and, if stated, standard deviations ``<receiver>_std_db``; empty where nothing is received.
 
     Returns:
         The arrays as an ``.npz`` file has them.
     """
+    arrays: dict[str, Any] = {
+        "row": np.arange(len(inputs)),
+        "tx_pos": inputs.tx_pos_m,
+        "receiver_name": np.asarray(receivers),
+    }
+    if inputs.carriers_hz is not None:
+        arrays[FREQUENCY] = inputs.carriers_hz
     if out.suffix.lower() == NPZ:
-        return write_predictions(out, arrays)
+        return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
-    columns: list[tuple[str, Any]] = list(zip("xyz", np.asarray(arrays["tx_pos"], float).T, strict=True))
-    for name, values in ((HEADING, tx_heading_rad), (FREQUENCY, arrays.get(FREQUENCY))):
-        if values is not None:
-            columns.append((name, np.asarray(values, float)))
+    columns: list[tuple[str, Any]] = list(zip("xyz", inputs.tx_pos_m.T, strict=True))
+    for name, values in ((HEADING, inputs.tx_heading_rad), (FREQUENCY, inputs.carriers_hz)):
+        columns += [] if values is None else [(name, values)]
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
-        if key in arrays:
-            columns += [(f"{name}_{suffix}", v) for name, v in zip(arrays["receiver_name"], arrays[key], strict=True)]
-    names, values = zip(*columns, strict=True)
-    write_csv(out, names, zip(*values, strict=True))
-    single = len(arrays["receiver_name"]) == 1
-    return arrays | {key: arrays[key][0] for key in ("prediction", "std") if single and key in arrays}
+        if key in observations:
+            columns += [(f"{name}_{suffix}", v) for name, v in zip(receivers, observations[key], strict=True)]
+    write_csv(out, [name for name, _ in columns], zip(*(values for _, values in columns), strict=True))
+    single = len(receivers) == 1
+    return arrays | {key: values[0] if single else values for key, values in observations.items()}

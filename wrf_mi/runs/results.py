@@ -34,40 +34,26 @@ def reference_key(name: str) -> str:
 
 @dataclass(frozen=True)
 class Results:
-    """Scores and predictions of a finished run, with a first axis of the receivers.
+    """Scores and predictions of a finished run, with a first axis of the receivers."""
 
-    Attributes:
-        path: run folder.
-        name: name for tables and legends.
-        task: ``"spectrum"``, ``"rssi"`` or ``"csi"`` (`wrf_mi.tasks.TASKS`).
-        dataset: name or folder of the data set; "": unknown.
-        metrics: content of ``metrics.json``.
-        seed: seed of split and fit; None: unknown.
-        receivers: names of the receivers.
-        row: test rows, shape [m].
-        tx_pos_m: transmitter positions [m, 3], metres.
-        prediction: grey values [n_rx, m, H, W], dBm [n_rx, m], or coefficients [n_rx, m, subcarriers] or
-            [n_rx, m, antennas, subcarriers].
-        truth: observations of the same shape; NaN where nothing was received.
-        references: reference predictions of the same shape by name (`wrf_mi.tasks.Task.references`).
-        std: stated standard deviations of the predictions, of the same shape and real; None: none are stated.
-        validation: pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without
-            folds.
-    """
-
-    path: Path
-    name: str
-    task: str
-    dataset: str
-    metrics: dict[str, Any]
-    seed: int | None
-    receivers: tuple[str, ...]
-    row: IntArray
-    tx_pos_m: FloatArray
+    path: Path  # run folder
+    name: str  # name for tables and legends
+    task: str  # ``"spectrum"``, ``"rssi"`` or ``"csi"`` (`wrf_mi.tasks.TASKS`)
+    dataset: str  # name or folder of the data set; "": unknown
+    metrics: dict[str, Any]  # content of ``metrics.json``
+    seed: int | None  # seed of split and fit; None: unknown
+    receivers: tuple[str, ...]  # names of the receivers
+    row: IntArray  # test rows, shape [m]
+    tx_pos_m: FloatArray  # transmitter positions [m, 3], metres
+    # grey values [n_rx, m, H, W], dBm [n_rx, m], or coefficients [n_rx, m, subcarriers] or [n_rx, m, antennas,
+    # subcarriers]
     prediction: Observations
-    truth: Observations
+    truth: Observations  # observations of the same shape; NaN where nothing was received
+    # reference predictions of the same shape by name (`wrf_mi.tasks.Task.references`)
     references: dict[str, Observations]
+    # stated standard deviations of the predictions, of the same shape and real; None: none are stated
     std: NDArray[np.float32] | None
+    # pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without folds
     validation: dict[str, list[tuple[float, float]]]
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -29,8 +29,7 @@ from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, spooled, write_prediction_file
 
-PREDICTED_PER_CHUNK = 256
-"""Positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver."""
+PREDICTED_PER_CHUNK = 256  # positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver
 MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
 """Largest number of positions of small observations at a time, and bytes of their observations."""
 
@@ -61,11 +60,7 @@ class Run:
 
     @cached_property
     def config(self) -> RunConfig:
-        """Content of ``config.yaml``.
-
-        Raises:
-            InputError: not a run folder, or a damaged one.
-        """
+        """Content of ``config.yaml``; `InputError`: not a run folder, or a damaged one."""
         return read_config(self.folder)
 
     @property
@@ -83,11 +78,7 @@ class Run:
 
     @cached_property
     def fitted(self) -> Fitted:
-        """Fitted model.
-
-        Raises:
-            InputError: not a finished run, or a run with several splits.
-        """
+        """Fitted model; `InputError`: not a finished run, or a run with several splits."""
         problem = self.problem
         if not (self.folder / SPLIT).exists():
             raise InputError(f"{self.folder}: one model for each block; choose one, e.g. {self.folder / 'fold0'}")
@@ -108,6 +99,11 @@ class Run:
         if not isinstance(self.fitted, FittedField):
             raise InputError(f"{self.folder}: a run of {self.config.model}, not of a learned field of spectra")
         return self.fitted
+
+    @property
+    def takes_heading(self) -> bool:
+        """Whether predictions may be given the transmitter's heading."""
+        return self.model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading
 
     def predictor(self) -> Predictor:
         """Predictor of the trained field: ``predictor()(tx_pos_m)`` gives spectra [m, H, W].
@@ -142,26 +138,21 @@ class Run:
                 receiver.
         """
         index = receiver_index(self.receivers, receiver)
-        up = None if uplink is None else np.asarray(uplink)
-        unknown = np.full((0 if up is None else len(up), 3), np.nan)
-        positions = unknown if tx_pos_m is None else np.atleast_2d(np.asarray(tx_pos_m, float))
-        heading = None if tx_heading_rad is None else np.atleast_1d(np.asarray(tx_heading_rad, float))
-        carriers = None if carriers_hz is None else np.atleast_1d(np.asarray(carriers_hz, float))
-        return self.predict_inputs(Inputs(positions, heading, up, carriers_hz=carriers), index)
+        return self.predict_inputs(_inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz), index)
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Predict the observations of the receiver of an index; inputs and errors as those of `predict`."""
+        """Predict the observations of the receiver of an index; errors as those of `predict`."""
         self.check_inputs(inputs)
         means, stds = list[NDArray[Any]](), list[FloatArray | None]()
-        for rows, found in self.predicted_parts(inputs, receiver):
+        for rows, chunk in self.predicted_parts(inputs, receiver):
             if not rows.start:
-                each = found.mean.nbytes + (0 if found.std is None else found.std.nbytes)
+                chunk_bytes = chunk.mean.nbytes + (0 if chunk.std is None else chunk.std.nbytes)
                 # Twice: parts, and the parts joined.
-                needed = 2 * each * len(inputs) / max(len(found.mean), 1)
+                needed = 2 * chunk_bytes * len(inputs) / max(len(chunk.mean), 1)
                 what = f"{self.folder}: predictions at {len(inputs)} positions at once"
                 require_memory(needed, what, "predict fewer at a time, or into a file (predict_to_file)")
-            means.append(found.mean)
-            stds.append(found.std)
+            means.append(chunk.mean)
+            stds.append(chunk.std)
         if len(means) == 1:
             return Prediction(means[0], stds[0])
         std = None if stds[0] is None else np.concatenate([part for part in stds if part is not None])
@@ -176,11 +167,11 @@ class Run:
         start, size = 0, PREDICTED_PER_CHUNK
         while start < len(inputs) or not start:
             rows = slice(start, min(start + size, len(inputs)))
-            found = self.fitted.predict(inputs if rows == slice(0, len(inputs)) else inputs.rows(rows), receiver)
-            yield rows, found
+            chunk = self.fitted.predict(inputs if rows == slice(0, len(inputs)) else inputs.rows(rows), receiver)
+            yield rows, chunk
             if rows.stop >= len(inputs):
                 return
-            row_bytes = max(found.mean.nbytes // len(found.mean), 1)
+            row_bytes = max(chunk.mean.nbytes // len(chunk.mean), 1)
             start, size = rows.stop, int(np.clip(CHUNK_BYTES // row_bytes, PREDICTED_PER_CHUNK, MOST_PER_CHUNK))
 
     def check_inputs(self, inputs: Inputs) -> None:
@@ -191,24 +182,27 @@ class Run:
         """
         model = self.model
         if inputs.tx_heading_rad is not None:
-            if not (model.headings if self.fitted.uses_heading is None else self.fitted.uses_heading):
+            if not self.takes_heading:
                 raise InputError(f"{self.folder}: {UNUSED_HEADING}")
             self._check_numbers(inputs, inputs.tx_heading_rad, "headings", "finite heading")
         if inputs.carriers_hz is not None or model.several_carriers:
-            stated = self.fitted.carriers_hz
-            known = self.problem.record.carriers_hz if stated is None else stated if stated.size else None
-            if known is None and inputs.carriers_hz is not None:
-                raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
-            if known is not None and inputs.carriers_hz is None:
-                text = f"its data have {carriers_text(known)}; give {FREQUENCY} for each position"
-                raise InputError(f"{self.folder}: {text}")
-            if inputs.carriers_hz is not None:
-                self._check_numbers(inputs, inputs.carriers_hz, "carriers", f"positive {FREQUENCY}", 0.0)
+            self._check_carriers(inputs)
         if model.uplink == "none":
             if inputs.uplink is not None:
                 raise InputError(f"{self.folder}: {UNUSED_UPLINK}")
         elif inputs.uplink is not None or model.uplink == "required":
             check_inputs(inputs, self.problem.record, model)
+
+    def _check_carriers(self, inputs: Inputs) -> None:
+        stated = self.fitted.carriers_hz
+        known = self.problem.record.carriers_hz if stated is None else stated if stated.size else None
+        if inputs.carriers_hz is not None:
+            if known is None:
+                raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
+            self._check_numbers(inputs, inputs.carriers_hz, "carriers", f"positive {FREQUENCY}", 0.0)
+        elif known is not None:
+            text = f"its data have {carriers_text(known)}; give {FREQUENCY} for each position"
+            raise InputError(f"{self.folder}: {text}")
 
     def _check_numbers(
         self, inputs: Inputs, values: FloatArray, name: str, wanted: str, above: float = -np.inf
@@ -217,13 +211,75 @@ class Run:
             text = f"{len(inputs)} positions and {name} {values.shape}; give one {wanted} for each"
             raise InputError(f"{self.folder}: {text}")
 
+    def predict_to_file(
+        self, inputs: Inputs, out: Path, scheduler: Scheduler | None = None, progress: bool = False
+    ) -> dict[str, tuple[int, ...]]:
+        """Predict at all receivers and write a file; see the function `predict_to_file`."""
+        check_prediction_file(out, self.folder)
+        self.check_inputs(inputs)
+        shape, arrays = (len(self.receivers), len(inputs)), dict[str, NDArray[Any]]()
+
+        def collect(rows: slice, receiver: int, chunk: Prediction) -> None:
+            std = None if chunk.std is None else chunk.std.astype(np.float32)
+            for name, values in (("prediction", chunk.mean), ("std", std)):
+                if values is not None:
+                    if name not in arrays:
+                        arrays[name] = spooled(out.parent, (*shape, *values.shape[1:]), values.dtype)
+                    arrays[name][receiver, rows] = values
+
+        if scheduler is None or not len(inputs):
+            self._collect(inputs, collect, progress)
+        else:
+            self._collect_parts(inputs, collect, scheduler)
+        written = write_prediction_file(out, inputs, [receiver.name for receiver in self.receivers], arrays)
+        return {key: value.shape for key, value in written.items()}
+
+    def _collect(self, inputs: Inputs, collect: Collect, progress: bool) -> None:
+        total = len(self.receivers) * len(inputs)
+        shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
+        with shown as bar:
+            for receiver in range(len(self.receivers)):
+                for rows, chunk in self.predicted_parts(inputs, receiver):
+                    collect(rows, receiver, chunk)
+                    if bar is not None:
+                        bar.add(rows.stop - rows.start, 1)
+
+    def _collect_parts(self, inputs: Inputs, collect: Collect, scheduler: Scheduler) -> None:
+        parts = row_parts(len(inputs), scheduler.workers, most=PREDICTED_PER_CHUNK)
+
+        def each(part: int, predictions: list[Prediction]) -> None:
+            for receiver, prediction in enumerate(predictions):
+                collect(parts[part], receiver, prediction)
+            predictions.clear()  # the scheduler keeps results to the end
+
+        opener, sizes = partial(open_run, self.folder, operator=self.operator), [p.stop - p.start for p in parts]
+        chosen = [inputs.rows(rows) for rows in parts]
+        scheduler.map(_predict_part, chosen, opener, what="predicting", sizes=sizes, each=each, lines=True)
+
+
+Collect = Callable[[slice, int, Prediction], None]
+"""Takes the predictions of some rows at the receiver of an index."""
+
+
+def _inputs(
+    tx_pos_m: ArrayLike | None, tx_heading_rad: ArrayLike | None, uplink: Any, carriers_hz: ArrayLike | None
+) -> Inputs:
+    """Inputs of given quantities, as arrays; unknown positions are NaN, one for each uplink."""
+    channels = None if uplink is None else np.asarray(uplink)
+    if tx_pos_m is None:
+        tx_pos_m = np.full((0 if channels is None else len(channels), 3), np.nan)
+    heading, carriers = (
+        None if values is None else np.atleast_1d(np.asarray(values, float)) for values in (tx_heading_rad, carriers_hz)
+    )
+    return Inputs(np.atleast_2d(np.asarray(tx_pos_m, float)), heading, channels, carriers_hz=carriers)
+
 
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
     """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part, config.entry)
-    seen = problem.seen(load_split(part / SPLIT))
+    visible = problem.seen(load_split(part / SPLIT))
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
-        return config.entry.load(arrays, seen, part), seconds
+        return config.entry.load(arrays, visible, part), seconds
 
 
 def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:
@@ -272,54 +328,9 @@ def predict_to_file(
         InputError: a run over several blocks, inputs that the model does not predict from, or a file name with another
             suffix or of a format that cannot hold the predictions.
     """
-    path = Path(folder)
-    asked = Inputs(np.asarray(tx_pos_m, float), tx_heading_rad, uplink, carriers_hz=carriers_hz)
-    run = open_run(path, operator=operator)
-    check_prediction_file(Path(out), path)
-    run.check_inputs(asked)
-    receivers, count = run.receivers, len(asked)
-    collected: dict[str, NDArray[Any]] = {}
-
-    def collect(rows: slice, index: int, found: Prediction) -> None:
-        std = None if found.std is None else found.std.astype(np.float32)
-        for name, values in (("prediction", found.mean), ("std", std)):
-            if values is not None:
-                if name not in collected:
-                    shape = (len(receivers), count, *values.shape[1:])
-                    collected[name] = spooled(Path(out).parent, shape, values.dtype)
-                collected[name][index, rows] = values
-
-    if scheduler is None or not count:
-        total = len(receivers) * count
-        shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
-        with shown as bar:
-            for index in range(len(receivers)):
-                for rows, found in run.predicted_parts(asked, index):
-                    collect(rows, index, found)
-                    if bar is not None:
-                        bar.add(rows.stop - rows.start, 1)
-    else:
-        parts = row_parts(count, scheduler.workers, most=PREDICTED_PER_CHUNK)
-
-        def each(part: int, found: list[Prediction]) -> None:
-            for index, one in enumerate(found):
-                collect(parts[part], index, one)
-            found.clear()  # the scheduler keeps results to the end
-
-        opener, sizes = partial(open_run, path, operator=operator), [part.stop - part.start for part in parts]
-        given = [asked.rows(rows) for rows in parts]
-        scheduler.map(_predict_part, given, opener, what="predicting", sizes=sizes, each=each, lines=True)
-    arrays: dict[str, Any] = {
-        "row": np.arange(count),
-        "tx_pos": asked.tx_pos_m,
-        "receiver_name": np.asarray([receiver.name for receiver in receivers]),
-    }
-    if carriers_hz is not None:
-        arrays[FREQUENCY] = carriers_hz
-    written = write_prediction_file(Path(out), arrays | collected, tx_heading_rad)
-    return {key: value.shape for key, value in written.items()}
+    inputs = _inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz)
+    return open_run(folder, operator=operator).predict_to_file(inputs, Path(out), scheduler, progress)
 
 
 def _predict_part(run: Run, inputs: Inputs) -> list[Prediction]:
-    """Predictions of all receivers."""
     return [run.predict_inputs(inputs, index) for index in range(len(run.receivers))]

@@ -18,10 +18,8 @@ from ..tracing import load_trace
 from ..tracing.search.surfaces import scene_surfaces
 from .api import open_run
 
-SHOWN_GAUSSIANS = 40
-"""Number of Gaussians shown, the strongest."""
-WEAKEST = 1e-6
-"""Lower limit of drawn signals: -120 dB."""
+SHOWN_GAUSSIANS = 40  # number of Gaussians shown, the strongest
+WEAKEST = 1e-6  # lower limit of drawn signals: -120 dB
 
 
 def scene_view(traced: str | Path, row: int, field: str | Path | None = None) -> Figure:
@@ -35,10 +33,10 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
     Raises:
         InputError: not such run folders, or a scene that no longer exists.
     """
-    run, found = open_run(traced), load_trace(Path(traced) / PATHS)
-    scene = run.problem.open_scene(found.frequency_hz)
-    transmitter = found.tx_pos_m[row]
-    paths = found.paths.select(found.paths.tx == row)
+    run, trace = open_run(traced), load_trace(Path(traced) / PATHS)
+    scene = run.problem.open_scene(trace.frequency_hz)
+    transmitter = trace.tx_pos_m[row]
+    paths = trace.paths.select(trace.paths.tx == row)
     cloud = None
     if field is not None:
         cloud = gaussian_cloud(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
@@ -46,7 +44,7 @@ def scene_view(traced: str | Path, row: int, field: str | Path | None = None) ->
         surfaces_of(scene),
         paths=replace(paths, tx=np.zeros_like(paths.tx), n_tx=1),
         transmitters_m=transmitter,
-        receivers_m=[receiver.position_m for receiver in found.receivers],
+        receivers_m=[receiver.position_m for receiver in trace.receivers],
         gaussians=cloud,
         title=f"{run.config.scene}, transmitter of row {row}",
     )

@@ -15,7 +15,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -34,7 +34,7 @@ from ..synthetic import load_record
 from ..tasks import TASKS
 from .api import plan_run
 from .evaluate import stored_metrics
-from .folder import CONFIG, METRICS, is_finished, package_versions
+from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed"),
@@ -42,8 +42,7 @@ OPTIONS = (
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
-FLAGS = ("deterministic", "intervals", "fast")
-"""Options without a value that may vary: ``true`` gives them."""
+FLAGS = ("deterministic", "intervals", "fast")  # options without a value that may vary: ``true`` gives them
 FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"
@@ -135,9 +134,9 @@ def plan_sweep(
         name = ",".join(f"{key}={word}" for key, word in words.items())
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        given = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
-        dataset = [given.pop("dataset")] if "dataset" in given else []
-        arguments = [part for key, value in given.items() for part in (f"--{key}", value)]
+        stated_options = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
+        dataset = [stated_options.pop("dataset")] if "dataset" in stated_options else []
+        arguments = [part for key, value in stated_options.items() for part in (f"--{key}", value)]
         switched = [f"--{key}" for key, value in varied.items() if key in FLAGS and value == "true"]
         stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in (*OPTIONS, *FLAGS))]
         set_all = [part for setting in stated for part in ("--set", setting)]
@@ -146,9 +145,9 @@ def plan_sweep(
     return Sweep(Path(out), shared, tuple(runs.values()))
 
 
-def check_run(dataset: str, arguments: Mapping[str, Any]) -> None:
-    """Refuse a run that ``wrf-mi train`` would refuse; ``arguments`` are those of `wrf_mi.runs.api.plan_run`."""
-    plan_run(_record(dataset), **arguments)
+def check_run(dataset: str, request: RunRequest) -> None:
+    """Refuse a run that ``wrf-mi train`` would refuse."""
+    plan_run(_record(dataset), request)
 
 
 _record = lru_cache(maxsize=4)(load_record)
@@ -214,27 +213,23 @@ def _claim(sweep: Sweep) -> None:
 
 def _files(sweep: Sweep) -> dict[str, list[Path]]:
     """Files of data sets, scenes and settings by the name that the command gives."""
-    found: dict[str, list[Path]] = {}
+    files: dict[str, list[Path]] = {}
     for run in sweep.runs:
         words = run.arguments[1:]
         for before, word in itertools.pairwise(("dataset", *words)):
             key, _, value = word.partition("=") if before == "--set" else (before.removeprefix("--"), "", word)
             if key == "dataset" and not word.startswith("--"):
-                found[value] = dataset_files(value)
+                files[value] = dataset_files(value)
             elif key in FILES:
-                found[value] = scene_files(value)
-    return {name: paths for name, paths in found.items() if paths}
+                files[value] = scene_files(value)
+    return {name: paths for name, paths in files.items() if paths}
 
 
 def dataset_files(name_or_folder: str) -> list[Path]:
-    """Folder or file of a data set; empty where it is not on this machine.
-
-    Raises:
-        InputError: no such data set.
-    """
+    """Folder or file of a data set; empty where it is not on this machine; `InputError`: no such data set."""
     path = Path(name_or_folder)
-    found = path if path.exists() else locate(name_or_folder)
-    return [] if found is None else [found]
+    place = path if path.exists() else locate(name_or_folder)
+    return [] if place is None else [place]
 
 
 def scene_files(scene: str | Path) -> list[Path]:
@@ -291,12 +286,13 @@ def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
 
 def sweep_table(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:
     """Markdown table of the rows of `run_sweep`."""
-    columns = [*varied, *HEADINGS.values()]
-    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
-    for row in rows:
-        cells = [_cell(key, row[key]) for key in (*varied, *HEADINGS)]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    cells = ([_cell(key, row[key]) for key in (*varied, *HEADINGS)] for row in rows)
+    return markdown_table([*varied, *HEADINGS.values()], cells)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Table in Markdown of a heading and rows of as many cells."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def _cell(key: str, value: Any) -> str:

@@ -27,21 +27,13 @@ class ViewOptions(CheckedSettings):
 
 @dataclass(frozen=True)
 class MaterialMesh:
-    """Triangles of a material.
+    """Triangles of a material."""
 
-    Attributes:
-        material: name of the radio material.
-        ceiling: whether these hide the inside from above.
-        corners_m: corners [f, 3, 3], metres.
-        surface: surface of each triangle, index into ``names`` [f].
-        names: names of the surfaces.
-    """
-
-    material: str
-    ceiling: bool
-    corners_m: FloatArray
-    surface: IntArray
-    names: tuple[str, ...]
+    material: str  # name of the radio material
+    ceiling: bool  # whether these hide the inside from above
+    corners_m: FloatArray  # corners [f, 3, 3], metres
+    surface: IntArray  # surface of each triangle, index into ``names`` [f]
+    names: tuple[str, ...]  # names of the surfaces
 
 
 @dataclass(frozen=True)
@@ -54,115 +46,71 @@ class SceneContent:
 
 @dataclass(frozen=True)
 class RowsContent:
-    """Held-out rows of a run.
+    """Held-out rows of a run."""
 
-    Attributes:
-        row: numbers of the rows [m].
-        tx_pos_m: positions of their transmitters [m, 3], metres.
-        score: score of each receiver [n_rx, m]; NaN where nothing was received.
-        label: name of the score.
-        digits: digits of the score after the decimal point.
-        higher_is_better: whether the score is an accuracy or an error.
-        stored: indices [t] into the rows of the transmitters that can be chosen.
-        observed: measured and predicted observations of the stored transmitters: ``image``, PNG by receiver and
-            transmitter; ``level``, numbers [n_rx, t]; or ``curve``, numbers [n_rx, t, k] (`observations_of`).
-        quantity: name of the observed quantity, with its unit.
-    """
-
-    row: IntArray
-    tx_pos_m: FloatArray
-    score: FloatArray
-    label: str
-    digits: int
-    higher_is_better: bool
-    stored: IntArray
+    row: IntArray  # numbers of the rows [m]
+    tx_pos_m: FloatArray  # positions of their transmitters [m, 3], metres
+    score: FloatArray  # score of each receiver [n_rx, m]; NaN where nothing was received
+    label: str  # name of the score
+    digits: int  # digits of the score after the decimal point
+    higher_is_better: bool  # whether the score is an accuracy or an error
+    stored: IntArray  # indices [t] into the rows of the transmitters that can be chosen
+    # measured and predicted observations of the stored transmitters: ``image``, PNG by receiver and transmitter;
+    # ``level``, numbers [n_rx, t]; or ``curve``, numbers [n_rx, t, k] (`observations_of`)
     observed: dict[str, Any]
-    quantity: str
+    quantity: str  # name of the observed quantity, with its unit
 
 
 @dataclass(frozen=True)
 class GaussiansContent:
-    """Gaussians of a learned field for t transmitters, the strongest first.
+    """Gaussians of a learned field for t transmitters, the strongest first."""
 
-    Attributes:
-        position_m: centres [n, 3], metres.
-        log_scale: natural logarithms of the standard deviations in metres [t or 1, n, 3].
-        rotation_xyzw: quaternions [t or 1, n, 4].
-        strength_db: opacity times magnitude of the signal [t, n], dB.
-        total: number of Gaussians of the field.
-    """
-
-    position_m: FloatArray
-    log_scale: FloatArray
-    rotation_xyzw: FloatArray
-    strength_db: FloatArray
-    total: int
+    position_m: FloatArray  # centres [n, 3], metres
+    log_scale: FloatArray  # natural logarithms of the standard deviations in metres [t or 1, n, 3]
+    rotation_xyzw: FloatArray  # quaternions [t or 1, n, 4]
+    strength_db: FloatArray  # opacity times magnitude of the signal [t, n], dB
+    total: int  # number of Gaussians of the field
 
 
 @dataclass(frozen=True)
 class PathsContent:
-    """Paths of t transmitters; p paths of v corners in all.
+    """Paths of t transmitters; p paths of v corners in all."""
 
-    Attributes:
-        tx: transmitter of each path [p].
-        rx: receiver of each path [p].
-        order: number of interactions [p].
-        kind: interactions of each path, index into ``kinds`` [p].
-        kinds: interactions in words.
-        gain_db: 20 log10 of the gain [p].
-        length_m: length [p], metres.
-        corners_m: corners from transmitter to receiver of all paths, one after the other [v, 3], metres; a path has
-            ``order`` + 2.
-    """
-
-    tx: IntArray
-    rx: IntArray
-    order: IntArray
-    kind: IntArray
-    kinds: tuple[str, ...]
-    gain_db: FloatArray
-    length_m: FloatArray
+    tx: IntArray  # transmitter of each path [p]
+    rx: IntArray  # receiver of each path [p]
+    order: IntArray  # number of interactions [p]
+    kind: IntArray  # interactions of each path, index into ``kinds`` [p]
+    kinds: tuple[str, ...]  # interactions in words
+    gain_db: FloatArray  # 20 log10 of the gain [p]
+    length_m: FloatArray  # length [p], metres
+    # corners from transmitter to receiver of all paths, one after the other [v, 3], metres; a path has ``order`` + 2
     corners_m: FloatArray
 
 
 @dataclass(frozen=True)
 class MapContent:
-    """A map on a horizontal grid or on points.
+    """A map on a horizontal grid or on points."""
 
-    Attributes:
-        name: name of its file.
-        height_m: height of the grid, metres; None: points.
-        x_m, y_m: coordinates of the grid [nx], [ny], or of the points [q], metres.
-        z_m: heights of the points [q], metres; None: a grid.
-        receivers: names of the receivers of ``values``; empty: values are common to all.
-        values: by name of the quantity, [n_rx, ny, nx] or [n_rx, q]; n_rx is 1 where it has no axis of receivers.
-        labels: name of each quantity with its unit.
-    """
-
-    name: str
-    height_m: float | None
+    name: str  # name of its file
+    height_m: float | None  # height of the grid, metres; None: points
+    # x_m, y_m: coordinates of the grid [nx], [ny], or of the points [q], metres
     x_m: FloatArray
     y_m: FloatArray
-    z_m: FloatArray | None
-    receivers: tuple[str, ...]
+    z_m: FloatArray | None  # heights of the points [q], metres; None: a grid
+    receivers: tuple[str, ...]  # names of the receivers of ``values``; empty: values are common to all
+    # by name of the quantity, [n_rx, ny, nx] or [n_rx, q]; n_rx is 1 where it has no axis of receivers
     values: dict[str, NDArray[np.float32]]
-    labels: dict[str, str]
+    labels: dict[str, str]  # name of each quantity with its unit
 
 
 @dataclass
 class ViewContent:
-    """All that a view shows.
+    """All that a view shows."""
 
-    Attributes:
-        title: names of what is shown.
-        notes: what was left out, and where data come from; sentences.
-        receivers: names of the receivers.
-        receivers_m: their positions [n_rx, 3], metres; NaN where unknown.
-    """
-
-    title: str
-    notes: list[str] = field(default_factory=list)
-    receivers: Sequence[str] = ()
+    title: str  # names of what is shown
+    notes: list[str] = field(default_factory=list)  # what was left out, and where data come from; sentences
+    receivers: Sequence[str] = ()  # names of the receivers
+    # their positions [n_rx, 3], metres; NaN where unknown
     receivers_m: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     scene: SceneContent | None = None
     rows: RowsContent | None = None
@@ -173,15 +121,13 @@ class ViewContent:
     @property
     def counts(self) -> dict[str, int]:
         """Number of elements of each layer that is present."""
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         if self.scene is not None:
-            found["triangles"] = sum(len(mesh.corners_m) for mesh in self.scene.meshes)
+            counts["triangles"] = sum(len(mesh.corners_m) for mesh in self.scene.meshes)
         if self.rows is not None:
-            found |= {"held_out_rows": len(self.rows.row), "transmitters": len(self.rows.stored)}
+            counts |= {"held_out_rows": len(self.rows.row), "transmitters": len(self.rows.stored)}
         if self.gaussians is not None:
-            found["gaussians"] = len(self.gaussians.position_m)
+            counts["gaussians"] = len(self.gaussians.position_m)
         if self.paths is not None:
-            found["paths"] = len(self.paths.tx)
-        if self.maps:
-            found["maps"] = len(self.maps)
-        return found
+            counts["paths"] = len(self.paths.tx)
+        return counts | ({"maps": len(self.maps)} if self.maps else {})

@@ -18,14 +18,11 @@ from ..parallel import run_module
 from .content import MapContent
 
 NETCDF, ZARR = (".nc", ".nc4", ".netcdf"), ".zarr"
-MAP_NUMBERS = 900_000
-"""Values of all maps of a page, at most: 2.4 MB."""
-RECEIVER, POINT = "receiver", "point"
-"""Dimensions of receivers and of the points of a surface."""
+MAP_NUMBERS = 900_000  # values of all maps of a page, at most: 2.4 MB
+RECEIVER, POINT = "receiver", "point"  # dimensions of receivers and of the points of a surface
 FACTS, VALUES = "facts", "value/"
 """Key of all but the arrays of a map that a child process has read, and prefix of the keys of its values."""
-MOST_S = 600.0
-"""Time of that process, which limits its processor time by the size of the file."""
+MOST_S = 600.0  # time of the child process, which limits its processor time by the size of the file
 
 
 def is_map(path: Path) -> bool:
@@ -59,8 +56,8 @@ def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
     facts = json.loads(str(arrays[FACTS]))
     axes = arrays["x_m"], arrays["y_m"], arrays.get("z_m")
     values = {name.removeprefix(VALUES): array for name, array in arrays.items() if name.startswith(VALUES)}
-    found = path.name, facts["height_m"], *axes, tuple(facts["receivers"]), values, facts["labels"]
-    return MapContent(*found), facts["notes"]
+    content = MapContent(path.name, facts["height_m"], *axes, tuple(facts["receivers"]), values, facts["labels"])
+    return content, facts["notes"]
 
 
 def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
@@ -75,14 +72,14 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
         if variable.dtype.kind not in "fiub" or set(variable.dims) not in (set(plane), {RECEIVER, *plane}):
             skipped.append(str(key))
             continue
-        given = variable if RECEIVER in variable.dims else variable.expand_dims(RECEIVER)
-        values[str(key)] = np.asarray(given.transpose(RECEIVER, *plane), np.float32)
+        by_receiver = variable if RECEIVER in variable.dims else variable.expand_dims(RECEIVER)
+        values[str(key)] = np.asarray(by_receiver.transpose(RECEIVER, *plane), np.float32)
         units = str(variable.attrs.get("units", ""))
         words = str(variable.attrs.get("long_name", key)).replace("_", " ")
         labels[str(key)] = f"{words} ({units})" if units not in ("", "1") else words
     if not values:
         raise InputError(f"{name}: no numbers over {' and '.join(plane)} in it; give a map made by wrf-mi map")
-    receivers = tuple(str(one) for one in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
+    receivers = tuple(str(name) for name in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
     x_m, y_m = (np.asarray(dataset[axis], float) for axis in "xy")
     z_m = np.asarray(dataset["z"], float) if points else None
     height_m = None if points else float(dataset["height"])
@@ -92,19 +89,19 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
 
 def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[MapContent], list[str]]:
     """Maps with at most ``most`` values in all, of every k-th position along each axis, and a note where k > 1."""
-    step, found = 1, list(maps)
-    while sum(values.size for one in found for values in one.values.values()) > most:
+    step, thin = 1, list(maps)
+    while sum(values.size for content in thin for values in content.values.values()) > most:
         step += 1
-        found = [_every(one, step) for one in maps]
+        thin = [_every(content, step) for content in maps]
     if step == 1:
-        return found, []
-    return found, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
+        return thin, []
+    return thin, [f"Maps: every {step}th position along each axis (every {step * step}th point of a surface)."]
 
 
-def _every(one: MapContent, step: int) -> MapContent:
+def _every(content: MapContent, step: int) -> MapContent:
     """A map of every ``step``-th position along each axis, and of as small a share of the points of a surface."""
-    part = slice(None, None, step if one.z_m is None else step * step)
-    index = (..., part, part) if one.z_m is None else (..., part)
-    values = {name: array[index] for name, array in one.values.items()}
-    z_m = None if one.z_m is None else one.z_m[part]
-    return replace(one, x_m=one.x_m[part], y_m=one.y_m[part], z_m=z_m, values=values)
+    part = slice(None, None, step if content.z_m is None else step * step)
+    index = (..., part, part) if content.z_m is None else (..., part)
+    values = {name: array[index] for name, array in content.values.items()}
+    z_m = None if content.z_m is None else content.z_m[part]
+    return replace(content, x_m=content.x_m[part], y_m=content.y_m[part], z_m=z_m, values=values)

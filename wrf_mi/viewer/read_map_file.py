@@ -36,7 +36,7 @@ def _limit_memory(more_bytes: int) -> None:
 def main(file: str, out: str) -> int:
     """Write the map; the exit status, 1 with one line on standard error for a file that is no map."""
     path, used = Path(file), resource.getrusage(resource.RUSAGE_SELF)
-    size = sum(one.stat().st_size for one in (path.rglob("*") if path.is_dir() else [path]) if one.is_file())
+    size = sum(file.stat().st_size for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file())
     _limit(resource.RLIMIT_CPU, round(used.ru_utime + used.ru_stime + CPU_S + size / BYTES_PER_S) + 1)
     _limit_memory(0)
     opened: Any = xarray.open_zarr if path.suffix.lower() == ZARR else xarray.open_dataset

@@ -2,7 +2,7 @@
 // Functions of page.js that do not depend on what is shown.
 const MISSING = 65535;
 
-// Inverse of wrf_mi.viewer.pack.packed: numbers in the order of the last axis, and their shape.
+// Inverse of wrf_mi.viewer.page.packed: numbers in the order of the last axis, and their shape.
 function unpack(packed) {
   const bytes = Uint8Array.from(atob(packed.codes), (c) => c.charCodeAt(0));
   const view = new DataView(bytes.buffer);

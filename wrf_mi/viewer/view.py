@@ -21,37 +21,35 @@ from ..runs.results import read_run
 from ..runs.run import Run, open_run
 from ..tasks.conditions import scene_carrier
 from .content import SHOWN_GAUSSIANS, SHOWN_PATHS, STORED_TRANSMITTERS, ViewContent, ViewOptions
+from .layers import (
+    OnStage,
+    gaussians_content,
+    paths_content,
+    read_scene,
+    rows_content,
+    run_scene,
+    scene_content,
+    surfaces_in,
+)
 from .map_layer import is_map, read_map, thinned
 from .page import page, plotly_js
-from .run_layers import OnStage, gaussians_content, paths_content, rows_content, run_scene
-from .scene_layer import read_scene, scene_content, surfaces_in
 
 Source = str | Path | Run | Any
 """A run, its folder, a scene by name, folder or file, a ``sionna.rt.Scene``, a map file or an ``xarray.Dataset``."""
 
-LARGEST_BYTES = 15_000_000
-"""Largest size of a page."""
-FRAME_HEIGHT_PX = 640
-"""Height of a view in a notebook."""
+LARGEST_BYTES = 15_000_000  # largest size of a page
+FRAME_HEIGHT_PX = 640  # height of a view in a notebook
 
 
 @dataclass(frozen=True)
 class View:
-    """A view of a scene, runs and maps.
+    """A view of a scene, runs and maps."""
 
-    Attributes:
-        content: what it shows.
-    """
-
-    content: ViewContent
+    content: ViewContent  # what it shows
 
     @cached_property
     def html(self) -> str:
-        """The page: one HTML document that needs no network.
-
-        Raises:
-            InputError: it would be larger than `LARGEST_BYTES`.
-        """
+        """The page: one HTML document that needs no network; `InputError`: it would be larger than `LARGEST_BYTES`."""
         text = page(self.content)
         if (size := len(text.encode())) > LARGEST_BYTES:
             remedy = "lower --transmitters, --gaussians or --paths, or give fewer maps"
@@ -64,11 +62,7 @@ class View:
         return self.content.counts
 
     def write(self, path: str | Path) -> Path:
-        """Write the page atomically.
-
-        Raises:
-            InputError: as `html`.
-        """
+        """Write the page atomically; `InputError`: as `html`."""
         return write_atomically(Path(path), self.html)
 
     def _repr_html_(self) -> str:
@@ -113,10 +107,10 @@ class _Gathered:
             self.material_used = True
 
     def _add_map(self, source: Any) -> None:
-        found, notes = read_map(source)
-        self.content.maps.append(found)
+        content, notes = read_map(source)
+        self.content.maps.append(content)
         self.content.notes += notes
-        self.titles.append(found.name)
+        self.titles.append(content.name)
 
     def _take_scene(self, surfaces: Any, materials: dict[str, str]) -> None:
         if self.scene is None:
@@ -153,14 +147,12 @@ class _Gathered:
             self._add_paths(run, numbers, positions, scene)
 
     def _add_paths(self, run: Run, numbers: IntArray, positions: FloatArray, scene: Any) -> None:
+        limits = self.options, self.on_stage, self.progress
         try:
-            found, notes = paths_content(
-                run, numbers, positions, scene, self.options, self.on_stage, progress=self.progress
-            )
+            self.content.paths, notes = paths_content(run, numbers, positions, scene, *limits)
         except InputError as error:
             # A transmitter inside a solid, for example, hides paths but nothing else.
-            found, notes = None, [f"Paths: not traced, {error}"]
-        self.content.paths = found
+            notes = [f"Paths: not traced, {error}"]
         self.content.notes += notes
 
 
@@ -199,20 +191,20 @@ def view(
     if not sources:
         raise InputError("view: nothing to show; give a run folder, a scene or a map")
     plotly_js()  # refused before the work
-    found = _Gathered(options, material, on_stage, progress)
+    gathered = _Gathered(options, material, on_stage, progress)
     for source in sources:
-        found.add(source)
-    if material is not None and not found.material_used:
+        gathered.add(source)
+    if material is not None and not gathered.material_used:
         raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
-    content = found.content
-    if found.scene is not None:
-        content.scene, note = scene_content(*found.scene)
+    content = gathered.content
+    if gathered.scene is not None:
+        content.scene, note = scene_content(*gathered.scene)
         content.notes += [note] if note else []
     content.maps, notes = thinned(content.maps)
     content.notes += notes
-    content.title = "; ".join(found.titles)
+    content.title = "; ".join(gathered.titles)
     if not content.receivers:
-        content.receivers = tuple(dict.fromkeys(name for one in content.maps for name in one.receivers))
+        content.receivers = tuple(dict.fromkeys(name for shown in content.maps for name in shown.receivers))
         content.receivers_m = np.full((len(content.receivers), 3), np.nan)
     if content.scene is None and content.rows is None and not content.maps:
         raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")

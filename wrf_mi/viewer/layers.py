@@ -1,17 +1,20 @@
-"""Layers of a view that show a run: held-out rows, observations, Gaussians and paths."""
+"""Layers of a view: mesh and edges of a scene; held-out rows, observations, Gaussians and paths of a run."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
+from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..models.gaussian.model import FittedField
@@ -19,22 +22,78 @@ from ..models.ray_tracing import CORRECTED, PATHS
 from ..runs.folder import SPLIT
 from ..runs.results import Results
 from ..runs.run import Run
-from ..runs.scene_view import gaussian_cloud
+from ..runs.scene_view import gaussian_cloud, surfaces_of
+from ..scene.mesh.surfaces import Surface
+from ..scene.preview import ceiling_faces, free_edges
 from ..tasks import TASKS
 from ..tracing import TraceOptions, TraceResult, load_trace, open_scene, trace_paths
-from .content import GaussiansContent, PathsContent, RowsContent, ViewOptions
-from .pack import packed
+from ..tracing.sionna.scenes import MESHES
+from .content import GaussiansContent, MaterialMesh, PathsContent, RowsContent, SceneContent, ViewOptions
+from .page import packed
 
-IMAGE_BYTES = 4_000_000
-"""Bytes of a page for observations that are images, at most."""
-PATH_NUMBERS = 1_000_000
-"""Coordinates of all paths of a page, at most: 2.7 MB."""
-WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9
-"""Limits before logarithms."""
+MOST_TRIANGLES = 100_000  # triangles of a page, the largest: 2.4 MB
+MOST_EDGES = 20_000
+OPENED_HZ = 3.5e9
+"""Carrier at which a scene without data is opened; materials are shown by name, so that it has no influence."""
+NO_MATERIAL, ANY_MATERIAL = "no material", "concrete"  # label of a bare mesh, and the material that it is opened with
+IMAGE_BYTES = 4_000_000  # bytes of a page for observations that are images, at most
+PATH_NUMBERS = 1_000_000  # coordinates of all paths of a page, at most: 2.7 MB
+WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9  # limits before logarithms
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
 OnStage = Callable[[str, float], None]
 """Progress callback: stage and fraction done."""
+
+
+def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
+    """Surfaces of a scene, by name, folder, XML or mesh, and the radio material of each by its name.
+
+    A mesh without a material is shown without one. `InputError` for no such scene, or one that cannot be opened.
+    """
+    bare = material is None and Path(source).suffix.lower() in MESHES
+    if bare and not Path(source).is_file():
+        raise InputError(f"{source}: no such file; give a run folder, a map or a scene")
+    surfaces, materials = surfaces_in(open_scene(source, OPENED_HZ, material=ANY_MATERIAL if bare else material))
+    return surfaces, dict.fromkeys(materials, NO_MATERIAL) if bare else materials
+
+
+def surfaces_in(scene: Any) -> tuple[list[Surface], dict[str, str]]:
+    """Surfaces of a ``sionna.rt.Scene``, and the radio material of each by its name."""
+    materials = {name: thing.radio_material.name for name, thing in scene.objects.items()}
+    return surfaces_of(scene), materials
+
+
+def scene_content(
+    surfaces: Sequence[Surface], materials: Mapping[str, str], most: int = MOST_TRIANGLES
+) -> tuple[SceneContent, str | None]:
+    """Triangles by material, and a note if there are more than ``most``, of which the largest are kept."""
+    vertices = np.concatenate([surface.vertices_m for surface in surfaces])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+    ceiling = np.concatenate([ceiling_faces(surface, low, high) for surface in surfaces])
+    number = np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces])
+    drawn, note = np.ones(len(corners), bool), None
+    if len(corners) > most:
+        drawn[:] = False
+        drawn[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
+        note = f"Mesh: the largest {most} of {len(corners)} triangles."
+    labels = np.array([material_label(materials[surface.name]) for surface in surfaces])
+    meshes = []
+    for label in sorted(set(labels)):
+        for above in (False, True):
+            chosen = np.flatnonzero(drawn & (labels[number] == label) & (ceiling == above))
+            if len(chosen):
+                used, index = np.unique(number[chosen], return_inverse=True)
+                names = tuple(surfaces[k].name for k in used)
+                meshes.append(MaterialMesh(str(label), above, corners[chosen], index, names))
+    edges = np.concatenate([free_edges(surface, creases=True) for surface in surfaces if surface.kind != "ceiling"])
+    length = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=-1)
+    return SceneContent(tuple(meshes), edges[np.argsort(-length, kind="stable")[:MOST_EDGES]]), note
+
+
+def material_label(material: str) -> str:
+    """Name of a radio material without the prefix of ITU-R P.2040's."""
+    return material.removeprefix("itu_").removeprefix("itu-").replace("_", " ")
 
 
 def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | None, list[str]]:
@@ -77,16 +136,15 @@ def representative(score: FloatArray, count: int) -> IntArray:
 def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
     """Measured and predicted observations of some test rows for the page.
 
-    Returns:
-        ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
-        receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
+    ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
+    receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
     """
     task = TASKS[results.task]
     both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}
     if task.image:
         size = list(results.truth.shape[-2:])
         return {"kind": "image", "size": size} | {
-            key: [[png(one) for one in part] for part in both[key]] for key in both
+            key: [[png(spectrum) for spectrum in part] for part in both[key]] for key in both
         }
     if task.axes == 0:
         return {"kind": "level"} | {key: packed(values) for key, values in both.items()}
@@ -173,12 +231,12 @@ def paths_content(
         source = f"traced for this view in {run.config.scene}, at most {depth} interactions, {traced.rays} rays"
     else:
         return None, []
-    found = path_layer(traced, limits.paths)
+    layer = path_layer(traced, limits.paths)
     notes = [f"Paths: {source}."]
-    if len(found.tx) < len(traced.paths):
-        text = f"the strongest {len(found.tx)} of {len(traced.paths)}"
+    if len(layer.tx) < len(traced.paths):
+        text = f"the strongest {len(layer.tx)} of {len(traced.paths)}"
         notes.append(f"Paths: {text}, at most {limits.paths} of each transmitter to each receiver.")
-    return found, notes
+    return layer, notes
 
 
 def path_layer(traced: TraceResult, most: int) -> PathsContent:
@@ -190,8 +248,8 @@ def path_layer(traced: TraceResult, most: int) -> PathsContent:
     rank = np.arange(len(order)) - np.searchsorted(pair[order], pair[order])
     # Paths of each pair of devices that a page has room for.
     room = PATH_NUMBERS // (3 * (paths.interactions.shape[1] + 2) * max(1, paths.n_tx * paths.n_rx))
-    kept = np.sort(order[rank < min(most, max(1, room))])
-    paths, gain_db = paths.select(kept), gain_db[kept]
+    strongest = np.sort(order[rank < min(most, max(1, room))])
+    paths, gain_db = paths.select(strongest), gain_db[strongest]
     bounces = paths.bounces
     receivers_m = np.stack([receiver.position_m for receiver in traced.receivers])
     corners = [np.zeros((0, 3))]

@@ -1,0 +1,190 @@
+"""``wrf-mi mesh``, ``correct`` and ``edit``: scenes from scans, plans and meshes, corrected and edited."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core import InputError
+from .options import DATASET, Arguments, add_command, add_n_train
+from .output import Watch, show
+
+if TYPE_CHECKING:
+    from ..scene.edit import Move
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``mesh``, ``correct`` and ``edit`` to the commands."""
+    for add in (_add_mesh, _add_correct, _add_edit):
+        add(commands)
+
+
+def _add_mesh(commands: Any) -> None:
+    text = "make a scene for both tracers from a LiDAR scan, a plan or a mesh"
+    parser = add_command(commands, "mesh", mesh_command, text)
+    add = parser.add_argument
+    add("points", metavar="POINTS", help="scan (PLY, LAS, LAZ, XYZ, NPZ), plan (NPZ, PNG, ROS map YAML, CSV) or mesh")
+    add("--out", required=True, metavar="DIR", help="scene folder to make")
+    add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
+    add("--up", choices=("y", "z"), help="axis that is up in a scan or mesh (default: y in GLB, else z)")
+    text = "point of the source, metres, z up, that becomes the origin, such as 701300,4485500,0"
+    add("--origin", type=_point, metavar="X,Y,Z", help=text)
+    add("--height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
+    add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
+    add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
+    text = "side of the plan at which the first row of an NPZ grid lies, where the file does not state row_0"
+    add("--row-0", choices=("top", "bottom"), help=text)
+    add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
+    add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
+    add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
+    text = "measured positions x,y[,z] in the scene's frame: refuse a plan that fits them better when mirrored"
+    add("--positions", metavar="CSV", help=text)
+    add("--replace", action="store_true", help="replace an existing scene folder")
+
+
+def mesh_command(a: Arguments) -> int:
+    """Make a scene folder."""
+    from ..scene.make import make_scene
+    from ..scene.register import read_pairs, register_pairs
+
+    pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
+    source = {"units": a.units, "up": a.up, "origin_m": a.origin, "row_0": a.row_0, "resolution_m": a.resolution}
+    storey = {"height_m": a.height, "floor_m": a.floor, "materials": a.materials}
+    frame = {"registration": pairs, "register_walls_of": a.register_walls, "positions": a.positions}
+    scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
+    kinds = list(scene.materials.surfaces.values())
+    counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
+    facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
+    lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
+    if a.origin is not None:
+        point = ", ".join(f"{value:.12g}" for value in a.origin)
+        lines.append(f"origin: {point}; subtract it from the positions of the measurements, too")
+    lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
+    return show(a.json, {**facts, "origin_m": a.origin}, "\n".join(lines))
+
+
+def _point(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(value) for value in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is no point; give X,Y,Z in metres")
+    return values
+
+
+def _add_correct(commands: Any) -> None:
+    parser = add_command(commands, "correct", correct_command, "correct a scene by measurements")
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
+    add("dataset", metavar="DATASET", help=DATASET)
+    add("--out", required=True, metavar="SCENE2", help="scene folder to make")
+    parts = "what is changed, from materials,planes,frame,hidden,gain,pose,patterns"
+    add("--fit", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials and gain)")
+    add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
+    add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
+    add("--rows", type=int, metavar="N", help="most training rows that are compared (default: 600)")
+    add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
+    add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
+    add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
+    add("--split", default="official", help="as for train (default: official); test rows are not used")
+    add_n_train(parser)
+    add("--seed", type=int, default=0, metavar="N", help="seed of split and held-out rows (default: 0)")
+    add("--replace", action="store_true", help="replace an existing scene folder")
+
+
+def correct_command(a: Arguments) -> int:
+    """Correct a scene, and write its page."""
+    from ..checking import warn_of_suspicions
+    from ..core.settings import with_settings
+    from ..correction import correct_scene, default_options, write_page
+    from ..correction.options import FRAME, PLANES
+    from ..datasets import make_splits
+    from ..synthetic import load_record
+
+    if Path(a.out).exists() and not a.replace:  # before the work, not after it
+        raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
+    record = load_record(a.dataset, progress=sys.stderr.isatty())
+    options = default_options(record)
+    if a.fit is not None:
+        options = replace(options, parts=tuple(a.fit.split(",")))
+    names = ("depth", "reflections", "rows", "rays")
+    stated = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
+    options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
+    if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
+        raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
+    splits = make_splits(record, a.split, a.seed, a.n_train)
+    if len(splits) > 1:
+        raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
+    warn_of_suspicions(record)
+    with Watch() as watch:
+        correction = correct_scene(a.scene, record, splits[0], options, a.material, watch.on_progress)
+        facts = write_page(correction, a.out, a.replace)
+    what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
+    lines = [f"{facts['score']} of {facts['held_out']} {what}   median    mean"]
+    for stage, score in facts["held_out_scores"].items():
+        mark = "  kept" if stage == facts["kept"] else ""
+        lines.append(f"{stage:<40}{score['median']:8.3f}{score['mean']:8.3f}{mark}")
+    lines.append(f"{facts['rows']} training rows, {facts['paths']} paths, {facts['seconds']:.0f} s")
+    lines.append(f"scene: {a.out}\npage: {a.out}/correction.md")
+    shown = {"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}}
+    return show(a.json, shown, "\n".join(lines))
+
+
+def _add_edit(commands: Any) -> None:
+    text = "move or remove parts of a scene, whose changed signals `trace` then predicts; without --out: list its parts"
+    parser = add_command(commands, "edit", edit_command, text)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="scene folder")
+    text = "move parts, together, by metres and turn them by degrees about the vertical axis; * and ? are wildcards"
+    add("--move", action="append", default=[], metavar="NAME,...:DX,DY,DZ[,DEG]", help=f"{text}; repeatable")
+    add("--remove", action="append", default=[], type=_names, metavar="NAME,...", help="leave parts out; repeatable")
+    add("--out", metavar="SCENE2", help="scene folder to make")
+    add("--replace", action="store_true", help="replace an existing scene folder")
+
+
+def edit_command(a: Arguments) -> int:
+    """Edit a scene, or list its parts."""
+    from ..scene.edit import box_of, edit_scene, read_surfaces
+
+    if a.out is not None:
+        removed = [name for names in a.remove for name in names]
+        folder = edit_scene(a.scene, a.out, [_move(text) for text in a.move], removed, a.replace)
+        return show(a.json, {"scene": str(folder)}, f"scene: {folder}\npicture: {folder / 'preview.png'}")
+    if a.move or a.remove or a.replace:
+        raise InputError("edit: give the folder of the edited scene (--out)")
+    surfaces, materials = read_surfaces(a.scene)
+    rows = [
+        {
+            "part": surface.name,
+            "material": materials.of(surface.name, surface.kind),
+            "box_m": box_of([surface]).round(3).tolist(),
+        }
+        for surface in surfaces
+    ]
+    width = max(len(row["part"]) for row in rows) + 2
+    lines = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"]
+    for row in rows:
+        low, high = (" ".join(f"{value:7.2f}" for value in corner) for corner in row["box_m"])
+        lines.append(f"{row['part']:<{width}}{row['material']:<24}{low:<24}{high}")
+    return show(a.json, {"scene": a.scene, "parts": rows}, "\n".join(lines))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _move(text: str) -> Move:
+    from ..scene.edit import Move
+
+    names, _, numbers = text.rpartition(":")
+    try:
+        values = [float(value) for value in numbers.split(",")]
+    except ValueError:
+        values = []
+    if not _names(names) or len(values) not in (3, 4):
+        raise InputError(f"--move {text}: give names, a colon, and DX,DY,DZ in metres, such as box:0.5,0,0")
+    return Move(_names(names), (values[0], values[1], values[2]), values[3] if len(values) == 4 else 0.0)
