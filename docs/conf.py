@@ -45,6 +45,7 @@ nb_output_stderr = "remove"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
+autodoc_inherit_docstrings = False  # an attribute that is None would have the docstring of the type of its base's
 autodoc_default_options = {"members": True, "show-inheritance": False}
 autosummary_generate = True
 # Names of wrf_mi have pages of their own, which those of the packages do not repeat.

@@ -22,6 +22,7 @@ from wrf_mi.runs import sweep
 from wrf_mi.runs.api import train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.evaluate import evaluate
+from wrf_mi.runs.folder import RunRequest
 from wrf_mi.runs.results import read_run
 from wrf_mi.tracing import TraceOptions
 
@@ -117,7 +118,7 @@ def test_a_sweep_is_refused_before_its_first_run(
     broken = changed(two_gateways, ((0, row, 0, 0), np.nan))
     monkeypatch.setattr(sweep, "_record", lambda dataset: broken)
     with pytest.raises(InputError, match=f"row {row}: 1 of 800 values are not finite"):
-        sweep.check_run("broken", arguments)
+        sweep.check_run("broken", RunRequest(**arguments))
 
 
 DIRECT = TraceOptions(reflection=False, depth=0)

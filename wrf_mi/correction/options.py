@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import NOT_NEGATIVE, CheckedSettings, Positive, ShareBelow1
+from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Positive, ShareBelow1
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, SpecularOptions
 from ..tracing.paths.instrument_parameters import TX_PATTERN
 from ..tracing.paths.scene_parameters import EXPONENT, PREFIX, QUANTITIES, SHIFT, TILT
@@ -41,6 +41,9 @@ HELD = 0.01
 OnStage = Callable[[str, float], None]
 """``on_stage(what, share)``: what is done, and the share of it that is done, 0 to 1."""
 
+Interactions = Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")]
+Degree = Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")]
+
 
 @dataclass(frozen=True)
 class CorrectionOptions(SpecularOptions, CheckedSettings):
@@ -57,11 +60,11 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     """
 
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
-    depth: Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")] = field(default=3, kw_only=True)
-    rows: Annotated[int, Field(ge=1, description="1 or more")] = 600
+    depth: Interactions = field(default=3, kw_only=True)
+    rows: Count = 600
     faint: ShareBelow1 = 1e-3
     steps: Annotated[int, NOT_NEGATIVE] = 8
-    pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 2
+    pattern_degree: Degree = 2
     shift_sd_m: Positive = 0.02
 
     def __post_init__(self) -> None:

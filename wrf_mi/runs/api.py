@@ -299,6 +299,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
                 fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
+            del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(Part(part, rows, *load_fitted(config, problem, part)))
         scores.append(score_part(folder, config, problem, parts[-1]))

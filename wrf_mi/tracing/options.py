@@ -17,6 +17,9 @@ FACTOR, DISC = "surface.factor", "surface.disc"
 """Parameters of Gaussians on surfaces (`wrf_mi.tracing.paths.surface_gaussians`): trained [2, g], logarithmic
 amplitudes and phases in rad, and constant [6, g], centres in metres and unit normals."""
 
+Depth = Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")]
+Rays = Annotated[int | Literal["auto"], Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpecularOptions:
@@ -29,10 +32,10 @@ class SpecularOptions:
         rays: number of rays from each source (best a power of two).
     """
 
-    depth: Annotated[int, Field(ge=0, le=MAX_DEPTH, description=f"0 to {MAX_DEPTH}")] = 3
+    depth: Depth = 3
     reflections: int | None = 3
     transmission: bool = True
-    rays: Annotated[int | Literal["auto"], Field(ge=1, le=MAX_RAYS, description=f"1 to {MAX_RAYS}")] = 1 << 16
+    rays: Rays = 1 << 16
 
     @property
     def options(self) -> TraceOptions:
