@@ -92,7 +92,7 @@ def default_options(record: Record) -> CorrectionOptions:
 
 
 # Products are of a few rows: threads that share them wait for each other, on a busy machine ten times as long.
-@threadpool_limits.wrap(1, "blas")
+@threadpool_limits.wrap(1, "blas")  # type: ignore[untyped-decorator]
 def correct_scene(
     scene: str | Path,
     record: Record,

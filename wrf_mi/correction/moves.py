@@ -346,13 +346,13 @@ class Moves:
     def _far_from_prior(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Squared distances of materials from their prior, in standard deviations."""
         away = (state.vector - state.mean) / self.posterior.prior_deviation
-        return np.square(away[np.array([choice.material for choice in choices])]).sum(axis=-1)
+        return np.asarray(np.square(away[np.array([choice.material for choice in choices])]).sum(axis=-1))
 
     def _implausible(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Squared distances of planes from the positions predicted by the other planes, in standard deviations."""
         posterior, vector, places = self.posterior, state.vector, [choice.plane for choice in choices]
         away = [(vector[at] - posterior.expected(vector, at)) / posterior.prior_deviation[at] for at in places]
-        return np.square(away).sum(axis=1)
+        return np.asarray(np.square(away).sum(axis=1))
 
     def _unsupported(self, choices: Sequence[SurfaceChoice], state: State) -> FloatArray:
         """Log-likelihoods without each surface, the higher the less observations tell of it."""

@@ -307,7 +307,7 @@ class PathSum:
         distinct = shifts[np.unique(which, return_index=True)[1]]
         length = (touched.slope @ distinct.T)[:, :, None]
         phase = np.exp(-1j * length * self._wavenumber(touched.paths)[:, None])[:, which]
-        return (gain.T[:, :, None] * phase) * unit[:, None]
+        return np.asarray((gain.T[:, :, None] * phase) * unit[:, None])
 
     def _gain_at(self, vector: FloatArray, touched: _Touched) -> Complex:
         materials = self._material.ravel()

@@ -65,7 +65,8 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
         sizes["static_geometry"] = n.static_geometry
         sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
-    return FIELDS[model](encoding=encoding, components=components, **sizes)
+    field: Field = FIELDS[model](encoding=encoding, components=components, **sizes)
+    return field
 
 
 def _shapes(field: Field) -> dict[str, tuple[int, ...]]:

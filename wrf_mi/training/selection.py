@@ -190,7 +190,8 @@ def _without_carrier(tx_pos_m: FloatArray, carriers_hz: FloatArray, split: Split
 
 def rows_at_receiver(record: Record, rows: IntArray, receiver: int) -> IntArray:
     """Those of some rows that a receiver received, whole."""
-    return rows[np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)]
+    is_whole = np.isfinite(record.observation[receiver, rows]).reshape(len(rows), -1).all(axis=1)
+    return np.asarray(rows[is_whole])
 
 
 class RowDistance:

@@ -97,7 +97,7 @@ class StageSelection:
         return predict.of_side(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight)
 
     def _observed(self, port: int, rows: IntArray) -> NDArray[Any]:
-        return self.plan.record.observation[port // self.plan.graph.carriers, rows]
+        return np.asarray(self.plan.record.observation[port // self.plan.graph.carriers, rows])
 
     def _scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
         """Scores of `_reports`."""

@@ -63,7 +63,7 @@ class Targets:
     def received(self, port: int, rows: IntArray) -> IntArray:
         """Conditions of those rows that a port's receiver observed at its carrier."""
         chosen = self.at(port, self.conditions(rows))
-        return chosen[self._complete[port // self.carriers, chosen]]
+        return np.asarray(chosen[self._complete[port // self.carriers, chosen]])
 
     @cached_property
     def _complete(self) -> NDArray[np.bool_]:
