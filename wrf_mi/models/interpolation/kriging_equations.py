@@ -115,10 +115,12 @@ class KrigingSystem:
         """
         kind = np.result_type(values, float)
         beta, weights = (np.empty((rows, values.shape[1]), kind) for rows in (self.trend.shape[1], len(values)))
+        solved_trend = self.solve(self.trend)
         for part in slices(values.shape[1], COLUMNS):
-            columns = values[:, part].astype(kind)
-            beta[:, part] = self.coefficients(columns)
-            weights[:, part] = self.weights(columns, beta[:, part])
+            # K^-1 y serves both: solving is most of the time, and the columns of the trend are few.
+            solved = self.solve(values[:, part].astype(kind))
+            beta[:, part] = np.linalg.solve(self.information, self.trend.T @ solved)
+            weights[:, part] = solved - solved_trend @ beta[:, part]
         return beta, weights
 
     def variance(
