@@ -44,19 +44,12 @@ _SCRIPT = Path(__file__).with_name("trial.py")
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of a trial.
+    """Result of a trial."""
 
-    Attributes:
-        usable: whether the library can be used.
-        reason: reason against it, a verb phrase ("is too old for Dr.Jit"); empty for a usable library.
-        version: version that the library reports, e.g. ``"19.1.7"``; empty for an unusable library.
-        device: name of the GPU; empty for LLVM.
-    """
-
-    usable: bool
-    reason: str = ""
-    version: str = ""
-    device: str = ""
+    usable: bool  # whether the library can be used
+    reason: str = ""  # reason against it, a verb phrase ("is too old for Dr.Jit"); empty for a usable library
+    version: str = ""  # version that the library reports, e.g. ``"19.1.7"``; empty for an unusable library
+    device: str = ""  # name of the GPU; empty for LLVM
 
 
 def installed_version(package: str) -> str | None:

@@ -19,8 +19,7 @@ import mitsuba as mi
 
 Vector = list[Any]
 Complex = tuple[Any, Any]
-Float64: Any = dr.float64_array_t(mi.Float)
-"""Double precision of the present backend: phases k d of thousands of rad."""
+Float64: Any = dr.float64_array_t(mi.Float)  # double precision of the present backend: phases k d of thousands of rad
 
 
 @dataclass

@@ -28,28 +28,20 @@ FREEDOM = 4.0
 MEDIAN_OF_MEAN = 0.8
 """Median of a row's mean squared residual in units of the variance: that of a chi-squared variable of 3 to 10 degrees
 of freedom, divided by its mean, is 0.79 to 0.93."""
-LEAST_VARIANCE = 1e-10
-"""Smallest variance of a residual in a unit of about 1: reports are rounded to single precision."""
-TRIALS = 8
-"""Largest number of damping factors tried in a step, each `HARDER` times the one before."""
+LEAST_VARIANCE = 1e-10  # smallest variance of a residual in a unit of about 1: reports are rounded to single precision
+TRIALS = 8  # largest number of damping factors tried in a step, each `HARDER` times the one before
 HARDER = 8.0
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6
-"""Damping of the first step and the smallest, relative to the diagonal."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6  # damping of the first step and the smallest, relative to the diagonal
 CONVERGED = 0.1
 """Decrease of the cost below which no further step is taken: a parameter's error of a standard deviation costs 0.5."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Size and correlation of the residuals of a row.
+    """Size and correlation of the residuals of a row."""
 
-    Attributes:
-        variance: s^2, in squares of the residuals' unit.
-        values: n_eff, number of independent values in a row.
-    """
-
-    variance: float
-    values: float
+    variance: float  # s^2, in squares of the residuals' unit
+    values: float  # n_eff, number of independent values in a row
 
     @classmethod
     def of(cls, residual: FloatArray) -> Noise:

@@ -34,10 +34,8 @@ from ..tracing.paths.solve import Prepared
 from ..tracing.paths.traced_field import TracedField, traced_fields
 from .options import CorrectionOptions
 
-LATTICE = (12, 40)
-"""Most elevations and azimuths of the lattice of directions."""
-FLOOR = 0.5
-"""Share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels."""
+LATTICE = (12, 40)  # most elevations and azimuths of the lattice of directions
+FLOOR = 0.5  # share of a median row's magnitude that is added to each row's own, as squares, in the unit of channels
 
 
 class PathTable(NamedTuple):

@@ -32,47 +32,33 @@ from .state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
-JOINT = 10
-"""Number of planes whose material and shift are chosen together."""
-STEP = 1 / 16
-"""Step of the shifts, wavelengths: paths change by up to an eighth."""
-FARTHEST = 2.0
-"""Largest shift tried, in standard deviations of the prior."""
+JOINT = 10  # number of planes whose material and shift are chosen together
+STEP = 1 / 16  # step of the shifts, wavelengths: paths change by up to an eighth
+FARTHEST = 2.0  # largest shift tried, in standard deviations of the prior
 GAIN = 0.5
 """Least increase of the log-posterior for which a state changes: that of a parameter off by a standard deviation."""
 SWEEPS, ROUNDS = 3, 3
 """Most sweeps over choices, and rounds: planes that are off hide the right material, and conversely."""
-ROUND_STEPS = 3
-"""Largest number of least-squares steps between choices."""
-REFINED = 8
-"""Number of shifts, the best with their best materials, that are compared after least-squares steps."""
-SHIFTS_EACH = 3
-"""Number of shifts of each material that are compared so, where materials are in doubt."""
+ROUND_STEPS = 3  # largest number of least-squares steps between choices
+REFINED = 8  # number of shifts, the best with their best materials, that are compared after least-squares steps
+SHIFTS_EACH = 3  # number of shifts of each material that are compared so, where materials are in doubt
 LIKELY = 3.0
 """Log-likelihood that counts for each face that becomes of the material of the others: most boxes are of one."""
-RECONSIDERED = 4
-"""Largest number of times that doubtful surfaces are chosen anew."""
+RECONSIDERED = 4  # largest number of times that doubtful surfaces are chosen anew
 ELSEWHERE, MINIMA = 3, 2
 """Number of the least plausible planes or materials that are tried otherwise, and of other choices of each."""
-APART = 1 / 8
-"""Least distance of minima, wavelengths: paths change by up to a quarter."""
+APART = 1 / 8  # least distance of minima, wavelengths: paths change by up to a quarter
 
 
 @dataclass(frozen=True)
 class SurfaceChoice:
-    """Alternatives of one surface or plane.
+    """Alternatives of one surface or plane."""
 
-    Attributes:
-        what: name of the surface or plane.
-        places: its entries of the vector.
-        values: values of these entries by ``material``, ``shift`` or ``material, shift``; NaN: as other planes predict.
-        of_plane: whether each entry is of a plane, not of a material.
-    """
-
-    what: str
-    places: IntArray
+    what: str  # name of the surface or plane
+    places: IntArray  # its entries of the vector
+    # values of these entries by ``material``, ``shift`` or ``material, shift``; NaN: as other planes predict
     values: Mapping[str, FloatArray]
-    of_plane: NDArray[np.bool_]
+    of_plane: NDArray[np.bool_]  # whether each entry is of a plane, not of a material
 
     @property
     def material(self) -> IntArray:

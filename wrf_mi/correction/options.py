@@ -18,8 +18,7 @@ from ..tracing.paths.traced_field import TracedOptions
 
 FRAME, HIDDEN = "frame", "hidden"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
-PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS)
-"""What a correction may change."""
+PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS)  # what a correction may change
 DEVIATIONS = {
     "permittivity": 0.7,  # of the logarithm of permittivity - 1
     "conductivity": 1.4,  # of logarithms, too
@@ -31,12 +30,10 @@ DEVIATIONS = {
     "pattern": 0.1,
 }
 """Standard deviations of parameters before the correction, by the last part of their names."""
-TILT_SD_RAD = 0.005
-"""Standard deviation of a plane's tilts."""
+TILT_SD_RAD = 0.005  # standard deviation of a plane's tilts
 FRAME_SD = np.repeat([0.05, 0.02], 3)
 """Standard deviations of the common displacement of all planes against the devices, metres, and rotation, rad."""
-HELD = 0.01
-"""Share of the deviations of planes that remains where they move with the frame alone."""
+HELD = 0.01  # share of the deviations of planes that remains where they move with the frame alone
 
 OnStage = Callable[[str, float], None]
 """``on_stage(what, share)``: what is done, and the share of it that is done, 0 to 1."""

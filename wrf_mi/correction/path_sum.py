@@ -34,8 +34,7 @@ from ..tracing.search.images import mirrored
 if TYPE_CHECKING:
     from .misfit import Misfit
 
-MOST_WAVES = 1 << 24
-"""Most element signals of paths, of 16 bytes each, that are kept for spectra."""
+MOST_WAVES = 1 << 24  # most element signals of paths, of 16 bytes each, that are kept for spectra
 TOGETHER = 512
 """Rows, over all vectors, of which trials are computed at once: their spectra fit into the cache of a processor."""
 MOST_KEPT = 64

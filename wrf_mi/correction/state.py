@@ -33,39 +33,25 @@ from .misfit import Misfit
 from .options import FRAME, FRAME_SD, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
 
-LEAST_PATHS = 10
-"""Fewest paths of a surface or plane that is changed."""
-ABSENT = "absent"
-"""Choice of a surface that waves do not notice."""
+LEAST_PATHS = 10  # fewest paths of a surface or plane that is changed
+ABSENT = "absent"  # choice of a surface that waves do not notice
 ABSENT_VALUES = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, 0.001]), 0.0)
 """Its entries of the vector, in the order of `QUANTITIES`; 1 mm of almost nothing."""
-STILL_ABSENT = 0.1
-"""Susceptibility up to which a surface that was chosen to be absent is, after least squares."""
-REFINING_STEPS = 3
-"""Largest number of least-squares steps of one plane while shifts are compared."""
-UNKNOWN = Noise(1.0, 1.0)
-"""Noise before any least squares."""
+STILL_ABSENT = 0.1  # susceptibility up to which a surface that was chosen to be absent is, after least squares
+REFINING_STEPS = 3  # largest number of least-squares steps of one plane while shifts are compared
+UNKNOWN = Noise(1.0, 1.0)  # noise before any least squares
 
 
 @dataclass(frozen=True)
 class State:
-    """Parameters of a stage, and the choices that led to them.
+    """Parameters of a stage, and the choices that led to them."""
 
-    Attributes:
-        posterior: what rows of measurements and prior knowledge tell of them.
-        stage: the stage, its parts joined by "+"; "" for the stated scene.
-        vector: parameters [p].
-        mean: means of the parameters' prior [p].
-        materials: material of each surface that was chosen, by its name.
-        noise: noise of the residuals after the last least squares.
-    """
-
-    posterior: ScenePosterior
-    stage: str
-    vector: FloatArray
-    mean: FloatArray
-    materials: Mapping[str, str]
-    noise: Noise = UNKNOWN
+    posterior: ScenePosterior  # what rows of measurements and prior knowledge tell of them
+    stage: str  # the stage, its parts joined by "+"; "" for the stated scene
+    vector: FloatArray  # parameters [p]
+    mean: FloatArray  # means of the parameters' prior [p]
+    materials: Mapping[str, str]  # material of each surface that was chosen, by its name
+    noise: Noise = UNKNOWN  # noise of the residuals after the last least squares
 
     @property
     def free(self) -> IntArray:

@@ -116,25 +116,16 @@ def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
 
 @dataclass
 class Lanes:
-    """Pixels in lanes, for all groups of transmitters.
+    """Pixels in lanes, for all groups of transmitters."""
 
-    Attributes:
-        azimuth: cosine and sine, [lanes] each.
-        elevation: for each of a lane's pixels cosine and sine, [lanes] each.
-        pixel: for each of a lane's pixels its numbers in the images of the group's transmitters, [lanes] each.
-        active: for each of a lane's pixels a mask [lanes].
-        start: begin of the lane's list, [lanes].
-        end: length of the lane's list, [lanes].
-        group: number of the lane's group of transmitters, [lanes].
-    """
-
-    azimuth: list[Any]
-    elevation: list[list[Any]]
+    azimuth: list[Any]  # cosine and sine, [lanes] each
+    elevation: list[list[Any]]  # for each of a lane's pixels cosine and sine, [lanes] each
+    # for each of a lane's pixels its numbers in the images of the group's transmitters, [lanes] each
     pixel: list[list[Any]]
-    active: list[Any]
-    start: Any
-    end: Any
-    group: Any
+    active: list[Any]  # for each of a lane's pixels a mask [lanes]
+    start: Any  # begin of the lane's list, [lanes]
+    end: Any  # length of the lane's list, [lanes]
+    group: Any  # number of the lane's group of transmitters, [lanes]
 
 
 @dataclass
@@ -316,12 +307,7 @@ class _Blend(dr.CustomOp):
 
 
 def blend(
-    footprints: Footprints,
-    signal: list[Any],
-    lists: TileLists,
-    plane: Plane,
-    batch: int,
-    blending: list[Any],
+    footprints: Footprints, signal: list[Any], lists: TileLists, plane: Plane, batch: int, blending: list[Any]
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel.
 

@@ -18,29 +18,21 @@ from ..core import rotation_matrix
 
 Arrays = dict[str, NDArray[np.float32]]
 
-SPLIT_SHRINK = 1.6
-"""Ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)."""
+SPLIT_SHRINK = 1.6  # ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)
 SPLIT_RAD = float(np.radians(5.0))
 """Size as seen from the receiver above which a growing Gaussian is split instead of cloned."""
-LEAST_OPACITY = 0.005
-"""Opacity below which a Gaussian is pruned (Kerbl et al. 2023)."""
+LEAST_OPACITY = 0.005  # opacity below which a Gaussian is pruned (Kerbl et al. 2023)
 RESET_OPACITY = 0.05
 """Largest opacity after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow back."""
 
 
 @dataclass(frozen=True)
 class DensityChange:
-    """A new set of Gaussians in terms of the old one.
+    """A new set of Gaussians in terms of the old one."""
 
-    Attributes:
-        parameters: per-Gaussian parameters of the new set, [k, m].
-        source: old Gaussian of each new one, [m].
-        fresh: new Gaussians whose optimiser moments start at zero, [m].
-    """
-
-    parameters: Arrays
-    source: NDArray[np.int64]
-    fresh: NDArray[np.bool_]
+    parameters: Arrays  # per-Gaussian parameters of the new set, [k, m]
+    source: NDArray[np.int64]  # old Gaussian of each new one, [m]
+    fresh: NDArray[np.bool_]  # new Gaussians whose optimiser moments start at zero, [m]
 
 
 def adapt(

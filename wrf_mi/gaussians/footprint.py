@@ -39,21 +39,15 @@ LOG2_E = math.log2(math.e)  # footprints are powers of two, which processors com
 
 @dataclass
 class Footprints:
-    """Footprints in a receiver's frame, arrays [batch * n], batch-major.
+    """Footprints in a receiver's frame, arrays [batch * n], batch-major."""
 
-    Attributes:
-        direction: unit vector n.
-        whitened: two vectors a, b with v^T C^-1 v = ((a . u)^2 + (b . u)^2) / (n . u)^2.
-        radius: angular radius that holds the whole footprint, radians; detached.
-        visible: far enough from the receiver to have a footprint; detached.
-        depth: distance from the receiver, metres, [n], common to all transmitters; detached. Float64, because it
-            decides the order, which rounding to float32 would change for nearly equal depths.
-    """
-
-    direction: list[dr.ArrayBase]
+    direction: list[dr.ArrayBase]  # unit vector n
+    # two vectors a, b with v^T C^-1 v = ((a . u)^2 + (b . u)^2) / (n . u)^2
     whitened: tuple[list[dr.ArrayBase], list[dr.ArrayBase]]
-    radius: dr.ArrayBase
-    visible: dr.ArrayBase
+    radius: dr.ArrayBase  # angular radius that holds the whole footprint, radians; detached
+    visible: dr.ArrayBase  # far enough from the receiver to have a footprint; detached
+    # distance from the receiver, metres, [n], common to all transmitters; detached. Float64, because it decides the
+    # order, which rounding to float32 would change for nearly equal depths
     depth: dr.ArrayBase
 
 

@@ -31,29 +31,17 @@ RESERVED = 1 << 21
 
 @dataclass
 class Plane:
-    """The perception plane, in tile order, for one image size.
+    """The perception plane, in tile order, for one image size."""
 
-    Attributes:
-        height: rows, over elevations 0 to 90 degrees.
-        width: columns, over the whole azimuth.
-        tile: tile of each lane, [lanes].
-        azimuth: cosine and sine of each lane's azimuth, [lanes] each.
-        elevation: for each of a lane's pixels, cosine and sine of the elevation, [lanes] each.
-        pixel: for each of a lane's pixels its row-major number, [lanes].
-        active: for each of a lane's pixels: False where it pads the plane to whole tiles, [lanes].
-        tile_row: first row of each tile, [tiles].
-        tile_column: first column of each tile, [tiles].
-    """
-
-    height: int
-    width: int
-    tile: dr.ArrayBase
-    azimuth: list[dr.ArrayBase]
-    elevation: list[list[dr.ArrayBase]]
-    pixel: list[dr.ArrayBase]
-    active: list[dr.ArrayBase]
-    tile_row: dr.ArrayBase
-    tile_column: dr.ArrayBase
+    height: int  # rows, over elevations 0 to 90 degrees
+    width: int  # columns, over the whole azimuth
+    tile: dr.ArrayBase  # tile of each lane, [lanes]
+    azimuth: list[dr.ArrayBase]  # cosine and sine of each lane's azimuth, [lanes] each
+    elevation: list[list[dr.ArrayBase]]  # for each of a lane's pixels, cosine and sine of the elevation, [lanes] each
+    pixel: list[dr.ArrayBase]  # for each of a lane's pixels its row-major number, [lanes]
+    active: list[dr.ArrayBase]  # for each of a lane's pixels: False where it pads the plane to whole tiles, [lanes]
+    tile_row: dr.ArrayBase  # first row of each tile, [tiles]
+    tile_column: dr.ArrayBase  # first column of each tile, [tiles]
 
     @property
     def tiles(self) -> int:
@@ -118,17 +106,11 @@ def perception_plane(height: int, width: int, float_type: type) -> Plane:
 
 @dataclass
 class TileLists:
-    """For each (transmitter, tile) the Gaussians that may reach it, from near to far.
+    """For each (transmitter, tile) the Gaussians that may reach it, from near to far."""
 
-    Attributes:
-        index: columns ``b * n + i`` of the Gaussians, all lists concatenated.
-        length: number of entries of each list, [batch * tiles].
-        start: begin of each list, [batch * tiles]; None: list k begins at ``k * n``.
-    """
-
-    index: dr.ArrayBase
-    length: dr.ArrayBase
-    start: dr.ArrayBase | None = None
+    index: dr.ArrayBase  # columns ``b * n + i`` of the Gaussians, all lists concatenated
+    length: dr.ArrayBase  # number of entries of each list, [batch * tiles]
+    start: dr.ArrayBase | None = None  # begin of each list, [batch * tiles]; None: list k begins at ``k * n``
 
     def begin(self, number: dr.ArrayBase, n: int) -> dr.ArrayBase:
         """Begin of the lists of these numbers, with ``n`` Gaussians of each transmitter."""

@@ -41,12 +41,7 @@ class Evaluation:
         pass
 
     def __call__(
-        self,
-        gaussians: Gaussians,
-        pose: Pose,
-        plane: Plane,
-        sphere: bool,
-        params: Mapping[str, Any],
+        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
     ) -> Complex:
         """Real and imaginary part [batch * directions], see `learned_field`.
 

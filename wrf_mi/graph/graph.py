@@ -47,43 +47,27 @@ from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
 Field = WrfGs | WrfGsPlus | Factorised
-LEVEL = "level"
-"""Parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude."""
-SHARE = 0.1
-"""Initial learned amplitude relative to the amplitude of the paths."""
-MATCHING = 3
-"""Passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor."""
-MATCHED = 256
-"""Most transmitters whose reports it compares."""
+LEVEL = "level"  # parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude
+SHARE = 0.1  # initial learned amplitude relative to the amplitude of the paths
+MATCHING = 3  # passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor
+MATCHED = 256  # most transmitters whose reports it compares
 
 
 @dataclass
 class Batch:
-    """A batch of transmitters and their receiver, on the device.
+    """A batch of transmitters and their receiver, on the device."""
 
-    Attributes:
-        condition: positions [3, batch], metres, or features [features, batch] in their place.
-        slots: rows of the traced side [batch].
-        receiver: number of the receiver, from 0.
-        carrier: logarithm of the carrier over the middle one; None: rows have a single carrier.
-        pose: pose of the receiver.
-        plane: directions of the learned signal.
-        weight: factor of the learned signal [batch], 0 to 1; None: 1.
-        signal: learned signal without its unit (`Graph.learned`); None: it is evaluated.
-    """
-
-    condition: Any
-    slots: Any
-    receiver: Any
-    pose: Pose
-    plane: Plane
-    weight: Any | None = None
-    carrier: Any | None = None
-    signal: Complex | None = None
+    condition: Any  # positions [3, batch], metres, or features [features, batch] in their place
+    slots: Any  # rows of the traced side [batch]
+    receiver: Any  # number of the receiver, from 0
+    pose: Pose  # pose of the receiver
+    plane: Plane  # directions of the learned signal
+    weight: Any | None = None  # factor of the learned signal [batch], 0 to 1; None: 1
+    carrier: Any | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
+    signal: Complex | None = None  # learned signal without its unit (`Graph.learned`); None: it is evaluated
 
 
-Alone = Literal["traced", "learned"]
-"""Component reported alone: traced or learned."""
+Alone = Literal["traced", "learned"]  # component reported alone: traced or learned
 Report = Callable[[Mapping[str, Any], Batch], Any]
 """``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
 

@@ -21,12 +21,9 @@ from ..core.registry import Registry
 from ..receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from ..receivers.reports import LEAST_POWER
 
-ENTRY_POINTS = "wrf_mi.receivers"
-"""Group of entry points of receiver models."""
-PIXEL = "pixel"
-"""The receiver model of the papers."""
-AUTO = "auto"
-"""The setting that leaves the choice to the task."""
+ENTRY_POINTS = "wrf_mi.receivers"  # group of entry points of receiver models
+PIXEL = "pixel"  # the receiver model of the papers
+AUTO = "auto"  # the setting that leaves the choice to the task
 
 
 class ReceiverModel(Protocol):
@@ -189,8 +186,7 @@ _BUILT_IN = (
     ReceiverKind("csi", ("csi",), _csi, levels=True, complex_valued=True),
 )
 _RECEIVERS = Registry[ReceiverKind]("receiver model", ENTRY_POINTS, {kind.name: kind for kind in _BUILT_IN})
-RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS
-"""All receiver models by name."""
+RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS  # all receiver models by name
 
 
 def register(kind: ReceiverKind) -> None:

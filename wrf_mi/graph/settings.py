@@ -10,8 +10,7 @@ from pydantic import Field
 from ..core.settings import Positive, ShareBelow1
 from ..tracing.options import DISC, MAX_DEGREE, SpecularOptions
 
-EvaluationName = Literal["splatted", "traced"]
-"""Evaluations of Gaussians (`wrf_mi.graph.evaluations`)."""
+EvaluationName = Literal["splatted", "traced"]  # evaluations of Gaussians (`wrf_mi.graph.evaluations`)
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.", "surface.")

@@ -22,10 +22,8 @@ ComplexArray = NDArray[np.complex128]
 TABLE_BYTES = 1 << 25
 """Largest table of responses; 360 x 90 directions of a 4 x 4 array take 8 MB. `KEPT_TABLES` are kept between calls."""
 KEPT_TABLES = 4
-CHUNK_SIZE = 16
-"""Signals whose spectra are computed together."""
-LINES_FROM = 64
-"""Number of elements from which a planar grid is summed line by line."""
+CHUNK_SIZE = 16  # signals whose spectra are computed together
+LINES_FROM = 64  # number of elements from which a planar grid is summed line by line
 MIRRORED, ALIGNED = 1e-6, 1e-9
 """Distances within which positions are opposite or on one line, as shares of the array's extent."""
 

@@ -28,20 +28,15 @@ class TracedPaths:
     """Paths to a receiver as differentiable arrays: ``each`` for every transmitter of the batch.
 
     Arrays are float64, with the transmitter as the slowest index; place holders of gain zero fill missing paths.
-
-    Attributes:
-        gain: complex gain of free-space loss, interactions, antennas and instrument, without exp(-j k length).
-        length_m: unfolded length, metres.
-        arrival: unit vectors towards the incoming wave, receiver's frame.
-        batch: number of transmitters.
-        each: number of paths of each transmitter, place holders included.
     """
 
-    gain: Complex  # two float arrays [batch * each]
-    length_m: Any  # float [batch * each]
-    arrival: Vector  # three float arrays [batch * each]
-    batch: int
-    each: int
+    # complex gain of free-space loss, interactions, antennas and instrument, without exp(-j k length); two float
+    # arrays [batch * each]
+    gain: Complex
+    length_m: Any  # unfolded length, metres; float [batch * each]
+    arrival: Vector  # unit vectors towards the incoming wave, receiver's frame; three float arrays [batch * each]
+    batch: int  # number of transmitters
+    each: int  # number of paths of each transmitter, place holders included
 
     @property
     def power(self) -> Any:

@@ -28,8 +28,7 @@ from ..core.types import IntArray
 
 SAME_LAG = 1e-6
 """Differences closer than this share of the array's extent are one lag: positions in files have six digits."""
-LEAST_CONDITION = 1e-7
-"""Singular values below this share of the greatest: the directions do not distinguish the lags."""
+LEAST_CONDITION = 1e-7  # singular values below this share of the greatest: the directions do not distinguish the lags
 
 
 class Lags:

@@ -16,12 +16,9 @@ from ..core.angles import FloatArray
 
 SQUARED_MAGNITUDE_EPS = 1e-8
 """Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
-LEAST_POWER = 1e-20
-"""Constant added to a power before its logarithm in a fit: the lowest report is -200 dB."""
-SILENCE = 4 * LEAST_POWER
-"""Power up to which nothing arrives in a fit: above the constants that are added to powers."""
-FLOOR_DB = 1e-3
-"""Distance from the floor up to which a report is the floor, dB: rounding to single precision."""
+LEAST_POWER = 1e-20  # constant added to a power before its logarithm in a fit: the lowest report is -200 dB
+SILENCE = 4 * LEAST_POWER  # power up to which nothing arrives in a fit: above the constants that are added to powers
+FLOOR_DB = 1e-3  # distance from the floor up to which a report is the floor, dB: rounding to single precision
 
 
 def strength_db(power: Any, floor: Any = math.nan, least: float = 0.0) -> Any:

@@ -30,39 +30,25 @@ from .lags import Lags
 
 ComplexArray = NDArray[np.complex128]
 
-STARTS = 200
-"""Random starts for one spectrum at most; half of 160 measured spectra needed 5 or fewer, the slowest 76."""
-GOOD_ENOUGH = 4.0
-"""A start has converged when its residual is at most this many times that of the grey levels."""
-STEPS = 120
-"""Steps of one start; starts that converge take 20 to 60."""
-TOGETHER = 64
-"""Spectra whose starts take their steps together."""
+STARTS = 200  # random starts for one spectrum at most; half of 160 measured spectra needed 5 or fewer, the slowest 76
+GOOD_ENOUGH = 4.0  # a start has converged when its residual is at most this many times that of the grey levels
+STEPS = 120  # steps of one start; starts that converge take 20 to 60
+TOGETHER = 64  # spectra whose starts take their steps together
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e6
 """Damping of the first step, the smallest, and the one at which a descent ends, relative to the diagonal."""
-SOFTER, HARDER = 5.0, 4.0
-"""Factors of the damping after a step that decreased the cost, and after another."""
-CONVERGED = 1e-7
-"""Relative decrease of the cost below which a start has converged: grey levels leave far more."""
-LEVELS = 255
-"""Highest grey level; digits below a level are cut off."""
+SOFTER, HARDER = 5.0, 4.0  # factors of the damping after a step that decreased the cost, and after another
+CONVERGED = 1e-7  # relative decrease of the cost below which a start has converged: grey levels leave far more
+LEVELS = 255  # highest grey level; digits below a level are cut off
 
 
 @dataclass(frozen=True)
 class Unscaled:
-    """Spectra before their minimum was subtracted, in units of each spectrum's range.
+    """Spectra before their minimum was subtracted, in units of each spectrum's range."""
 
-    Attributes:
-        squared: squared magnitudes [n, height, width].
-        lowest: c, the magnitude that became 0, over the range that became 1, [n].
-        residual: root mean square over pixels of the part outside the span of the array's lags, [n].
-        rounding: the residual that the grey levels alone explain, [n].
-    """
-
-    squared: FloatArray
-    lowest: FloatArray
-    residual: FloatArray
-    rounding: FloatArray
+    squared: FloatArray  # squared magnitudes [n, height, width]
+    lowest: FloatArray  # c, the magnitude that became 0, over the range that became 1, [n]
+    residual: FloatArray  # root mean square over pixels of the part outside the span of the array's lags, [n]
+    rounding: FloatArray  # the residual that the grey levels alone explain, [n]
 
 
 def unscale(grey: ArrayLike, lags: Lags) -> Unscaled:
@@ -97,16 +83,12 @@ def unscale(grey: ArrayLike, lags: Lags) -> Unscaled:
 
 @dataclass(frozen=True)
 class Retrieved:
-    """Element signals of spectra.
+    """Element signals of spectra."""
 
-    Attributes:
-        signals: [n, m], each row up to a common phase (and the exchange with its mirror image).
-        residual: root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n].
-        explained: whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot.
-    """
-
-    signals: ComplexArray
+    signals: ComplexArray  # [n, m], each row up to a common phase (and the exchange with its mirror image)
+    # root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n]
     residual: FloatArray
+    # whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot
     explained: NDArray[np.bool_]
 
 

@@ -14,8 +14,7 @@ from ..core import Paths
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 
-SURE = 1e-12
-"""Concentrations of azimuths above 1 - SURE count as 1: rounding of float64."""
+SURE = 1e-12  # concentrations of azimuths above 1 - SURE count as 1: rounding of float64
 
 
 @dataclass(frozen=True)

@@ -40,40 +40,26 @@ STEEPEST = 0.95  # largest q that is extrapolated; a series with a larger one do
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting that was tried.
+    """A setting that was tried."""
 
-    Attributes:
-        part: depth, rays, diffraction or scattering.
-        value: the setting's value.
-        change_db: largest change against the previous setting, of power or of a spectrum; None for the first.
-        kept: whether the setting was taken.
-        spectrum: largest change of a reported spectrum, relative L2; None for the first, and without spectra.
-    """
-
-    part: str
-    value: int | bool
+    part: str  # depth, rays, diffraction or scattering
+    value: int | bool  # the setting's value
+    # largest change against the previous setting, of power or of a spectrum; None for the first
     change_db: float | None
-    kept: bool
+    kept: bool  # whether the setting was taken
+    # largest change of a reported spectrum, relative L2; None for the first, and without spectra
     spectrum: float | None = None
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Chosen options and their estimated error.
+    """Chosen options and their estimated error."""
 
-    Attributes:
-        options: the chosen options.
-        target_db: requested error.
-        error_db: estimated error: the sum of the parts' remainders.
-        trials: all settings that were tried, in order.
-        judged_by: power, or power and spectrum.
-    """
-
-    options: TraceOptions
-    target_db: float
-    error_db: float
-    trials: tuple[Trial, ...]
-    judged_by: tuple[str, ...] = ("power",)
+    options: TraceOptions  # the chosen options
+    target_db: float  # requested error
+    error_db: float  # estimated error: the sum of the parts' remainders
+    trials: tuple[Trial, ...]  # all settings that were tried, in order
+    judged_by: tuple[str, ...] = ("power",)  # power, or power and spectrum
 
     @property
     def spectrum_error(self) -> float | None:

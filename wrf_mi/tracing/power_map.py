@@ -195,11 +195,7 @@ def _means_outside(
 
 
 def _power_dbm(
-    prepared: Prepared,
-    tx_pos_m: FloatArray,
-    receivers: Sequence[Receiver],
-    options: TraceOptions,
-    tx_antenna: Antenna,
+    prepared: Prepared, tx_pos_m: FloatArray, receivers: Sequence[Receiver], options: TraceOptions, tx_antenna: Antenna
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
@@ -207,11 +203,7 @@ def _power_dbm(
 
 
 def traced_powers(
-    prepared: Prepared,
-    tx_pos_m: FloatArray,
-    receivers: Sequence[Receiver],
-    options: TraceOptions,
-    tx_antenna: Antenna,
+    prepared: Prepared, tx_pos_m: FloatArray, receivers: Sequence[Receiver], options: TraceOptions, tx_antenna: Antenna
 ) -> FloatArray:
     """Received powers of `_power_dbm`, kept in the user's cache."""
     # The key holds all that determines the powers, code and versions included; a stale file is never read.

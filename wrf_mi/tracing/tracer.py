@@ -61,11 +61,7 @@ class RayTracer:
         self._prepared = Prepared(self.scene)
 
     def trace(
-        self,
-        tx_pos_m: ArrayLike,
-        progress: bool = False,
-        first_row: int = 0,
-        carriers_hz: FloatArray | None = None,
+        self, tx_pos_m: ArrayLike, progress: bool = False, first_row: int = 0, carriers_hz: FloatArray | None = None
     ) -> TraceResult:
         """Paths from transmitter positions to all receivers.
 
@@ -119,15 +115,10 @@ class RayTracer:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets of traced signal strengths.
+    """Offsets of traced signal strengths."""
 
-    Attributes:
-        offset_db: offset of each receiver, shape [n_rx].
-        floor_dbm: weakest measured signal of each receiver, shape [n_rx], the report where no path arrives.
-    """
-
-    offset_db: FloatArray
-    floor_dbm: FloatArray
+    offset_db: FloatArray  # offset of each receiver, shape [n_rx]
+    floor_dbm: FloatArray  # weakest measured signal of each receiver, shape [n_rx], the report where no path arrives
 
     def __call__(self, traced_dbm: ArrayLike) -> FloatArray:
         """Traced signal strengths [n_rx, n] (dBm for 0 dBm sent, NaN without a path) on the receivers' scales."""

@@ -249,15 +249,10 @@ def _rounded(value: float) -> float:
 
 @dataclass(frozen=True)
 class MovedSearch:
-    """Where paths are searched for the scene as stated.
+    """Where paths are searched for the scene as stated."""
 
-    Attributes:
-        prepared: shared state of traces in the moved scene.
-        parameters: parameters of the traced fields, Dr.Jit tensors by name, used to prune weak paths.
-    """
-
-    prepared: Prepared
-    parameters: Mapping[str, Any]
+    prepared: Prepared  # shared state of traces in the moved scene
+    parameters: Mapping[str, Any]  # parameters of the traced fields, Dr.Jit tensors by name, used to prune weak paths
 
 
 def moved_search(

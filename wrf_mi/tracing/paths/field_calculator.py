@@ -38,40 +38,25 @@ Tables = tuple[Any, Any, Any, Any]
 
 @dataclass
 class Level:
-    """Interactions of q paths at the same depth; place holders where a path has fewer.
+    """Interactions of q paths at the same depth; place holders where a path has fewer."""
 
-    Attributes:
-        normal: unit normals of the planes, either sign, world frame; zeros for place holders.
-        offset_m: offsets n . x of the planes, metres.
-        reflects: mask of reflections.
-        transmits: mask of transmissions.
-        material: indices into `Tables`.
-        plane: indices into the scene's planes.
-    """
-
-    normal: Vector  # three float arrays [q]
-    offset_m: Any  # float [q]
-    reflects: Any  # mask [q]
-    transmits: Any  # mask [q]
-    material: Any  # unsigned integer [q]
-    plane: Any  # unsigned integer [q]
+    # unit normals of the planes, either sign, world frame; zeros for place holders; three float arrays [q]
+    normal: Vector
+    offset_m: Any  # offsets n . x of the planes, metres; float [q]
+    reflects: Any  # mask of reflections
+    transmits: Any  # mask of transmissions
+    material: Any  # indices into `Tables`; unsigned integer [q]
+    plane: Any  # indices into the scene's planes; unsigned integer [q]
 
 
 @dataclass
 class Chains:
-    """Chains of q paths from transmitters to one receiver.
+    """Chains of q paths from transmitters to one receiver."""
 
-    Attributes:
-        source_m: transmitter positions, world frame, metres.
-        heading: cosine and sine of the transmitters' yaw.
-        exists: 1 for a path, 0 for a place holder.
-        levels: interactions in the order from the transmitter.
-    """
-
-    source_m: Vector  # three float arrays [q]
-    heading: Complex  # two float arrays [q]
-    exists: Any  # float [q]
-    levels: list[Level]  # [depth]
+    source_m: Vector  # transmitter positions, world frame, metres; three float arrays [q]
+    heading: Complex  # cosine and sine of the transmitters' yaw; two float arrays [q]
+    exists: Any  # 1 for a path, 0 for a place holder; float [q]
+    levels: list[Level]  # interactions in the order from the transmitter; [depth]
 
     def select(self, index: Any) -> Chains:
         """Select the paths of an unsigned integer array of indices."""

@@ -27,8 +27,7 @@ from ...backend.vectors import Complex, Float64, Pose, Vector, complex_exponenti
 from ...core import Receiver
 from ...core.angles import FloatArray
 
-TX_PATTERN = "pattern.transmitter"
-"""Name of the parameter [2, c] of the transmitters' pattern."""
+TX_PATTERN = "pattern.transmitter"  # name of the parameter [2, c] of the transmitters' pattern
 
 
 def gain_name(receiver: Receiver) -> str:

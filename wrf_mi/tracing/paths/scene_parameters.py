@@ -41,20 +41,15 @@ from .field_calculator import Level
 
 LEAST_SUSCEPTIBILITY = 1e-3
 """Start of permittivity - 1 for materials of permittivity 1 (metal, air), whose logarithm has no derivative."""
-LEAST_CONDUCTIVITY = 1e-6
-"""Start of the conductivity of lossless materials, S/m."""
+LEAST_CONDUCTIVITY = 1e-6  # start of the conductivity of lossless materials, S/m
 
 PREFIX, EXPONENT = "material.", "exponent"
-SURFACE = "surface"
-"""In place of a material's name: parameters [n] of all surfaces."""
-QUANTITIES = ("permittivity", "conductivity", "thickness", EXPONENT)
-"""Constants of a material that may be parameters."""
-TRAINED = QUANTITIES[:2]
-"""Those that are by default."""
+SURFACE = "surface"  # in place of a material's name: parameters [n] of all surfaces
+QUANTITIES = ("permittivity", "conductivity", "thickness", EXPONENT)  # constants of a material that may be parameters
+TRAINED = QUANTITIES[:2]  # those that are by default
 LEAST = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
 """Least value of the constants whose parameter is the logarithm of what they are above it."""
-COLUMNS = (*QUANTITIES, "reflected")
-"""Constants of `SlabMaterials`, each an array."""
+COLUMNS = (*QUANTITIES, "reflected")  # constants of `SlabMaterials`, each an array
 MaterialGrouping = Literal["named", "surface"]
 """Whether each named material, or each surface, has a permittivity and a conductivity."""
 SHIFT, TILT = "plane.shift", "plane.tilt"
@@ -68,25 +63,15 @@ def name_of(material: str, quantity: str) -> str:
 
 @dataclass(frozen=True)
 class SlabMaterials:
-    """The n stated materials of a scene, with the constants that are not parameters.
+    """The n stated materials of a scene, with the constants that are not parameters."""
 
-    Attributes:
-        names: names in the scene; of surfaces ``<object>/<plane>``, the plane's number in `Surfaces`.
-        permittivity: relative, shape [n].
-        conductivity: S/m, shape [n].
-        thickness: thickness of the slab that stands for a surface, metres, shape [n].
-        exponent: exponent of the frequency in the conductivity, shape [n].
-        reflected: share of the reflected amplitude that is not scattered, shape [n].
-        grouping: parameters are [1] for each named material, or [n] for all surfaces.
-    """
-
-    names: tuple[str, ...]
-    permittivity: FloatArray
-    conductivity: FloatArray
-    thickness: FloatArray
-    exponent: FloatArray
-    reflected: FloatArray
-    grouping: MaterialGrouping = "named"
+    names: tuple[str, ...]  # names in the scene; of surfaces ``<object>/<plane>``, the plane's number in `Surfaces`
+    permittivity: FloatArray  # relative, shape [n]
+    conductivity: FloatArray  # S/m, shape [n]
+    thickness: FloatArray  # thickness of the slab that stands for a surface, metres, shape [n]
+    exponent: FloatArray  # exponent of the frequency in the conductivity, shape [n]
+    reflected: FloatArray  # share of the reflected amplitude that is not scattered, shape [n]
+    grouping: MaterialGrouping = "named"  # parameters are [1] for each named material, or [n] for all surfaces
 
     def select(self, slabs: IntArray) -> SlabMaterials:
         """Materials by their numbers, in that order."""
@@ -199,19 +184,12 @@ def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -
 
 @dataclass
 class PlaneTables:
-    """Stated planes of a scene, float64 arrays [q] on the device.
+    """Stated planes of a scene, float64 arrays [q] on the device."""
 
-    Attributes:
-        normal: unit normals, three arrays [q].
-        offset_m: n . x, metres, [q].
-        centre_m: centres of the tilts, metres, three arrays [q].
-        axes: two unit vectors in each plane, three arrays [q] each.
-    """
-
-    normal: Vector
-    offset_m: Any
-    centre_m: Vector
-    axes: list[Vector]
+    normal: Vector  # unit normals, three arrays [q]
+    offset_m: Any  # n . x, metres, [q]
+    centre_m: Vector  # centres of the tilts, metres, three arrays [q]
+    axes: list[Vector]  # two unit vectors in each plane, three arrays [q] each
 
     @classmethod
     def of(cls, surfaces: Surfaces, planes: IntArray | slice = slice(None)) -> PlaneTables:
@@ -260,19 +238,12 @@ class PlaneTables:
 
 @dataclass(frozen=True)
 class SceneTables:
-    """Stated materials and planes.
+    """Stated materials and planes."""
 
-    Attributes:
-        slabs: materials, or those of each surface.
-        slab_of_face: index of the material of each face [f], -1 where it is no slab.
-        constants: `SlabMaterials.constants`.
-        planes: planes on the device.
-    """
-
-    slabs: SlabMaterials
-    slab_of_face: IntArray
-    constants: dict[str, Any]
-    planes: PlaneTables
+    slabs: SlabMaterials  # materials, or those of each surface
+    slab_of_face: IntArray  # index of the material of each face [f], -1 where it is no slab
+    constants: dict[str, Any]  # `SlabMaterials.constants`
+    planes: PlaneTables  # planes on the device
 
     @classmethod
     def of(cls, scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> SceneTables:

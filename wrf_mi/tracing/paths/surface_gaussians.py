@@ -29,29 +29,20 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..options import DISC, FACTOR
 
-NEAREST = 6
-"""Gaussians that change one interaction."""
-SIZE = 0.75
-"""Standard deviation of a Gaussian in the plane, as a share of the spacing."""
-EXTENT = 4.0
-"""Distance in standard deviations beyond which a Gaussian does not count: its weight is below 4e-4."""
-LEAST_POINTS = 4
-"""Fewest interactions of training paths in a cell of the lattice that gets a Gaussian."""
+NEAREST = 6  # gaussians that change one interaction
+SIZE = 0.75  # standard deviation of a Gaussian in the plane, as a share of the spacing
+EXTENT = 4.0  # distance in standard deviations beyond which a Gaussian does not count: its weight is below 4e-4
+LEAST_POINTS = 4  # fewest interactions of training paths in a cell of the lattice that gets a Gaussian
 SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99
 """Largest distance along the normal, and smallest cosine between normals, of a plane that scans find twice."""
 
 
 @dataclass(frozen=True)
 class Interactions:
-    """Interactions of paths with surfaces.
+    """Interactions of paths with surfaces."""
 
-    Attributes:
-        position_m: points [m, 3], world frame, metres.
-        normal: unit normals of the planes, either sign, [m, 3].
-    """
-
-    position_m: FloatArray
-    normal: FloatArray
+    position_m: FloatArray  # points [m, 3], world frame, metres
+    normal: FloatArray  # unit normals of the planes, either sign, [m, 3]
 
     @classmethod
     def joined(cls, parts: list[Interactions]) -> Interactions:
@@ -61,15 +52,10 @@ class Interactions:
 
 @dataclass(frozen=True)
 class SurfaceGaussians:
-    """Flat Gaussians on surfaces.
+    """Flat Gaussians on surfaces."""
 
-    Attributes:
-        discs: centres in metres and unit normals (`DISC`), [6, g].
-        size_m: standard deviation s in the plane, metres.
-    """
-
-    discs: FloatArray
-    size_m: float
+    discs: FloatArray  # centres in metres and unit normals (`DISC`), [6, g]
+    size_m: float  # standard deviation s in the plane, metres
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -129,17 +115,11 @@ class SurfaceGaussians:
 
 @dataclass
 class PathWeights:
-    """Weights of surface Gaussians for q paths, on the device.
+    """Weights of surface Gaussians for q paths, on the device."""
 
-    Attributes:
-        index: numbers of Gaussians, `each` for a path in turn, [q * each].
-        weight: their weights w_g, [q * each].
-        each: largest number of Gaussians of a path.
-    """
-
-    index: Any
-    weight: Any
-    each: int
+    index: Any  # numbers of Gaussians, `each` for a path in turn, [q * each]
+    weight: Any  # their weights w_g, [q * each]
+    each: int  # largest number of Gaussians of a path
 
     @classmethod
     def of(cls, gaussians: SurfaceGaussians, met: Interactions, path: IntArray, count: int) -> PathWeights:

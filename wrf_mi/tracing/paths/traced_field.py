@@ -37,44 +37,30 @@ from ..search.legs import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
 from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths
-from .instrument_parameters import (
-    gain_name,
-    instrument_parameters,
-    moved_m,
-    receiver_pose,
-    spread_pose,
-    with_antennas,
-)
+from .instrument_parameters import gain_name, instrument_parameters, moved_m, receiver_pose, spread_pose, with_antennas
 from .result import TraceResult, without_faint
 from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
 from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
 
-SINGLE = 16
-"""Numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all."""
+SINGLE = 16  # numbers of paths of a field's only transmitter are multiples of this, so that few recordings serve all
 
 
 @dataclass(frozen=True)
 class TracedOptions:
-    """Options of a traced field.
+    """Options of a traced field."""
 
-    Attributes:
-        trace: options of the search, without diffraction and scattering, whose fields have no derivative here.
-        pattern_degree: degree of the trainable factors of both antennas' patterns, 0 for none.
-        tx_antenna: antenna of the transmitters, which turns with their heading.
-        materials: whether each named material has parameters, or each surface, started from its named material.
-        planes: whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`).
-        faint: the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search,
-            add up to less than this share of the amplitudes of all; 0: none.
-        constants: constants of materials that are parameters, of `wrf_mi.tracing.paths.scene_parameters.QUANTITIES`.
-    """
-
+    # options of the search, without diffraction and scattering, whose fields have no derivative here
     trace: TraceOptions = field(default_factory=TraceOptions)
-    pattern_degree: int = 0
-    tx_antenna: Antenna = ANTENNA
+    pattern_degree: int = 0  # degree of the trainable factors of both antennas' patterns, 0 for none
+    tx_antenna: Antenna = ANTENNA  # antenna of the transmitters, which turns with their heading
+    # whether each named material has parameters, or each surface, started from its named material
     materials: MaterialGrouping = "named"
-    planes: bool = False
+    planes: bool = False  # whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`)
+    # the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search, add up
+    # to less than this share of the amplitudes of all; 0: none
     faint: float = 0.0
+    # constants of materials that are parameters, of `wrf_mi.tracing.paths.scene_parameters.QUANTITIES`
     constants: tuple[str, ...] = TRAINED
 
     def __post_init__(self) -> None:

@@ -36,17 +36,11 @@ _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 @dataclass(frozen=True)
 class ReflectionChains:
-    """Sequences of reflecting planes seen from sources; c chains.
+    """Sequences of reflecting planes seen from sources; c chains."""
 
-    Attributes:
-        plane: planes in their order from the source, shape [c, depth], -1 beyond the last.
-        image: images of the source after each reflection, shape [c, depth, 3], metres, float64.
-        source: number of the source of each chain, shape [c].
-    """
-
-    plane: IntArray
-    image: FloatArray
-    source: IntArray
+    plane: IntArray  # planes in their order from the source, shape [c, depth], -1 beyond the last
+    image: FloatArray  # images of the source after each reflection, shape [c, depth, 3], metres, float64
+    source: IntArray  # number of the source of each chain, shape [c]
 
     def __len__(self) -> int:
         """Number of chains."""

@@ -70,11 +70,7 @@ def meeting_point(
 
 
 def specular_paths(
-    surfaces: Surfaces,
-    chains: ReflectionChains,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
-    options: TraceOptions,
+    surfaces: Surfaces, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
 ) -> Legs:
     """Every unobstructed path from sources [s, 3] to targets [n, 3], metres, by the reflections of chains from these
     sources.

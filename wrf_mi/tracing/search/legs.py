@@ -18,23 +18,18 @@ ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability
 
 @dataclass(frozen=True)
 class Legs:
-    """Interactions of p paths from source to target, the input of Sionna RT's stages.
+    """Interactions of p paths from source to target, the input of Sionna RT's stages."""
 
-    Attributes:
-        source, target: indices of the points that each path joins, shape [p].
-        interactions: ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last.
-        face: index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last.
-        vertices_m: interaction points [p, depth, 3], metres, NaN beyond the last.
-        probability: probability of the interaction in a random search, shape [p, depth]; 1 in an exhaustive one.
-        wedge: edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction.
-    """
-
-    source: IntArray
-    target: IntArray
+    source: IntArray  # indices of the points that each path joins, shape [p]
+    target: IntArray  # indices of the points that each path joins, shape [p]
+    # ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last
     interactions: NDArray[np.uint8]
+    # index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last
     face: IntArray
-    vertices_m: FloatArray
+    vertices_m: FloatArray  # interaction points [p, depth, 3], metres, NaN beyond the last
+    # probability of the interaction in a random search, shape [p, depth]; 1 in an exhaustive one
     probability: NDArray[np.float32]
+    # edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction
     wedge: dict[str, NDArray[Any]]
 
     def __len__(self) -> int:

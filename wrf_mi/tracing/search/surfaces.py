@@ -52,34 +52,20 @@ infinity."""
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Faces of all objects, and their planes; f faces, q planes, b objects.
+    """Faces of all objects, and their planes; f faces, q planes, b objects."""
 
-    Attributes:
-        names: names of the objects.
-        shape_ids: Mitsuba's registry index of each object's mesh, shape [b].
-        first_face: index of each object's first face, shape [b + 1]; face = first_face[object] + primitive.
-        triangles: corners of the faces [f, 3, 3], metres.
-        plane: plane of each face, shape [f].
-        normal: unit normals [q, 3].
-        offset: n . x of each plane, shape [q], metres.
-        face: largest face of each plane, shape [q].
-        axes: two unit vectors in each plane [q, 2, 3].
-        low, high: bounds of the plane's faces along ``axes``, shape [q, 2], metres.
-        files: name of each object's mesh file, "" for none; empty without files.
-    """
-
-    names: tuple[str, ...]
-    shape_ids: NDArray[np.uint32]
-    first_face: IntArray
-    triangles: FloatArray
-    plane: IntArray
-    normal: FloatArray
-    offset: FloatArray
-    face: IntArray
-    axes: FloatArray
-    low: FloatArray
-    high: FloatArray
-    files: tuple[str, ...] = ()
+    names: tuple[str, ...]  # names of the objects
+    shape_ids: NDArray[np.uint32]  # Mitsuba's registry index of each object's mesh, shape [b]
+    first_face: IntArray  # index of each object's first face, shape [b + 1]; face = first_face[object] + primitive
+    triangles: FloatArray  # corners of the faces [f, 3, 3], metres
+    plane: IntArray  # plane of each face, shape [f]
+    normal: FloatArray  # unit normals [q, 3]
+    offset: FloatArray  # n . x of each plane, shape [q], metres
+    face: IntArray  # largest face of each plane, shape [q]
+    axes: FloatArray  # two unit vectors in each plane [q, 2, 3]
+    low: FloatArray  # bounds of the plane's faces along ``axes``, shape [q, 2], metres
+    high: FloatArray  # bounds of the plane's faces along ``axes``, shape [q, 2], metres
+    files: tuple[str, ...] = ()  # name of each object's mesh file, "" for none; empty without files
 
     @cached_property
     def digest(self) -> str:

@@ -42,19 +42,13 @@ UNKNOWN_FACE = (1 << 31) - 1  # face of a reflection that rays cannot distinguis
 
 
 class Met(NamedTuple):
-    """Paths and what they meet.
+    """Paths and what they meet."""
 
-    Attributes:
-        candidate: indices of the candidates that are paths [k].
-        interactions: ``InteractionType`` of each interaction from the source on [k, depth], 0 beyond the last.
-        face: faces [k, depth], -1 beyond the last.
-        points_m: points in single precision [k, depth, 3], metres, NaN beyond the last.
-    """
-
-    candidate: IntArray
+    candidate: IntArray  # indices of the candidates that are paths [k]
+    # ``InteractionType`` of each interaction from the source on [k, depth], 0 beyond the last
     interactions: NDArray[np.uint8]
-    face: IntArray
-    points_m: FloatArray
+    face: IntArray  # faces [k, depth], -1 beyond the last
+    points_m: FloatArray  # points in single precision [k, depth, 3], metres, NaN beyond the last
 
     def select(self, which: NDArray[Any]) -> Met:
         """The paths of a mask or of indices."""

@@ -39,15 +39,10 @@ direction from one to the other to 1e-3 rad."""
 
 @dataclass(frozen=True)
 class Devices:
-    """Sources or targets of a trace, for Sionna RT's field calculator.
+    """Sources or targets of a trace, for Sionna RT's field calculator."""
 
-    Attributes:
-        position_m: positions [n, 3], metres.
-        antennas: an antenna for each, or a common one.
-    """
-
-    position_m: FloatArray
-    antennas: tuple[MountedAntenna, ...]
+    position_m: FloatArray  # positions [n, 3], metres
+    antennas: tuple[MountedAntenna, ...]  # an antenna for each, or a common one
 
     @property
     def angles(self) -> FloatArray:
@@ -186,11 +181,7 @@ def sampled_paths(
 
 
 def field_of(
-    scene: Any,
-    buffer: Any,
-    ends: Ends,
-    rays: int,
-    loop_mode: Literal["symbolic", "evaluated"] = "symbolic",
+    scene: Any, buffer: Any, ends: Ends, rays: int, loop_mode: Literal["symbolic", "evaluated"] = "symbolic"
 ) -> tuple[Any, Any]:
     """Complex gains [p] of paths as Dr.Jit arrays, without the phase exp(-j k length).
 

@@ -29,10 +29,7 @@ HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
 
 
 def open_scene(
-    source: str | Path,
-    frequency_hz: float,
-    thickness_m: Mapping[str, float] | None = None,
-    material: str | None = None,
+    source: str | Path, frequency_hz: float, thickness_m: Mapping[str, float] | None = None, material: str | None = None
 ) -> Any:
     """Open a scene in Sionna RT at a carrier frequency.
 
