@@ -118,7 +118,12 @@ def correct_scene(
     held_out = _held_out(record, split)
     # Stages are fitted to some of the rows, and judged by the others.
     trial = traced.posterior(held_out.known, held_out.known_rows)
-    _check_paths(trial, f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
+    if not any(side.exists.any() for side in trial.misfit.sides):
+        raise InputError(f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
+    if not len(trial.free("+".join(trial.options.parts))):
+        raise InputError(
+            f"{record.name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
+        )
     judged = _judged_stages(trial, traced, held_out)
     units = ((stage, held_out.units(result.score)) for stage, result in judged.items())
     best_stage = last_gain(units, held_out.higher_is_better, confidence=CONFIDENCE)
@@ -132,12 +137,8 @@ def correct_scene(
         unseen = judged[best_stage].unseen
         before, after = held_out.vector_of(best, unseen), held_out.with_mean_gain(state.vector, final.misfit)
         data = CorrectionData(record.name, split.all_train, _error_ratio(unseen, before, final.misfit, after, left_out))
-    facts = {
-        "rows": len(split.all_train),
-        "held_out": len(held_out.rows),
-        "held_out_receivers": list(held_out.out),
-        "paths": len(final.misfit.paths.row),
-    }
+    facts: dict[str, Any] = {"rows": len(split.all_train), "held_out": len(held_out.rows)}
+    facts |= {"held_out_receivers": list(held_out.out), "paths": len(final.misfit.paths.row)}
     scores = {stage: result.score for stage, result in judged.items()}
     return Correction(state, deviation, scores, _kinds(scene), data, time.perf_counter() - begun, facts)
 
@@ -163,15 +164,6 @@ def _checked(
     rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:most]
     split = replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))
     return record, split, options
-
-
-def _check_paths(posterior: ScenePosterior, no_paths: str) -> None:
-    """Refuse a scene of which the rows tell nothing: without a path to a receiver, or to any surface."""
-    if not any(side.exists.any() for side in posterior.misfit.sides):
-        raise InputError(no_paths)
-    if not len(posterior.free("+".join(posterior.options.parts))):
-        name = posterior.misfit.record.name
-        raise InputError(f"{name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions")
 
 
 class _TracedScene:

@@ -113,17 +113,10 @@ def minimised(
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise of its beginning has it.
 
-    Args:
-        residual: residuals [rows, values] of parameters [p], model minus observation; NaN without observation.
-        jacobian: their derivatives by the free parameters [k, rows, values], or 0 without observation.
-        start: parameters [p].
-        free: indices [k] of the parameters that change.
-        prior: prior of these parameters.
-        steps: largest number of steps.
-        on_step: called with the number of a step, from 0, before it.
-
-    Returns:
-        Most probable parameters [p] and their residuals.
+    ``residual`` gives residuals [rows, values] of parameters [p], model minus observation, NaN without observation;
+    ``jacobian`` their derivatives [k, rows, values] by the entries ``free`` [k], whose prior is ``prior``, or 0 without
+    observation. ``on_step`` is called with the number of a step, from 0, before it. Returns the most probable
+    parameters [p] and their residuals.
     """
     vector, damping = np.array(start, float), FIRST_DAMPING
     present = residual(vector)
@@ -157,11 +150,7 @@ def posterior_covariance(
 ) -> FloatArray:
     """Covariance [p, p] of parameters: inverse of the Fisher information and the prior's precision.
 
-    Args:
-        derivative: derivatives [p, rows, values] at the solution.
-        residual: residuals [rows, values] there.
-        prior: prior of the parameters.
-        noise: noise of the solution.
+    Derivatives [p, rows, values] and residuals [rows, values] are those at the solution, as is the noise.
     """
     return np.asarray(np.linalg.inv(_normal(derivative, residual, noise)[0] + prior.precision), float)
 
@@ -171,14 +160,9 @@ def left_out_residuals(
 ) -> FloatArray:
     """Residuals [rows, values] of each row by a fit to the others, to first order; NaN without observation.
 
+    Derivatives [p, rows, values], residuals [rows, values], covariance [p, p] and noise are those of the solution.
     Source: the residual of a row over one minus its leverage, Cook and Weisberg, "Residuals and Influence in
     Regression" (1982), section 2.2; here of all values of a row.
-
-    Args:
-        derivative: derivatives [p, rows, values] at the solution.
-        residual: residuals [rows, values] there.
-        covariance: covariance [p, p] of the solution.
-        noise: noise of the solution.
     """
     left_out = np.full(residual.shape, np.nan)
     for row in np.flatnonzero(np.isfinite(residual).all(axis=1)):

@@ -129,15 +129,15 @@ class Misfit:
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
-        self.record, self.rows, self._traced = record, rows, options.traced
+        self.record, self.rows, self._traced, self._task = record, rows, options.traced, task_of(record)
         self.tables = prepared.tables(self._traced.materials)
         placed = placed_receivers(record, by_uplink=False)
         # Receivers without any observation are not traced: some hundred others may have heard these rows.
         known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
         numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in numbers]
-        shape = record.observation.shape[2:]
-        self._strides = [_stride(n, most) for n, most in zip(shape, LATTICE, strict=True)] if self._image else []
+        shape, is_image = record.observation.shape[2:], self._task.image
+        self._strides = [_stride(n, most) for n, most in zip(shape, LATTICE, strict=True)] if is_image else []
         self.ports = self._traced_ports(numbers, prepared, searched)
         self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
@@ -162,17 +162,13 @@ class Misfit:
             port.record(self._device(self.start))
 
     @property
-    def _image(self) -> bool:
-        return task_of(self.record).image
-
-    @property
     def sides(self) -> list[TracedField]:
         """Traced sides of the ports."""
         return [port.side for port in self.ports]
 
     def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: MovedSearch | None) -> list[_Port]:
         """Ports of the receivers, which have these numbers in the record."""
-        record, rows, task = self.record, self.rows, task_of(self.record)
+        record, rows, task = self.record, self.rows, self._task
         shape = tuple(map(int, record.observation.shape[2:]))
         complete = (shape[0], shape[1]) if task.image else (1, 1)
         size = tuple(n // stride for n, stride in zip(complete, self._strides or (1, 1), strict=True))
@@ -214,7 +210,7 @@ class Misfit:
         """Observations and their units [n_rx * rows], in which residuals are."""
         stored = self.record.observation[:, self.rows]
         count = stored.shape[0] * stored.shape[1]
-        if self._image:
+        if self._task.image:
             # A model's coarse image has its extremes on the lattice, not between, so the observed one is scaled there.
             coarse = minmax_scale(stored[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
             return coarse.reshape(count, -1), np.ones(count)
@@ -320,7 +316,7 @@ class Misfit:
 
     def scores(self, vector: FloatArray) -> FloatArray:
         """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""
-        task, params = task_of(self.record), self._device(vector)
+        task, params = self._task, self._device(vector)
         stored = self.record.observation[:, self.rows]
         stored = stored.reshape(-1, *stored.shape[2:])
         scores = np.full(len(stored), np.nan)
@@ -342,9 +338,7 @@ class Misfit:
         return np.concatenate([np.zeros(0, np.int64), *(np.arange(part.start, part.stop) for part in parts)])
 
     def counts(self) -> tuple[IntArray, IntArray]:
-        """Number of paths that each plane of ``planes`` reflects, and that meet each slab of ``slabs``, over all
-        receivers.
-        """
+        """Number of paths that each of `planes` reflects, and that meet each of `slabs`, over all receivers."""
         paths = self.paths
         reflecting, met = paths.plane[paths.reflects], paths.slab[paths.slab >= 0]
         return np.bincount(reflecting, minlength=len(self.planes)), np.bincount(met, minlength=len(self.slabs))

@@ -65,11 +65,7 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     shift_sd_m: Positive = 0.02
 
     def __post_init__(self) -> None:
-        """Check ranges and parts.
-
-        Raises:
-            InputError: a number out of range, no part or an unknown one.
-        """
+        """Check ranges and parts; `InputError` for a number out of range, no part or an unknown one."""
         super().__post_init__()
         if unknown := [part for part in self.parts if part not in PARTS]:
             raise InputError(f"correct: {unknown[0]!r} is not a part; choose of {', '.join(PARTS)}")

@@ -46,33 +46,22 @@ CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OU
 
 
 def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:
-    """Write a corrected scene and its page atomically.
-
-    Args:
-        correction: from `wrf_mi.correction.correct_scene`.
-        folder: the new scene folder.
-        replace: replace an existing folder.
-
-    Returns:
-        The content of ``correction.json``.
+    """Write a corrected scene and its page atomically as a new scene folder; returns what its JSON file holds.
 
     Raises:
-        InputError: a folder that exists or cannot be written, or no surface is left.
+        InputError: a folder that exists and is not to be replaced, or cannot be written, or no surface is left.
     """
     facts, state = _facts(correction), correction.state
     with atomic_folder(Path(folder), replace=replace) as part:
-        write_corrected_scene(
-            part,
-            correction.misfit.sides[0].scene,
-            state.scene_parameters(),
-            grouping="surface",
-            kinds=correction.kinds,
-            absent=state.absent(),
-            replace=True,
-        )
+        opened, parameters = correction.misfit.sides[0].scene, state.scene_parameters()
+        how: dict[str, Any] = {"kinds": correction.kinds, "absent": state.absent(), "replace": True}
+        write_corrected_scene(part, opened, parameters, grouping="surface", **how)
         plain = json.dumps(facts, indent=1, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
         write_atomically(part / FILE, plain + "\n")
-        write_atomically(part / PAGE, _text(correction, facts))
+        lines = [*_scores_text(correction, facts), *_frame_text(facts["frame"])]
+        lines += _planes_text(facts["planes"]) if correction.kept else []
+        lines += [*_materials_text(correction, facts["materials"]), *_limits_text(facts), ""]
+        write_atomically(part / PAGE, "\n".join(lines))
         write_figure(part / PICTURE, _picture(correction, facts))
     return facts
 
@@ -190,20 +179,6 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
         "rotation_mrad": motion[3:].tolist(),
         "rotation_sd_mrad": sd[3:].tolist(),
     }
-
-
-def _text(correction: Correction, facts: dict[str, Any]) -> str:
-    """The page as Markdown."""
-    return "\n".join(
-        [
-            *_scores_text(correction, facts),
-            *_frame_text(facts["frame"]),
-            *(_planes_text(facts["planes"]) if correction.kept else []),
-            *_materials_text(correction, facts["materials"]),
-            *_limits_text(facts),
-            "",
-        ]
-    )
 
 
 def _table(header: str, kinds: str, rows: Iterable[Sequence[str]]) -> list[str]:

@@ -102,9 +102,7 @@ class PathSum:
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
-        """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths by materials and
-        gains.
-        """
+        """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths without planes."""
         task, models = task_of(misfit.record), [port.model for port in misfit.ports]
         gains = {port.side.gain_name for port in misfit.ports}
         carriers = len(models) // len(misfit.receivers)
@@ -116,7 +114,7 @@ class PathSum:
         if others or moved or len(gains) * carriers < len(models):
             return False
         if task.in_decibel:
-            return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
+            return all(isinstance(model, PowerReceiver) for model in models)
         if task.image:
             arrays = [m for m in models if isinstance(m, ArrayReceiver) and m.instrument_scale]
             sizes, count = {len(m.elements_m) for m in arrays}, len(misfit.paths.row)
@@ -189,8 +187,9 @@ class PathSum:
         self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
 
     def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
-        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; those by materials are
-        differences over `STEP`.
+        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received.
+
+        Those by materials are differences over `STEP`.
         """
         touched, waves = self._changed(vector[None])
         present, total = self._waves.copy(), self._total.copy()

@@ -96,8 +96,9 @@ class State:
         return replace(self, vector=vector, noise=Noise.of(residual))
 
     def scene_parameters(self) -> dict[str, FloatArray]:
-        """Parameters by name for all planes and surfaces of the scene: planes that no path meets move with the frame,
-        their materials are as stated.
+        """Parameters by name for all planes and surfaces of the scene.
+
+        Planes that no path meets move with the frame; their materials are as stated.
         """
         misfit, parameters = self.posterior.misfit, self.posterior.misfit.of_scene(self.vector)
         if self._moves_frame:
@@ -126,9 +127,7 @@ class State:
         return frozenset(misfit.slabs[sorted(thin | supposed)].tolist())
 
     def uncertainty(self) -> tuple[FloatArray, FloatArray]:
-        """Standard deviations of the free entries, and residuals [n_rx * rows, values] of each row by a fit to the
-        others (`left_out_residuals`).
-        """
+        """Standard deviations of the free entries, and `left_out_residuals` [n_rx * rows, values]."""
         free, misfit = self.free, self.posterior.misfit
         residual = misfit.residual(self.vector)
         derivative = near(misfit, self.vector).jacobian(self.vector, free)
@@ -297,12 +296,8 @@ def scene_entries(planes: IntArray, count: int) -> IntArray:
 def rigid_motion(surfaces: Surfaces, change: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rigid motion that is nearest to shifts and tilts of planes, and its standard deviations, [6] each.
 
-    Args:
-        surfaces: surfaces with q planes.
-        change: shifts [q] in metres, then tilts [q, 2] in rad row by row.
-        precision: inverse variance of each entry [3 q].
-
-    Motions that no plane fixes, such as along a corridor, are 0 with an infinite standard deviation.
+    ``change`` [3 q] are shifts of the q planes in metres, then tilts in rad row by row, and ``precision`` the inverse
+    variances of each. Motions that no plane fixes, such as along a corridor, are 0 with an infinite standard deviation.
     """
     motions = rigid_motions(surfaces)
     information = motions.T @ (precision[:, None] * motions)

@@ -309,7 +309,9 @@ class _Blend(dr.CustomOp):
 def blend(
     footprints: Footprints, signal: list[Any], lists: TileLists, plane: Plane, batch: int, blending: list[Any]
 ) -> tuple[Any, Any]:
-    """Received complex signal of each pixel.
+    """Received complex signal of each pixel: real and imaginary part, [batch * height * width], row-major.
+
+    Differentiable in footprints, signal and ``blending``.
 
     Args:
         footprints: footprints of ``batch * n`` Gaussians, or of n that all transmitters share.
@@ -319,10 +321,6 @@ def blend(
         batch: number of transmitters.
         blending: one array of opacities in [0, 1) (alpha blending), or real and imaginary part of delta, |delta| < 1
             (product blending), as many numbers as footprints.
-
-    Returns:
-        Real and imaginary part of R, arrays [batch * height * width], row-major. Differentiable in
-        footprints, signal and ``blending``.
     """
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)
@@ -333,15 +331,9 @@ def blend(
 
 
 def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
-    """Received complex signal per direction for each transmitter of the batch.
+    """Complex signal that a receiver gets from each direction of a plane, for each transmitter of the batch.
 
-    Args:
-        gaussians: Gaussians of one field for ``batch`` transmitters.
-        pose: pose of the receiver.
-        plane: the receiver's perception plane, see `wrf_mi.gaussians.tiles.perception_plane`.
-
-    Returns:
-        Real and imaginary part, arrays [batch * height * width], row-major.
+    Returns real and imaginary part, [batch * height * width], row-major.
     """
     batch, signal = gaussians.batch, gaussians.signal
     if not gaussians.count:

@@ -19,15 +19,7 @@ from numpy.typing import ArrayLike
 
 
 def unambiguous_scale(points_m: ArrayLike, least_m: float) -> float:
-    """Scale at which all of some points have different encodings: their extent is within the longest period.
-
-    Args:
-        points_m: positions [n, 3], metres.
-        least_m: smallest scale, more than 0, which is doubled until it is large enough.
-
-    Returns:
-        Length of the unit, metres.
-    """
+    """Scale in metres, ``least_m`` or more, at which points [n, 3] have different encodings: none is a period apart."""
     extent = float(np.ptp(np.asarray(points_m, float), axis=0).max(initial=0.0))
     scale = least_m
     while 2 * scale <= extent < np.inf:
@@ -41,15 +33,9 @@ def encoded_size(octaves: int) -> int:
 
 
 def encode(points: Any, octaves: int, scale_m: float) -> Any:
-    """Positional encoding of points.
+    """Positional encoding of points [3, n] in metres, NumPy's or tensors. Differentiable.
 
-    Args:
-        points: tensor or NumPy array [3, n], metres. Differentiable.
-        octaves: number of octaves, L + 1 in the paper.
-        scale_m: unit of ``t``, metres.
-
-    Returns:
-        Tensor or NumPy array [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
+    Returns [6 * octaves, n]: all sines, then all cosines; octave by octave, x, y, z in each.
     """
     host = isinstance(points, np.ndarray)
     if octaves == 0:

@@ -143,14 +143,12 @@ class WrfGs:
 class WrfGsPlus:
     """WRF-GS+ (paper, section V): static attributes and a deformation network, alpha blending (eq. 14).
 
-    The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth;
-    three linear heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter.
-    With ``static_geometry`` only the first head is present: the map from the Gaussians' signals to the receiver is then
-    common to all transmitters.
-    Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
-    rotation's to the quaternion before it is normalised; the heads start small, so that the static
-    field dominates at first.
-    With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
+    The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth; three linear
+    heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter. With ``static_geometry``
+    only the first head is present: the map from the Gaussians' signals to the receiver is then common to all
+    transmitters. Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
+    rotation's to the quaternion before it is normalised; the heads start small, so that the static field dominates at
+    first. With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
     encoding: Encoding = Encoding()

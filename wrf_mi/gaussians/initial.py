@@ -90,18 +90,10 @@ def random_gaussians(
 
 
 def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.random.Generator) -> InitialGaussians:
-    """Gaussians at ``count`` points of a cloud, each as large as the gap to its neighbours.
+    """Gaussians at ``count`` points (4 or more) of a cloud [m, 3], metres, each as large as the gap to its neighbours.
 
-    The scale is the root mean square distance to the three nearest chosen points (3D Gaussian splatting,
-    Kerbl et al. 2023, section 5.1).
-
-    Args:
-        points_m: shape [m, 3] with m >= count, world frame, metres.
-        count: number of Gaussians, at least 4.
-        rng: generator that chooses the points.
-
-    Raises:
-        InputError: too few points, or a coordinate that is not a number.
+    The scale is the root mean square distance to the three nearest chosen points (3D Gaussian splatting, Kerbl et al.
+    2023, section 5.1). `InputError` for too few points, or a coordinate that is not a number.
     """
     points = np.asarray(points_m, float)
     if points.ndim != 2 or points.shape[1] != 3:

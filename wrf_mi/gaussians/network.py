@@ -94,20 +94,11 @@ def dense_of_pairs(
     per_transmitter: Mapping[str, dr.ArrayBase],
     hidden: dr.ArrayBase | None = None,
 ) -> dr.ArrayBase:
-    """A hidden layer of the concatenation of parts, for every pair of a transmitter and a Gaussian.
+    """A hidden layer [outputs, batch * n] of concatenated parts, for every pair of a transmitter and a Gaussian.
 
-    W [x; y] + b = W_x x + W_y y + b: products of parts that depend on the Gaussian only are computed once for all
-    transmitters, and vice versa.
-
-    Args:
-        params: the layer's weights, one matrix for each part.
-        name: name of the layer.
-        per_gaussian: parts [size, n].
-        per_transmitter: parts [size, batch].
-        hidden: a part [size, batch * n] that depends on both, batch-major; its matrix is ``name.hidden``.
-
-    Returns:
-        Tensor [outputs, batch * n], rectified.
+    W [x; y] + b = W_x x + W_y y + b: products of parts [size, n] that depend on the Gaussian only are computed once for
+    all transmitters, and vice versa for parts [size, batch]. ``hidden`` [size, batch * n] depends on both, batch-major;
+    its matrix is ``name.hidden``.
     """
     bias = params[f"{name}.bias"]
     batch = next(iter(per_transmitter.values())).shape[1]

@@ -102,12 +102,8 @@ def logistic(logit: Any) -> Any:
 def by_component(gaussians: Gaussians, components: int) -> Gaussians:
     """Gaussians with one signal each: those of a transmitter come ``components`` times, a signal at a time.
 
-    Args:
-        gaussians: Gaussians with 2 * ``components`` signals: real parts, then imaginary ones.
-        components: number of complex signals per Gaussian.
-
-    Returns:
-        A batch of ``batch * components``, components of a transmitter one after the other.
+    Gaussians with 2 * ``components`` signals, real parts, then imaginary ones, become a batch of ``batch *
+    components``, components of a transmitter one after the other.
     """
     if components == 1:
         return gaussians
@@ -130,14 +126,9 @@ CHUNK_SIZE = 1 << 14  # pairs of Gaussian and transmitter at once: 64 MB of a ne
 def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_once: int = CHUNK_SIZE) -> Gaussians:
     """The evaluated result of ``field.gaussians(params, tx_pos)`` in chunks, without gradients, which need all layers.
 
-    A network keeps some numbers of every layer for each Gaussian and transmitter, kilobytes in WRF-GS+: in chunks
-    memory grows only with the Gaussians themselves.
-
-    Args:
-        field: any of `wrf_mi.gaussians.FIELDS`: no Gaussian depends on another.
-        params: parameters of the field.
-        tx_pos: transmitter positions [3, batch], metres.
-        at_once: approximate number of pairs of Gaussian and transmitter at once.
+    A network keeps some numbers of every layer for each Gaussian and transmitter, kilobytes in WRF-GS+: in chunks of
+    about ``at_once`` pairs memory grows only with the Gaussians themselves. Of `wrf_mi.gaussians.FIELDS` none has
+    Gaussians that depend on another.
     """
     count, batch = params["position"].shape[1], tx_pos.shape[1]
     step = max(at_once // batch, 1)

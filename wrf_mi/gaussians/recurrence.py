@@ -80,11 +80,9 @@ def reverse_start(
 ) -> tuple[list[list[Complex]], ReverseState]:
     """Gradients of each pixel of a lane, and the state before the first Gaussian.
 
-    Args:
-        pixels: for each of a lane's pixels its numbers in the images of its transmitters.
-        active: for each pixel, False where it only fills the lane; its gradient is then zero.
-        total: R, (re, im) of all images.
-        gradient: derivative of the loss with respect to both.
+    ``pixels`` are the numbers of each of a lane's pixels in the images of its transmitters, ``active`` is False where a
+    pixel only fills the lane (its gradient is then zero), ``total`` is R of all images (re, im), ``gradient`` that of
+    the loss by both.
     """
     float_type: Any = type(total[0])
     slopes, state = [], ReverseState([], [])
@@ -107,18 +105,10 @@ def _summed(slopes: list[Any], values: list[Any]) -> Complex:
 def reverse_step(
     blending: list[Any], g: Any, t: Complex, q: Complex, signals: list[Complex], slopes: list[Complex]
 ) -> tuple[Any, list[Any], list[Complex], Complex, Complex]:
-    """Derivatives of the loss by one Gaussian in one pixel.
+    """Derivatives of the loss by one Gaussian in one pixel: by G', by ``blending`` and by each S; T and Q behind it.
 
-    Args:
-        blending: opacity or delta.
-        g: footprint G'.
-        t: T before the Gaussian.
-        q: Q before it, times the gradient's conjugate. Alpha blending uses the real part only.
-        signals: S of each transmitter.
-        slopes: gradient of each transmitter.
-
-    Returns:
-        Derivatives by G', by ``blending`` and by each S; T and Q behind the Gaussian.
+    ``g`` is the footprint G', ``t`` T before the Gaussian, ``q`` Q before it times the gradient's conjugate (alpha
+    blending uses the real part only); ``signals`` and ``slopes`` are S and the gradient of each transmitter.
     """
     weight, after = forward_step(blending, g, t)
     # dL/dS = conj(w T) dL/dR: the gradient of a product of complex numbers by one of them.

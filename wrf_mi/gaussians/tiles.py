@@ -167,11 +167,7 @@ def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch
 
 
 def check_entries(entries: int) -> int:
-    """The number of entries of all lists, if 32 bits count them.
-
-    Raises:
-        InputError: they do not.
-    """
+    """The number of entries of all lists; `InputError` if 32 bits do not count them."""
     if entries >= 2**32:
         what = f"{entries} entries in the lists of tiles, where 32 bits count"
         raise InputError(f"splatting: {what}; use fewer Gaussians, or fewer transmitters at once")

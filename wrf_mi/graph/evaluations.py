@@ -27,12 +27,8 @@ EVALUATIONS: Mapping[str, str] = {
 class Evaluation:
     """Complex signal of Gaussians on a receiver's directions, here splatted: walls of a scene have no effect.
 
-    Args:
-        scene: scene from `wrf_mi.tracing.open_scene`; None: no scene.
-        traced: parameters of the scene that are trained.
-
-    Attributes:
-        recordable: whether Dr.Jit can record a call (`dr.freeze`).
+    ``scene`` is from `wrf_mi.tracing.open_scene`, None without one, ``traced`` has the parameters that are trained.
+    ``recordable``: whether Dr.Jit can record a call (`dr.freeze`).
     """
 
     recordable = True
@@ -45,12 +41,7 @@ class Evaluation:
     ) -> Complex:
         """Real and imaginary part [batch * directions], see `learned_field`.
 
-        Args:
-            gaussians: Gaussians of one field for a batch of transmitters.
-            pose: pose of the receiver.
-            plane: pixels of a hemisphere.
-            sphere: the lower hemisphere too.
-            params: parameters of the graph by name, those of the scene's materials among them.
+        ``params``: parameters of the graph by name, those of the scene's materials among them.
         """
         return learned_field(gaussians, pose, plane, sphere)
 
@@ -61,15 +52,10 @@ class Evaluation:
 def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:
     """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
 
-    Args:
-        gaussians: Gaussians of one field for a batch of transmitters.
-        pose: pose of the receiver.
-        plane: pixels of a hemisphere.
-        sphere: the lower hemisphere too, as seen by the receiver after half a turn about its x axis.
-
-    Returns:
-        Real and imaginary part, [batch * directions]; with ``sphere``, for each transmitter the pixels of the upper
-        hemisphere, then those of the lower one, both in the order of `wrf_mi.core.pixel_directions`.
+    Gaussians are those of one field for a batch of transmitters, ``plane`` has the pixels of a hemisphere. With
+    ``sphere``, the lower hemisphere is as seen by the receiver after half a turn about its x axis. Returns the real and
+    imaginary part, [batch * directions]: of each transmitter the pixels of the upper hemisphere, then those of the
+    lower one, both in the order of `wrf_mi.core.pixel_directions`.
     """
     upper = splat(gaussians, pose, plane)
     if not sphere:

@@ -163,11 +163,7 @@ class Graph:
         return Prepared(self.scene)
 
     def check(self, tx_pos_m: FloatArray) -> None:
-        """Refuse transmitters [n, 3] and receivers inside the scene's solids, warn of those near surfaces.
-
-        Raises:
-            InputError: a transmitter or receiver inside a solid, both named.
-        """
+        """Refuse transmitters [n, 3] and receivers in solids (`InputError`), warn of those near surfaces."""
         if self.scene is not None:
             self._prepared.check(tx_pos_m, self.receivers)
 
@@ -186,16 +182,11 @@ class Graph:
     ) -> Sequence[TracedField | None]:
         """The traced sides of a receiver, one for each carrier of the transmitters, from one search for paths.
 
-        Args:
-            tx_pos_m: transmitters [n, 3], world frame, metres.
-            receiver: number of the receiver.
-            tx_heading_rad: yaw of each transmitter's frame [n], rad; None: 0.
-            carriers_hz: carrier of each transmitter [n], Hz, of training or not; None: all have that of the scene.
-            params: values by name, with which paths are those that `TracedField.refresh` finds; None: stated values.
+        Transmitters [n, 3] are in the world frame, metres; ``tx_heading_rad`` is the yaw of each one's frame [n] (None:
+        0), ``carriers_hz`` its carrier [n], of training or not (None: all have that of the scene). With ``params``,
+        values by name, paths are those that `TracedField.refresh` finds; None: stated values.
 
-        Returns:
-            Traced sides in ascending order of carriers, each of the transmitters at its carrier; without a scene None
-            in their place.
+        Sides are in ascending order of carriers, each of the transmitters at its carrier; without a scene None.
         """
         if self.scene is None:
             return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
@@ -213,12 +204,8 @@ class Graph:
     ) -> dict[str, NDArray[np.float32]]:
         """Put Gaussians on the surfaces that paths of traced sides meet, if the settings train them.
 
-        Args:
-            sides: traced sides of the training transmitters; later ones get the same Gaussians.
-            fitted: parameters of a fit with such Gaussians, which replace new ones.
-
-        Returns:
-            Starting values of their parameters, none without such Gaussians.
+        ``sides`` are those of the training transmitters; later ones get the same Gaussians. ``fitted``: parameters of a
+        fit with such Gaussians, which replace new ones. Returns starting values of their parameters, if any.
         """
         spacing_m, present = self.traced.surface_spacing, [side for side in sides if side is not None]
         if fitted is not None:
@@ -232,11 +219,9 @@ class Graph:
         return self.surface.parameters()
 
     def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the trained parameters beside the field's, by name, from the traced sides of all
-        ports.
+        """Starting values of the trained parameters beside the field's, by name, from the traced sides of all ports.
 
-        Raises:
-            InputError: without Gaussians, a receiver that no path reaches.
+        `InputError` without Gaussians for a receiver that no path reaches.
         """
         values: dict[str, NDArray[np.float32]] = {}
         for side in sides:
@@ -252,14 +237,7 @@ class Graph:
     def learned(self, number: int, params: Mapping[str, Any], batch: Batch, chunked: bool = False) -> Complex:
         """Signal of the Gaussians on a port's directions, without the receiver's unit (`unit`).
 
-        Args:
-            number: number of the port.
-            params: parameters of the graph by name.
-            batch: transmitters and pose.
-            chunked: as in `report`.
-
-        Returns:
-            Real and imaginary part, [batch * components * directions].
+        With ``chunked`` as in `report`. Returns real and imaginary part, [batch * components * directions].
         """
         assert self.field is not None
         evaluate = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
@@ -350,10 +328,7 @@ class Graph:
     def match_gain(self, number: int, side: TracedField, observed: NDArray[Any]) -> NDArray[np.float32]:
         """The receiver's starting gain [2], which matches the mean of the traced reports of a port to the observations.
 
-        Args:
-            number: number of the port.
-            side: traced side of the observed transmitters.
-            observed: observations [n, *shape of a report], NaN where nothing was received.
+        ``observed`` [n, *shape of a report] are of the transmitters of ``side``, NaN where nothing was received.
         """
         model = self.models[number]
         unscaled: Any = getattr(model, "unscaled", model)

@@ -32,24 +32,19 @@ class ReceiverModel(Protocol):
     @property
     def sphere(self) -> bool:
         """Whether directions cover the full sphere instead of the upper hemisphere."""
-        ...
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of a report; complex numbers as a last axis of real and imaginary part."""
-        ...
 
     def arrays(self, float_type: Any) -> list[Any]:
         """Constants on the device that a report reads."""
-        ...
 
     def __call__(self, traced: Any, learned: Any) -> Any:
         """Reports of a batch, flat."""
-        ...
 
     def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
         """Logarithm of the missing amplitude of reports."""
-        ...
 
 
 GAPS = ("frequencies_hz", "floor_db")
@@ -167,7 +162,7 @@ def _power(form: Form, receiver: Receiver) -> PowerReceiver:
     known = form.frequencies_hz is not None
     # As the instrument of the task: powers of paths are added.
     floor = LEAST_POWER if np.isnan(form.floor_db) else 10 ** (form.floor_db / 10)
-    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), interference=False, floor=floor)
+    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), floor=floor)
 
 
 def _csi(form: Form, receiver: Receiver) -> CsiReceiver:
@@ -190,20 +185,15 @@ RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS  # all receiver models by nam
 
 
 def register(kind: ReceiverKind) -> None:
-    """Add a receiver model for this process; an installed package names it by an entry point of `ENTRY_POINTS`.
+    """Add a receiver model for this process (`InputError` if its name is taken).
 
-    Raises:
-        InputError: the name is taken.
+    An installed package names it by an entry point of `ENTRY_POINTS`.
     """
     _RECEIVERS.add(kind.name, kind)
 
 
 def receiver_kind(name: str, task: str) -> ReceiverKind:
-    """The receiver model of a name, for a task.
-
-    Raises:
-        InputError: an unknown name, or a model of another task.
-    """
+    """The receiver model of a name, for a task; `InputError` for an unknown name, or a model of another task."""
     able = [known for known in RECEIVERS if task in RECEIVERS[known].tasks]
     if name not in RECEIVERS:
         raise InputError(f"receiver model {name!r}: unknown; choose from {', '.join(able)}")

@@ -164,11 +164,8 @@ def phase_draws(count: int) -> FloatArray:
 def with_phase_errors(paths: Paths, phase_error: float) -> list[Paths]:
     """`DRAWS` copies of a receiver's paths, with phases to each reflection of which a normal error was added.
 
-    A mesh that is off by centimetres knows the powers of paths, but not how they interfere.
-
-    Args:
-        paths: paths to one receiver.
-        phase_error: standard deviation of the phase that each interaction but transmission adds, rad, independently.
+    A mesh that is off by centimetres knows the powers of paths, but not how they interfere. ``phase_error`` is the
+    standard deviation of the phase that each interaction but transmission adds, rad, independently.
     """
     # Draws by a path's number among those of its transmitter, so that they do not depend on other transmitters.
     number = np.arange(len(paths)) - np.searchsorted(paths.tx, paths.tx)

@@ -101,11 +101,8 @@ def expected_report(
 ) -> Any:
     """Mean of a receiver's reports over `DRAWS` draws of its paths' phases (`wrf_mi.receivers.channel`).
 
-    Args:
-        report: receiver model.
-        paths: paths of a batch of transmitters.
-        learned: learned signal of these transmitters, flat; None: none.
-        deviation: standard deviation of each path's phase [batch * each], rad.
+    ``learned`` is the learned signal of the transmitters of ``paths``, flat, or None; ``deviation`` the standard
+    deviation of each path's phase [batch * each], rad.
     """
     batch, each, drawn = paths.batch, paths.each, paths.batch * DRAWS
     # The copies of a transmitter's paths lie one after the other, so that they count as transmitters.
@@ -121,10 +118,8 @@ def expected_report(
         size = dr.width(learned[0]) // batch
         lane = dr.arange(mi.UInt32, drawn * size)
         of_learned = lane // (DRAWS * size) * size + lane % size
-        learned = (
-            dr.gather(type(learned[0]), learned[0], of_learned),
-            dr.gather(type(learned[1]), learned[1], of_learned),
-        )
+        re_l, im_l = (dr.gather(type(part), part, of_learned) for part in learned)
+        learned = re_l, im_l
     reports = report(TracedPaths(times((re, im), (cosine, sine)), length_m, arrival, drawn, each), learned)
     # Reports lie draw by draw: gathered value by value, so that one reduction in fixed order sums the draws.
     size = dr.width(reports) // drawn
@@ -140,14 +135,7 @@ def spread(values: Any, count: int) -> Any:
 
 
 class ComplexMatrix:
-    """A complex matrix M [m, n] on the device, for rows of complex numbers as pairs of flat arrays.
-
-    Args:
-        values: complex matrix [m, n].
-
-    Attributes:
-        values: the matrix.
-    """
+    """A complex matrix M [m, n] on the device, ``values``, for rows of complex numbers as pairs of flat arrays."""
 
     def __init__(self, values: ArrayLike) -> None:
         self.values: NDArray[np.complex128] = np.asarray(values, complex)

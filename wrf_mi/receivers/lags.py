@@ -66,8 +66,7 @@ class Lags:
     @property
     def count(self) -> int:
         """Number of real numbers in a vector of lags."""
-        result: int = self.basis.shape[1]
-        return result
+        return int(self.basis.shape[1])
 
     @cached_property
     def pairs(self) -> FloatArray:

@@ -56,11 +56,7 @@ def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
 
 
 def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; None is an absent side.
-
-    Raises:
-        ValueError: neither side, or another ``how``.
-    """
+    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; `ValueError` of two absent sides (None) or another ``how``."""
     sides = [side for side in (traced, learned) if side is not None]
     if not sides or how not in ("coherent", "power"):
         raise ValueError(f"power: how {how!r} with {len(sides)} sides; give coherent or power, and one side at least")
@@ -295,11 +291,7 @@ class CsiReceiver:
         return sides[0], sides[1]
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Channels [batch * outputs * 2], real and imaginary part in turn, of the two sides; either may be None.
-
-        Raises:
-            ValueError: neither side.
-        """
+        """Channels [batch * outputs * 2], real and imaginary part in turn; either side, but not both, may be None."""
         sides = [side for side in self.signals(traced, learned) if side is not None]
         if not sides:
             raise ValueError("CsiReceiver: neither a traced nor a learned side")
@@ -340,14 +332,10 @@ class PowerReceiver(CsiReceiver):
 
     Attributes:
         how: sum of the sides.
-        interference: traced paths interfere with each other; False: their powers add, as in an average over positions
-            within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
-            side its root enters as a positive real number.
         floor: power that is reported where neither side arrives.
     """
 
     how: How = "coherent"
-    interference: bool = True
     floor: float = LEAST_POWER
 
     @property
@@ -358,9 +346,10 @@ class PowerReceiver(CsiReceiver):
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
         count = self._ports.count
-        of_paths, of_gaussians = self.signals(traced if self.interference else None, learned)
-        if traced is not None and not self.interference:
-            # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
+        of_paths, of_gaussians = self.signals(None, learned)
+        if traced is not None:
+            # Powers of paths add, as in an average over positions within a wavelength or over a wide band: the root of
+            # their sum, equal at all frequencies, is a signal of phase zero.
             mean = dr.repeat(_float_type(learned)(dr.sqrt(traced.power + LEAST_POWER)), count)
             of_paths = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count

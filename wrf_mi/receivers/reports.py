@@ -22,12 +22,10 @@ FLOOR_DB = 1e-3  # distance from the floor up to which a report is the floor, dB
 
 
 def strength_db(power: Any, floor: Any = math.nan, least: float = 0.0) -> Any:
-    """Power in dB, 10 log10(power + least); ``floor`` stands for powers up to 4 ``least``.
+    """Power in dB, 10 log10(power + least), of NumPy or Dr.Jit arrays; ``floor`` stands for powers up to 4 ``least``.
 
-    Args:
-        power: received powers, a NumPy or Dr.Jit array.
-        floor: power that is reported where nothing arrives; NaN: none, as in a record.
-        least: constant that bounds the derivative of the logarithm where little arrives (`LEAST_POWER`).
+    NaN as ``floor``: none, as in a record. ``least`` bounds the derivative of the logarithm where little arrives
+    (`LEAST_POWER`).
     """
     if isinstance(power, np.ndarray):
         return 10 * np.log10(np.where(power > 4 * least, power + least, floor))

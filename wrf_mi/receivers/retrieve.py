@@ -52,14 +52,9 @@ class Unscaled:
 
 
 def unscale(grey: ArrayLike, lags: Lags) -> Unscaled:
-    """Undo the scaling of stored spectra.
+    """Undo the scaling of stored spectra [n, height, width], 0 to 1, magnitudes cut to multiples of 1 / `LEVELS`.
 
-    Args:
-        grey: stored spectra [n, height, width], 0 to 1, magnitudes cut to multiples of 1 / `LEVELS`.
-        lags: lags of the array on the spectra's grid.
-
-    Raises:
-        InputError: another grid.
+    ``lags`` are those of the array on the spectra's grid; `InputError` for another grid.
     """
     stored = np.asarray(grey, float)
     # Cutting off takes half a level on average, but not from the highest.
@@ -73,12 +68,9 @@ def unscale(grey: ArrayLike, lags: Lags) -> Unscaled:
     lowest = np.maximum(-across / (2 * np.maximum(square - rounding, rounding)), 0)
     left = curved + 2 * lowest[:, None] * straight
     magnitude = middle + lowest[:, None, None]
-    return Unscaled(
-        magnitude**2,
-        lowest,
-        np.sqrt(np.square(left).mean(axis=1)),
-        np.sqrt(np.square(2 * magnitude / LEVELS).mean(axis=(1, 2)) / 12),
-    )
+    outside = np.sqrt(np.square(left).mean(axis=1))
+    levels = np.sqrt(np.square(2 * magnitude / LEVELS).mean(axis=(1, 2)) / 12)
+    return Unscaled(magnitude**2, lowest, outside, levels)
 
 
 @dataclass(frozen=True)
@@ -93,16 +85,10 @@ class Retrieved:
 
 
 def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:
-    """Signals whose squared spectra are nearest in the least-squares sense.
+    """Signals whose squared spectra are nearest in the least-squares sense, from random starts.
 
-    Args:
-        unscaled: spectra from `unscale`.
-        lags: lags of the array on the spectra's grid.
-        seed: seed of the random starts.
-        starts: largest number of starts for each spectrum.
-
-    Raises:
-        InputError: an array whose lags do not determine its signals: a line, or fewer than four elements.
+    ``lags`` are those of the array on the spectra's grid, ``starts`` is the largest number of starts of a spectrum.
+    `InputError` for an array whose lags do not determine its signals: a line, or fewer than four elements.
     """
     m = lags.elements
     # A second singular value of zero: all lags are on one line, whose spectra other signals have too.
@@ -111,9 +97,7 @@ def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int 
         raise InputError(f"retrieval: {m} elements on a line or too few lags; it takes an array of two dimensions")
     # P = x^T F x with x = (Re h, Im h), a symmetric F for each coordinate.
     real, imaginary = (lags.to_coordinates(part).reshape(m, m, -1) for part in lags.pairs)
-    form = np.concatenate(
-        [np.concatenate([real, -imaginary], axis=1), np.concatenate([imaginary, real], axis=1)], axis=0
-    )
+    form = np.concatenate([np.concatenate(row, axis=1) for row in ((real, -imaginary), (imaginary, real))])
     form = (form + form.transpose(1, 0, 2)) / 2
     pixels = lags.shape[0] * lags.shape[1]
     wanted = lags.coordinates(unscaled.squared)
@@ -179,15 +163,8 @@ def _descend(form: FloatArray, target: FloatArray, start: FloatArray) -> tuple[F
 def align_signals(signals: ArrayLike, tx_pos_m: ArrayLike, elements_m: ArrayLike) -> ComplexArray:
     """Choose each row's common phase, and one of its two mirror images, so that neighbours in space agree.
 
-    Rows are joined nearest first (Prim's tree). The exchange of all rows with their mirror images stays undetermined.
-
-    Args:
-        signals: element signals [n, m].
-        tx_pos_m: transmitter positions [n, 3], metres.
-        elements_m: element positions [m, 3], metres.
-
-    Returns:
-        Aligned signals [n, m].
+    Rows of ``signals`` [n, m], of transmitters at ``tx_pos_m`` [n, 3], are joined nearest first (Prim's tree). The
+    exchange of all rows with their mirror images stays undetermined.
     """
     aligned, positions = np.array(signals, complex), np.asarray(tx_pos_m, float)
     opposite = mirror_order(elements_m)

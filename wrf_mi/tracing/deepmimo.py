@@ -37,9 +37,7 @@ LOADED_PATHS = 25
 
 
 def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
-    """Refuse (`InputError`) a folder that exists and may not be replaced, or that ``deepmimo.load`` does not find by
-    its name.
-    """
+    """Refuse (`InputError`) a folder that exists and may not be replaced, or that ``deepmimo.load`` cannot name."""
     folder = Path(path)
     name = folder.resolve().name
     if name != name.lower() or not name or re.search(r'[\\:*?"\'<>|\n]', name):
@@ -53,9 +51,8 @@ def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
 def write_deepmimo(path: str | Path, traced: TraceResult, replace: bool = False, max_paths: int | None = None) -> Path:
     """Write a trace atomically as a scenario of DeepMIMO 4.
 
-    Powers and phases are those of the traced gains, antennas included, and phases include the carrier's
-    exp(-j 2 pi f delay). Scene and materials are not written. Paths of a user are ordered as line of sight, then by
-    falling power.
+    Powers and phases are those of the traced gains, antennas included, and phases include the carrier's exp(-j 2 pi f
+    delay). Scene and materials are not written. Paths of a user are ordered as line of sight, then by falling power.
 
     Args:
         path: folder of the scenario; its name is that of the scenario, in small letters.

@@ -75,17 +75,9 @@ class RayTracer:
         Raises:
             InputError: a position inside a solid object, or a material that is not known at one of the carriers.
         """
-        instrument = self.instrument
-        traced = trace_paths(
-            self.scene,
-            tx_pos_m,
-            instrument.receivers,
-            self.options,
-            progress,
-            self._prepared,
-            first_row,
-            tx_antenna=instrument.tx_antenna,
-        )
+        receivers, antenna = self.instrument.receivers, self.instrument.tx_antenna
+        place = progress, self._prepared, first_row
+        traced = trace_paths(self.scene, tx_pos_m, receivers, self.options, *place, tx_antenna=antenna)
         if carriers_hz is None:
             return traced
 
@@ -173,15 +165,9 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
     now = next(rx.antenna for rx in traced.receivers if rx.name == first)
     who = f"receiver {first}" if count == 1 else f"{len(gains_db)} of {count} receivers (first: {first})"
     options = f"--rx-polarization {now.turned.polarization}" + (" or --rx-frame world" if now.frame == "array" else "")
-    logger.warning(
-        "%s: turning the receive polarisation by 90 degrees raises the median traced power by %.0f dB; "
-        "state the antenna in the data, or try %s (now: %s, frame %s)",
-        who,
-        gains_db[first],
-        options,
-        now.polarization,
-        now.frame,
-    )
+    text = "%s: turning the receive polarisation by 90 degrees raises the median traced power by %.0f dB; "
+    text += "state the antenna in the data, or try %s (now: %s, frame %s)"
+    logger.warning(text, who, gains_db[first], options, now.polarization, now.frame)
 
 
 def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:

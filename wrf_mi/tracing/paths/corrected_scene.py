@@ -52,12 +52,8 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
     area, the largest first, so that a wall stays flat at the corners of a small face that is almost parallel to it; a
     mesh that only touches another one (a partition on the middle of a floor) does not follow it.
 
-    Args:
-        surfaces: surfaces of the scene.
-        parameters: ``plane.shift`` [q] and ``plane.tilt`` [q, 2]; missing ones are zero.
-
-    Raises:
-        ValueError: parameters of a scene with another number of planes.
+    Planes have moved by ``plane.shift`` [q] and ``plane.tilt`` [q, 2] of ``parameters``, zero where missing;
+    `ValueError` for those of another number of planes.
     """
     # Corners that faces share, and the planes that meet at each.
     normal, offset = planes_at(surfaces, parameters)
@@ -83,11 +79,7 @@ def moved_triangles(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) 
 
 
 def planes_at(surfaces: Surfaces, parameters: Mapping[str, NDArray[Any]]) -> tuple[FloatArray, FloatArray]:
-    """Normals [q, 3] and offsets [q] in metres of a scene's planes with the parameters of `moved_triangles`.
-
-    Raises:
-        ValueError: parameters of a scene with another number of planes.
-    """
+    """Normals [q, 3] and offsets [q] in metres of a scene's planes, with parameters and errors of `moved_triangles`."""
     count = len(surfaces.normal)
     shift, tilt = (np.asarray(parameters.get(name, np.zeros(0)), float) for name in (SHIFT, TILT))
     shift, tilt = shift if shift.size else np.zeros(count), tilt if tilt.size else np.zeros((count, 2))
@@ -116,11 +108,7 @@ def _determining(pairs: IntArray, count: int, area: FloatArray, normal: FloatArr
 
 
 def check_materials(scene: Any) -> None:
-    """Refuse a scene that `write_corrected_scene` cannot write.
-
-    Raises:
-        InputError: a material that is neither a slab nor an absorber.
-    """
+    """Refuse (`InputError`) a scene with a material that is neither a slab nor an absorber: no folder can hold it."""
     slabs = read_materials(scene).names
     for name, scene_object in scene.objects.items():
         if (material := scene_object.radio_material.name) not in slabs and not absorbs(scene_object.radio_material):
@@ -144,23 +132,14 @@ def write_corrected_scene(
     carrier that the scene is set to; others have constants, which hold there, and the exponent of the conductivity with
     the frequency.
 
-    Args:
-        folder: the new folder.
-        scene: a ``sionna.rt.Scene`` as it was trained with.
-        parameters: ``plane.*`` (see `moved_triangles`) and ``material.*`` (see
-            `wrf_mi.tracing.paths.scene_parameters`); others are ignored.
-        grouping: grouping of the parameters of materials.
-        kinds: kinds of objects by name; by default ``other``.
-        absent: slabs, in the order of their parameters, whose surfaces are left out.
-        replace: replace an existing folder.
-
-    Returns:
-        The folder.
+    ``scene`` is a ``sionna.rt.Scene`` as it was trained with. Of ``parameters``, ``plane.*`` (see `moved_triangles`)
+    and ``material.*`` (`wrf_mi.tracing.paths.scene_parameters`, in the given ``grouping``) count. ``kinds`` are those
+    of objects by name, by default ``other``; surfaces of the slabs ``absent``, in the order of their parameters, are
+    left out.
 
     Raises:
         InputError: a material that is neither a slab nor an absorber, no surface is left, or a folder that exists or
             cannot be written.
-        ValueError: see `moved_triangles`.
     """
     # Which materials have changed, and which surfaces stay together.
     check_materials(scene)
@@ -204,7 +183,8 @@ def write_corrected_scene(
                 if owner not in fitted_names:
                     fitted_names[owner] = plain_name(f"fitted_{owner}", ODD_IN_MATERIALS, constants)
                 material = fitted_names[owner]
-                constants[material] = _constants(fitted[slab]) | {LAW: _rounded(exponent[slab]), CARRIER: carrier_hz}
+                law = {LAW: float(f"{exponent[slab]:.5g}"), CARRIER: carrier_hz}
+                constants[material] = _constants(fitted[slab]) | law
             elif (itu := material.removeprefix("itu_")) != material and not in_itu_range(itu, carrier_hz):
                 material = f"{itu}_{carrier_hz / 1e6:.0f}mhz"
                 constants[material] = _constants(fitted[slab])
@@ -212,15 +192,9 @@ def write_corrected_scene(
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
     facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants)
-    return write_scene(
-        folder,
-        parts,
-        frame="that of the scene it was made from",
-        source=f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold",
-        materials=facts,
-        description="A scene corrected by measurements",
-        replace=replace,
-    )
+    source = f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold"
+    frame, title = "that of the scene it was made from", "A scene corrected by measurements"
+    return write_scene(folder, parts, frame=frame, source=source, materials=facts, description=title, replace=replace)
 
 
 def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[np.bool_]:
@@ -240,11 +214,7 @@ def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[n
 
 
 def _constants(slab: FloatArray) -> dict[str, float]:
-    return dict(zip(PERFECT_CONSTANTS, map(_rounded, slab), strict=True))
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.5g}")
+    return {name: float(f"{value:.5g}") for name, value in zip(PERFECT_CONSTANTS, slab, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -260,44 +230,28 @@ def moved_search(
 ) -> MovedSearch:
     """Move the planes of a scene in place, for the search of paths there.
 
-    Args:
-        copy: ``sionna.rt.Scene`` with the objects of the stated one, which may have been moved before; nothing else
-            may use it.
-        stated: surfaces of the scene as stated.
-        parameters: parameters of `wrf_mi.tracing.paths.traced_field.TracedField` by name, those of planes among them.
-        absent: slabs of surfaces, in the order of their parameters, that no ray shall meet.
-
-    Raises:
-        ValueError: parameters of a scene with another number of planes.
+    The objects of ``copy``, a ``sionna.rt.Scene`` that nothing else may use, are those of the scene as ``stated``,
+    perhaps moved before. ``parameters`` are those of `wrf_mi.tracing.paths.traced_field.TracedField`, planes among
+    them; no ray shall meet the slabs of surfaces ``absent``, in the order of their parameters.
     """
     triangles = moved_triangles(stated, parameters)
     left_out = np.isin(slabs_of_faces(copy, stated, "surface")[1], list(absent))
     triangles[left_out] = triangles[left_out][:, :1]  # no ray meets a point
-    _move(copy, stated, triangles)
+    # The faces of the copy take these corners, which they no longer share.
+    scene_parameters = copy.mi_scene_params
+    for number, name in enumerate(stated.names):
+        mesh = copy.objects[name].mi_mesh.id()
+        corners = triangles[stated.first_face[number] : stated.first_face[number + 1]].reshape(-1)
+        scene_parameters[f"{mesh}.vertex_positions"] = on_device(corners, mi.Float)
+        scene_parameters[f"{mesh}.faces"] = on_device(np.arange(len(corners) // 3), mi.UInt32)
+    scene_parameters.update()
     # The outline of each plane in its stated axes, and a face of it that stands for it; not one that is left out.
     normal, offset = planes_at(stated, parameters)
     flat = np.einsum("fcx,fax->fca", triangles, stated.axes[stated.plane])
     low, high = plane_bounds(stated.plane, flat, len(normal))
     face = np.where(left_out[stated.face], largest_face(stated.plane, trimesh.triangles.area(triangles)), stated.face)
+    shape_ids = np.array([shape_id(copy.objects[name].mi_mesh) for name in stated.names], np.uint32)
     surfaces = replace(
-        stated,
-        shape_ids=np.array([shape_id(copy.objects[name].mi_mesh) for name in stated.names], np.uint32),
-        triangles=triangles,
-        normal=normal,
-        offset=offset,
-        face=face,
-        low=low,
-        high=high,
+        stated, shape_ids=shape_ids, triangles=triangles, normal=normal, offset=offset, face=face, low=low, high=high
     )
     return MovedSearch(Prepared(copy, surfaces), {name: to_tensor(values) for name, values in parameters.items()})
-
-
-def _move(scene: Any, stated: Surfaces, triangles: FloatArray) -> None:
-    """Give the faces of a scene other corners [f, 3, 3], which they no longer share."""
-    parameters = scene.mi_scene_params
-    for number, name in enumerate(stated.names):
-        mesh = scene.objects[name].mi_mesh.id()
-        corners = triangles[stated.first_face[number] : stated.first_face[number + 1]].reshape(-1)
-        parameters[f"{mesh}.vertex_positions"] = on_device(corners, mi.Float)
-        parameters[f"{mesh}.faces"] = on_device(np.arange(len(corners) // 3), mi.UInt32)
-    parameters.update()

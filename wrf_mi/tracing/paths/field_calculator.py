@@ -63,8 +63,9 @@ class Chains:
         return dr.gather(Chains, self, index)
 
     def met(self, depth: int) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
-        """Planes and materials that the p paths meet at up to ``depth`` interactions [p, depth], -1 for none, and
-        whether they are reflected there; without place holders.
+        """Planes, materials and whether they reflect, at up to ``depth`` interactions of the p paths that exist.
+
+        Each is [p, depth]; planes and materials are -1 for none.
         """
         exists = np.flatnonzero(self.exists.numpy() > 0)
         plane, material = np.full((2, len(exists), depth), -1)
@@ -237,13 +238,9 @@ def slab(cosine: Any, permittivity: Any, conductivity: Any, thickness_m: Any, fr
     has the same equations, in float32 for any input; here in the type of ``cosine``. Differentiable in all Dr.Jit
     arguments.
 
-    Args:
-        cosine: cosine of the angle of incidence theta, a Dr.Jit array of either float type, [p].
-        permittivity: relative permittivity eps_r, [p].
-        conductivity: sigma, S/m, [p].
-        thickness_m: d, metres, [p].
-        frequency_hz: carrier frequency f, a number or an array of the same type.
-
+    ``cosine`` is that of the angle of incidence theta, a Dr.Jit array [p] of either float type; eps_r is the relative
+    permittivity [p], sigma the conductivity in S/m [p], ``thickness_m`` d in metres [p], ``frequency_hz`` the carrier
+    f.
     Source: ITU-R P.2040-3, equations 37, 43 and 44.
     """
     kind: Any = mi.Complex2f if type(cosine) is mi.Float else dr.float64_array_t(mi.Complex2f)

@@ -54,12 +54,9 @@ def pose_names(receiver: Receiver) -> tuple[str, str]:
 
 
 def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type: Any) -> Pose:
-    """Corrected pose of a receiver. Differentiable in both parameters.
+    """Corrected pose of a receiver, of a float type, in which the stated position is added. Differentiable.
 
-    Args:
-        receiver: stated pose.
-        parameters: the receiver's position and rotation, tensors [3]; missing ones are zero.
-        float_type: float type of the result and of the sum with the stated position.
+    ``parameters``: the receiver's position and rotation, tensors [3]; missing ones are zero.
     """
 
     def correction(name: str) -> list[Any]:
@@ -90,11 +87,9 @@ def component(tensor: Any, i: int) -> Any:
 
 
 def spread_pose(pose: Pose, count: int) -> Pose:
-    """A pose as arrays of ``count`` values.
-
-    The derivative of a gather is a sum in the same kernel; broadcast numbers would take a kernel for each of the
-    twelve.
-    """
+    """A pose as arrays of ``count`` values."""
+    # The derivative of a gather is a sum in the same kernel; broadcast numbers would take a kernel for each of the
+    # twelve.
     table = dr.concat([*pose.position, *(c for row in pose.to_world for c in row)])
     kind: Any = type(table)
     wide = [dr.gather(kind, table, dr.full(dr.uint32_array_t(kind), i, count)) for i in range(12)]
@@ -118,15 +113,9 @@ def with_antennas(
 
 
 def pattern_factor(coefficients: Any, direction: Vector) -> Complex:
-    """Complex factor F(u) of directions in the antenna's frame. Differentiable in both arguments.
+    """Complex factor F(u) of directions u in the antenna's frame, three arrays [p], in their type. Differentiable.
 
-    Args:
-        coefficients: real and imaginary parts by degree and order, tensor [2, (L + 1)^2 - 1].
-        direction: unit vectors u, three arrays [p] of any float type, which is that of the result.
-
-    Returns:
-        Real and imaginary part, arrays [p].
-
+    ``coefficients``: real and imaginary parts by degree and order, tensor [2, (L + 1)^2 - 1].
     Source: real spherical harmonics as in Sloan, "Efficient spherical harmonic evaluation" (2013), JCGT 2(2).
     """
     float_type = type(direction[0])

@@ -91,11 +91,7 @@ class TraceResult:
         return replace(selected, paths=paths, receivers=tuple(self.receivers[number] for number in which))
 
     def legs(self, surfaces: Surfaces) -> Legs:
-        """The paths in the direction of the search, for Sionna RT.
-
-        Raises:
-            InputError: the scene lacks an object, or has another one by that name.
-        """
+        """The paths in the direction of the search, for Sionna RT; `InputError` of a scene that lacks an object."""
         paths, first = self.paths, np.zeros(len(self.paths.object_names) + 1, np.int64)
         for index, name in enumerate(paths.object_names):
             met = paths.objects == index
@@ -130,13 +126,7 @@ def recompute(traced: TraceResult, scene: Any) -> TraceResult:
 
     Args:
         traced: from `wrf_mi.tracing.trace_paths` or `load_trace`, perhaps with other antennas.
-        scene: a ``sionna.rt.Scene`` of the same geometry.
-
-    Returns:
-        The paths with the new gains.
-
-    Raises:
-        InputError: the scene lacks an object that a path meets.
+        scene: a ``sionna.rt.Scene`` of the same geometry; `InputError` where it lacks an object that a path meets.
     """
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
@@ -188,11 +178,7 @@ def save_trace(file: str | Path, traced: TraceResult) -> Path:
 
 
 def load_trace(file: str | Path) -> TraceResult:
-    """Read a file of `save_trace`.
-
-    Raises:
-        InputError: a file that is missing or damaged, or holds paths without their trace.
-    """
+    """Read a file of `save_trace`; `InputError` of one that is missing, damaged, or holds paths without their trace."""
     paths, extra = read_paths_file(file)
     try:
         return TraceResult(

@@ -118,12 +118,10 @@ class SlabMaterials:
         self, parameters: Mapping[str, Any], stated: Mapping[str, Any], frequency_ratio: float = 1.0
     ) -> tuple[Any, Any, Any, Any]:
         """Relative permittivity, conductivity, thickness and reflected share [n], from parameters where there are any.
-        Differentiable.
 
-        Args:
-            parameters: Dr.Jit tensors by the names of `parameters`.
-            stated: `constants`, whose float type is that of the result.
-            frequency_ratio: frequency over that at which the scene and parameters state the conductivity.
+        Differentiable. ``parameters`` are Dr.Jit tensors by the names of `parameters`, ``stated`` is that of
+        `constants`, whose float type the result has; ``frequency_ratio``: frequency over that at which conductivities
+        are stated.
         """
 
         def column(quantity: str) -> Any:
@@ -262,12 +260,11 @@ class SceneTables:
 def renumbered(levels: Sequence[Level], planes: IntArray, slabs: IntArray) -> list[Level]:
     """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``, ascending.
 
-    Both have all those that a path meets; interactions that are place holders get any of these numbers.
+    Both have all those that a path meets; place holders get any of these numbers.
     """
 
     def places(numbers: Any, chosen: IntArray) -> Any:
         return to_uint(np.minimum(np.searchsorted(chosen, np.asarray(numbers)), len(chosen) - 1))
 
-    return [
-        replace(level, plane=places(level.plane, planes), material=places(level.material, slabs)) for level in levels
-    ]
+    columns = ((level, places(level.plane, planes), places(level.material, slabs)) for level in levels)
+    return [replace(level, plane=plane, material=material) for level, plane, material in columns]

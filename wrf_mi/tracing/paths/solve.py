@@ -41,9 +41,7 @@ SAMPLE = (4, 256)  # sources and targets on which convergence is judged
 class Prepared:
     """State that the traces of a scene share: its planes, and chains of planes that rays from fixed points have found.
 
-    Args:
-        scene: a ``sionna.rt.Scene`` of constant geometry and, for traced fields, materials.
-        surfaces: its surfaces; None: they are found.
+    The ``sionna.rt.Scene`` is of constant geometry and, for traced fields, materials; ``surfaces`` are found if None.
     """
 
     def __init__(self, scene: Any, surfaces: Surfaces | None = None) -> None:
@@ -54,11 +52,7 @@ class Prepared:
         self._checked: set[bytes] = set()
 
     def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
-        """Refuse antennas inside solids and warn of those near surfaces, each position once, as stated.
-
-        Raises:
-            InputError: see `wrf_mi.tracing.search.devices.check_devices`.
-        """
+        """Refuse antennas inside solids and warn of those near surfaces (`check_devices`), each position once."""
         transmitters, receiver_names = _names(len(tx_pos_m), receivers, first_row)
         sides = (transmitters, tx_pos_m), (receiver_names, np.stack([receiver.position_m for receiver in receivers]))
         for names, stated in sides:
@@ -71,7 +65,7 @@ class Prepared:
             self._checked.update(stated[row].tobytes() for row in new)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
-        """Transmitters [n, 3] and receivers as they are traced: see `wrf_mi.tracing.search.devices.from_behind`."""
+        """Transmitters [n, 3] and receivers as they are traced (`wrf_mi.tracing.search.devices.from_behind`)."""
         stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         # Those on a surface stay: their paths are searched for before it, and have the lengths from the surface.
         positions, others = np.split(from_behind(self.surfaces, stated), [len(tx_pos_m)])
@@ -178,7 +172,7 @@ def trace_paths(
     rays = shared.rays(sources, targets, options)
     # Paths, then their gains by Sionna RT's field calculator, which knows diffraction and scattering.
     with scattering_materials(scene, options):
-        legs = _search(scene, shared, sources, targets, options, rays, progress)
+        legs = _search(shared, sources, targets, options, rays, progress)
         unknown = np.full(len(legs), np.nan, np.complex128)
         gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
     # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
@@ -212,15 +206,8 @@ def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Rec
 
 
 def _search(
-    scene: Any,
-    shared: Prepared,
-    sources: FloatArray,
-    targets: FloatArray,
-    options: TraceOptions,
-    rays: int,
-    progress: bool,
+    shared: Prepared, sources: FloatArray, targets: FloatArray, options: TraceOptions, rays: int, progress: bool
 ) -> Legs:
-    """Paths from all sources to all targets."""
     parts = []
     with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
         task = bar.add_task("tracing paths", total=len(sources) * len(targets))
@@ -233,7 +220,7 @@ def _search(
                 kinds = [specular_paths(shared.surfaces, chains, group, batch, options)]
                 if options.sampled and len(shared.surfaces.plane):
                     for index, source in enumerate(group):
-                        legs = sampled_paths(scene, shared.surfaces, source, batch, options, rays)
+                        legs = sampled_paths(shared.scene, shared.surfaces, source, batch, options, rays)
                         kinds.append(replace(legs, source=np.full_like(legs.source, index)))
                 legs = join(kinds)
                 parts.append(replace(legs, source=legs.source + first, target=legs.target + start))
@@ -244,17 +231,14 @@ def _search(
 def converged_rays(shared: Prepared, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions) -> int:
     """Number of rays that find (nearly) every path, judged on up to 4 sources and 256 targets.
 
-    The number is doubled, from 2^14, until in two consecutive doublings neither the number of paths nor the power
-    sum 1 / length^2 in free space grew by more than 0.05 %. Each number has different rays, so that a path that is
-    found by chance once does not count as converged.
-
-    Returns:
-        The last number but two, as further doublings found nothing; 2^24 at most, with a warning.
+    The number is doubled, from 2^14 to at most 2^24 (with a warning), until in two consecutive doublings neither the
+    number of paths nor the power sum 1 / length^2 in free space grew by more than 0.05 %; the last number but two is
+    returned. Each number has different rays, so that a path found by chance once does not count as converged.
     """
     if not len(shared.surfaces.plane) or not options.most_reflections:
         return FIRST_RAYS
-    sources = sources_m[spread(len(sources_m), SAMPLE[0])]
-    targets = targets_m[spread(len(targets_m), SAMPLE[1])]
+    ends = (sources_m, SAMPLE[0]), (targets_m, SAMPLE[1])
+    sources, targets = (positions[spread(len(positions), most)] for positions, most in ends)
     plain = replace(options, diffraction=False, scattering=False)
     best, calm, rays = np.zeros(2), 0, FIRST_RAYS
     while True:
@@ -297,21 +281,10 @@ def _paths(
     order = np.lexsort((*legs.face.T[::-1], length, legs.source, legs.target))
     legs, gain, length = legs.select(order), gain[order], length[order]
     tx, rx, vertices = tx_pos_m[legs.source], rx_pos_m[legs.target], legs.vertices_m
-    objects = np.where(legs.interactions != 0, surfaces.object_of(np.maximum(legs.face, 0)), -1)
-    paths = Paths(
-        tx=legs.source,
-        rx=legs.target,
-        gain=gain,
-        length_m=length,
-        departure=_directions(tx, rx, vertices),
-        arrival=_directions(rx, tx, vertices[:, ::-1]),
-        interactions=legs.interactions,
-        vertices_m=vertices,
-        objects=objects.astype(np.int32),
-        object_names=surfaces.names,
-        n_tx=len(tx_pos_m),
-        n_rx=len(rx_pos_m),
-    )
+    objects = np.where(legs.interactions != 0, surfaces.object_of(np.maximum(legs.face, 0)), -1).astype(np.int32)
+    departure, arrival = _directions(tx, rx, vertices), _directions(rx, tx, vertices[:, ::-1])
+    met = legs.interactions, vertices, objects, surfaces.names
+    paths = Paths(legs.source, legs.target, gain, length, departure, arrival, *met, len(tx_pos_m), len(rx_pos_m))
     return paths, legs
 
 

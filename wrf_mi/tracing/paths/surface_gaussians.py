@@ -67,7 +67,7 @@ class SurfaceGaussians:
 
     @classmethod
     def covering(cls, met: Interactions, spacing_m: float) -> SurfaceGaussians:
-        """Gaussians where interactions lie: at their mean in each cell of a lattice of ``spacing_m`` in each plane."""
+        """Gaussians at the means of interactions in the cells of a lattice of ``spacing_m`` in each plane."""
         # A cell: a square of the plane, and within tolerances its offset and normal.
         offset = (met.position_m * met.normal).sum(axis=1)
         cell = np.round((met.position_m - offset[:, None] * met.normal) / spacing_m)
@@ -132,11 +132,9 @@ class PathWeights:
         return cls(on_device(indices, mi.UInt32), on_device(weights, Float64), depth * NEAREST)
 
     def factor(self, factors: Any, paths: Any | None = None) -> Complex:
-        """Complex factor of each path's gain, or of the numbers ``paths``. Differentiable in ``factors``.
+        """Complex factor of each path's gain, or of paths by their numbers ``paths``; None: all. Differentiable.
 
-        Args:
-            factors: tensor `FACTOR`, [2, g].
-            paths: numbers of paths, an unsigned integer array; None: all.
+        ``factors`` is the tensor `FACTOR`, [2, g].
         """
         index, weight = self.index, self.weight
         if paths is not None:

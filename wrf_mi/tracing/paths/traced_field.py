@@ -50,25 +50,19 @@ SINGLE = 16  # numbers of paths of a field's only transmitter are multiples of t
 class TracedOptions:
     """Options of a traced field."""
 
-    # options of the search, without diffraction and scattering, whose fields have no derivative here
+    # Options of the search, without diffraction and scattering, whose fields have no derivative here.
     trace: TraceOptions = field(default_factory=TraceOptions)
     pattern_degree: int = 0  # degree of the trainable factors of both antennas' patterns, 0 for none
     tx_antenna: Antenna = ANTENNA  # antenna of the transmitters, which turns with their heading
-    # whether each named material has parameters, or each surface, started from its named material
-    materials: MaterialGrouping = "named"
+    materials: MaterialGrouping = "named"  # whether named materials have parameters, or surfaces, started from those
     planes: bool = False  # whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`)
-    # the weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search, add up
-    # to less than this share of the amplitudes of all; 0: none
+    # The weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search, add up to
+    # less than this share of the amplitudes of all; 0: none.
     faint: float = 0.0
-    # constants of materials that are parameters, of `wrf_mi.tracing.paths.scene_parameters.QUANTITIES`
-    constants: tuple[str, ...] = TRAINED
+    constants: tuple[str, ...] = TRAINED  # constants of materials that are parameters, of `QUANTITIES`
 
     def __post_init__(self) -> None:
-        """Check the options of the search.
-
-        Raises:
-            InputError: diffraction or scattering.
-        """
+        """Check the options of the search; `InputError` with diffraction or scattering."""
         if self.trace.diffraction or self.trace.scattering:
             raise InputError("traced side: diffraction and scattering have no derivative here; switch both off")
 

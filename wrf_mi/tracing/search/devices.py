@@ -31,8 +31,7 @@ PAIRS_PER_CHUNK = 1 << 20
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
     """Warn of antennas at positions [n, 3], metres, outside the scene.
 
-    Raises:
-        InputError: the first antenna inside a solid object, by its name of ``names``, such as ``transmitter 3``.
+    `InputError` names the first antenna inside a solid object by ``names``, such as ``transmitter 3``.
     """
     enclosing = solid_around(surfaces, positions_m)
     if (enclosing >= 0).any():

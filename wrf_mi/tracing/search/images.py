@@ -43,8 +43,8 @@ def mirrored(vectors: FloatArray, normal: FloatArray, offset_m: FloatArray | flo
 def image_sources(normal: FloatArray, offset_m: FloatArray, plane: IntArray, source_m: FloatArray) -> FloatArray:
     """Images [c, b + 1, 3] of a source [3], or of the source of each chain [c, 3], after 0, 1, ... reflections, metres.
 
-    The planes q . x = o of the scene have normals [q, 3] and offsets [q]; a chain's planes [c, b] are in their order
-    from the source, -1 for none.
+    A chain's planes [c, b] are in their order from the source, -1 for none; normals [q, 3] and offsets [q] are the
+    scene's.
     """
     image = np.repeat(np.broadcast_to(source_m, (len(plane), 3))[:, None], plane.shape[1] + 1, axis=1)
     # The image after a reflection is that before it, mirrored in the plane that reflects: Balanis (2012), section 7.4.
@@ -59,8 +59,7 @@ def image_sources(normal: FloatArray, offset_m: FloatArray, plane: IntArray, sou
 def meeting_point(
     start_m: FloatArray, end_m: FloatArray, normal: FloatArray, offset_m: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points [n, 3] where lines through first and second points [n, 3] meet planes, and heights [n] of both above
-    these.
+    """Points [n, 3] where lines between points [n, 3] meet planes, and heights [n] of both points above these.
 
     Planes have unit normals [n, 3] and offsets [n], metres. A line parallel to its plane meets it at the first point.
     """
@@ -72,10 +71,9 @@ def meeting_point(
 def specular_paths(
     surfaces: Surfaces, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
 ) -> Legs:
-    """Every unobstructed path from sources [s, 3] to targets [n, 3], metres, by the reflections of chains from these
-    sources.
+    """Unobstructed paths from sources [s, 3] to targets [n, 3], metres, by reflections of chains from these sources.
 
-    Returns paths with source 0..s-1 and target 0..n-1 and vertices in float64 on the surfaces' planes.
+    Vertices are in float64 on the surfaces' planes.
     """
     depth = max(options.depth, 1)
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
@@ -146,9 +144,7 @@ def _vertices(
 
 
 def _mounted(surfaces: Surfaces, plane: IntArray, source_m: FloatArray, target_m: FloatArray) -> NDArray[np.bool_]:
-    """Mask [n] of chains [n, b] whose first plane holds the source, or last plane the target: on a wall there is no
-    image.
-    """
+    """Mask [n] of chains whose first plane holds the source, or last the target: on a wall there is no image."""
     rows, last = np.arange(len(plane)), np.count_nonzero(plane >= 0, axis=1) - 1
     mounted = np.zeros(len(plane), bool)
     if not plane.shape[1]:

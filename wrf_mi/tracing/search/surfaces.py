@@ -93,8 +93,13 @@ class Surfaces:
 
     @cached_property
     def scale_m(self) -> float:
-        """Length by which distances that single precision does not resolve grow."""
-        return scale_m(self.triangles, self.centre_m)
+        """Length by which distances that single precision does not resolve grow: that of roundings of corners in files.
+
+        The largest coordinate plus 1 m; far from the origin at most `FARTHEST` times the same about the middle.
+        """
+        about = (self.triangles, self.triangles - self.centre_m)
+        stated, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in about)
+        return min(stated, FARTHEST * centred)
 
     @cached_property
     def screens(self) -> Any:
@@ -276,15 +281,6 @@ def plane_bounds(plane: IntArray, corners_m: FloatArray, count: int) -> tuple[Fl
     np.minimum.at(low, plane, corners_m.min(axis=1))
     np.maximum.at(high, plane, corners_m.max(axis=1))
     return low, high
-
-
-def scale_m(triangles: FloatArray, centre_m: FloatArray) -> float:
-    """Largest coordinate of triangles [f, 3, 3] plus 1 m: the rounding of their corners in files grows with it.
-
-    Far from the origin it is bounded by `FARTHEST` times the same about the middle [3] of the scene.
-    """
-    stated, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in (triangles, triangles - centre_m))
-    return min(stated, FARTHEST * centred)
 
 
 def screens(triangles: FloatArray, scale_m: float) -> Any:

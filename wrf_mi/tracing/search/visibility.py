@@ -64,13 +64,10 @@ class Met(NamedTuple):
 def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool) -> Met:
     """Candidates that are paths: what obstructs none of their legs, and at each reflection the plane that reflects.
 
-    Args:
-        surfaces: surfaces of the scene.
-        vertices_m: source, points of reflection and target of each candidate [n, b + 2, 3], metres; vertices beyond the
-            target are not read. No vertex but those of reflection may lie on a surface.
-        plane: plane of each reflection from the source on [n, b], -1 beyond the last.
-        depth: largest number of interactions.
-        transmission: whether waves pass surfaces.
+    No vertex but those of reflection of ``vertices_m`` [n, b + 2, 3], source, points of reflection and target in
+    metres, may lie on a surface; those beyond the target are not read. ``plane`` [n, b] are the planes of the
+    reflections from the source on, -1 beyond the last, ``depth`` is the largest number of interactions, and with
+    ``transmission`` waves pass surfaces.
     """
     import drjit as dr
     import mitsuba as mi
@@ -158,12 +155,8 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     used = np.arange(depth) < count.numpy()[is_path, None]
     kinds = np.where(code >= REFLECTS, SPECULAR, TRANSMISSION)
     points_m = np.moveaxis(points.numpy().reshape(3, size, depth), 0, -1)[is_path].astype(float)
-    met = Met(
-        is_path,
-        np.where(used, kinds, 0).astype(np.uint8),
-        np.where(used, code % REFLECTS, -1),
-        np.where(used[..., None], points_m + surfaces.centre_m, np.nan),
-    )
+    inside = np.where(used[..., None], points_m + surfaces.centre_m, np.nan)
+    met = Met(is_path, np.where(used, kinds, 0).astype(np.uint8), np.where(used, code % REFLECTS, -1), inside)
     return with_crossings(surfaces, vertices_m[is_path], plane[is_path], met, transmission)
 
 
@@ -193,6 +186,9 @@ class _Crossings(NamedTuple):
         return _Crossings(*(array[which] for array in self))
 
 
+_Near = tuple[IntArray, IntArray, FloatArray]  # indices of points on planes, a plane near each, and the points
+
+
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
 
@@ -206,7 +202,13 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     # Few paths have any: the others stay as they are.
     crossing, path = np.unique(crossings.path, return_inverse=True)
     part = met.select(crossing)
-    further = _unrecorded(surfaces, plane.shape[1] + 1, part, crossings._replace(path=path))
+    # Crossings that rays have not met: one number for each path, leg and plane, as a straight leg crosses a plane once.
+    row, slot = np.nonzero(part.interactions == TRANSMISSION)
+    columns = [(row, part.leg[row, slot], surfaces.plane[part.face[row, slot]])]
+    columns += [(path, crossings.leg, surfaces.plane[crossings.face])]
+    legs, planes = plane.shape[1] + 1, len(surfaces.normal)
+    met_by_rays, crossed = ((number * legs + leg) * planes + at for number, leg, at in columns)
+    further = crossings._replace(path=path).select(~np.isin(crossed, met_by_rays))
     if transmission:
         part, valid = _inserted(part, further, vertices_m[crossing])
     else:
@@ -301,12 +303,7 @@ def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met:
 
 
 def _crossed(
-    surfaces: Surfaces,
-    vertices_m: FloatArray,
-    plane: IntArray,
-    path: IntArray,
-    leg: IntArray,
-    near: tuple[IntArray, IntArray, FloatArray],
+    surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, path: IntArray, leg: IntArray, near: _Near
 ) -> _Crossings:
     """Crossings of the planes near points, on one leg [n] of each point's path [n]."""
     point, crossed, points = near
@@ -328,10 +325,7 @@ def _crossed(
     return _Crossings(row[index], leg[index], face[closed], share[closed], where[closed])
 
 
-def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Index of each point [n, 3] on planes [n], number of another plane within `NEAR` that touches its plane, and the
-    point.
-    """
+def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> _Near:
     tree, boxes = surfaces.boxes
     groups = list(_by_value(plane))
     mirrors = np.array([mirror for mirror, _ in groups], np.int64)
@@ -358,13 +352,3 @@ def _by_value(values: IntArray) -> Iterator[tuple[int, IntArray]]:
     ordered = values[order]
     for rows in np.split(order, np.flatnonzero(np.diff(ordered)) + 1) if len(values) else ():
         yield int(values[rows[0]]), rows
-
-
-def _unrecorded(surfaces: Surfaces, legs: int, met: Met, crossings: _Crossings) -> _Crossings:
-    """Crossings that rays have not met on the same of a path's legs."""
-    path, slot = np.nonzero(met.interactions == TRANSMISSION)
-    columns = [(path, met.leg[path, slot], surfaces.plane[met.face[path, slot]])]
-    columns += [(crossings.path, crossings.leg, surfaces.plane[crossings.face])]
-    # One number for each path, leg and plane: a straight leg crosses a plane once.
-    met_by_rays, crossed = ((row * legs + at) * len(surfaces.normal) + plane for row, at, plane in columns)
-    return crossings.select(~np.isin(crossed, met_by_rays))

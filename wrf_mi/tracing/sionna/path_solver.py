@@ -57,8 +57,7 @@ Ends = tuple[Devices, Devices]  # sources and targets of a search, or transmitte
 def sionna_orientation(to_world: ArrayLike) -> FloatArray:
     """Orientations (alpha, beta, gamma; rad) of devices in Sionna RT [..., 3].
 
-    Of rotations [..., 3, 3] from the device's frame, whose boresight is +x, to the world's
-    (`wrf_mi.core.Antenna.to_world`).
+    Of rotations [..., 3, 3] from the device's frame, boresight +x, to the world's (`wrf_mi.core.Antenna.to_world`).
     """
     with warnings.catch_warnings():
         # A device that looks straight up or down has many equivalent angles.

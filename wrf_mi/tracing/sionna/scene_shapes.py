@@ -64,12 +64,8 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
 
     Rectangles become two triangles; disks, spheres and cylinders become inscribed meshes of `SEGMENTS` segments
     (logged). A mesh file whose polygons Mitsuba reads as other triangles than `mesh_parts` does, or not at all, becomes
-    a file of those triangles. All other shapes stay as they are.
-
-    Args:
-        root: root of a scene file, from `wrf_mi.scene.xml_file.read_scene_xml`.
-        path: the scene file.
-        folder: folder for the triangles, which the scene needs until it is loaded.
+    a file of those triangles in ``folder``, which the scene needs until it is loaded. All other shapes stay as they
+    are.
 
     Raises:
         InputError: naming the file, the shape, and the remedy: a shape without triangles or with a parameter that
