@@ -19,7 +19,7 @@ from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.search.images import displaced
 from wrf_mi.tracing.search.legs import TRANSMISSION
-from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, scale_m, screens
+from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, find_planes, screens
 
 LONG, WIDE, HIGH, WALL = 8.0, 4.0, 2.5, 4.0
 """Two rooms side by side, metres, and where the wall between them stands."""
@@ -371,7 +371,8 @@ def test_scale_is_bounded_far_from_the_origin():
     corners = trimesh.creation.box(bounds=[(0, 0, 0), (6, 4, 3)]).triangles
     for away_m, expected in ((0.0, 7.0), (50.0, 57.0), (1e4, 100.0)):
         moved = corners + away_m
-        assert scale_m(moved, moved.reshape(-1, 3).mean(axis=0)) == pytest.approx(expected)
+        surfaces = find_planes(("box",), np.zeros(1, np.uint32), np.array([0, len(moved)]), moved)
+        assert surfaces.scale_m == pytest.approx(expected)
 
 
 def test_reflections_in_edges_of_turned_rooms_count_once(tmp_path: Path):

@@ -31,10 +31,8 @@ HOST: dict[Any, type[np.generic]] = {
 
 
 def release_memory() -> None:
-    """Give the memory of arrays that nothing uses any more back to the system; Dr.Jit keeps it for further arrays.
-
-    After a fit that is most of what the process has, and what follows allocates by NumPy.
-    """
+    """Give the memory of arrays that nothing uses any more back to the system; Dr.Jit keeps it for further arrays."""
+    # After a fit that is most of what the process has, and what follows allocates by NumPy.
     gc.collect()  # recorded functions refer to what records them
     dr.flush_malloc_cache()
 

@@ -61,10 +61,8 @@ class Noise:
         return np.asarray((FREEDOM + self.values) / 2 * np.log1p(self._excess(mean_squares)).sum(axis=-1))
 
     def weights(self, residual: FloatArray) -> FloatArray:
-        """Weights [rows] of squared residuals: (FREEDOM + n_eff) / FREEDOM / s^2 at most, 0 without observation.
-
-        They are divided by values per independent value: sums over all values are then sums over independent ones.
-        """
+        """Weights [rows] of squared residuals: (FREEDOM + n_eff) / FREEDOM / s^2 at most, 0 without observation."""
+        # They are divided by values per independent value: sums over all values are then sums over independent ones.
         share = self.values / residual.shape[1] / self.variance
         mean = np.square(residual).mean(axis=1)
         weight = share * (FREEDOM + self.values) / FREEDOM / (1 + self._excess(mean))
@@ -148,10 +146,7 @@ def minimised(
 def posterior_covariance(
     derivative: NDArray[np.floating], residual: FloatArray, prior: Prior, noise: Noise
 ) -> FloatArray:
-    """Covariance [p, p] of parameters: inverse of the Fisher information and the prior's precision.
-
-    Derivatives [p, rows, values] and residuals [rows, values] are those at the solution, as is the noise.
-    """
+    """Covariance [p, p] at a solution of derivatives [p, rows, values], residuals [rows, values], prior and noise."""
     return np.asarray(np.linalg.inv(_normal(derivative, residual, noise)[0] + prior.precision), float)
 
 

@@ -250,10 +250,8 @@ class Misfit:
         return np.stack([np.square(self.residual(vector)).mean(axis=1) for vector in vectors])
 
     def missing_gains(self, vector: FloatArray) -> dict[str, float]:
-        """Logarithm of the amplitude that reports of each receiver lack, by the name of its gain, over its carriers.
-
-        Least squares of a phase start from equal mean magnitudes, else the smallest reports would fit best.
-        """
+        """Logarithm of the amplitude that reports of each receiver lack, by the name of its gain, over its carriers."""
+        # Least squares of a phase start from equal mean magnitudes, else the smallest reports would fit best.
         missing = dict[str, list[float]]()
         if not any(port.side.gain_name in self.parts for port in self.ports):
             return {}

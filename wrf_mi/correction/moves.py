@@ -127,9 +127,8 @@ def shift_choices(posterior: ScenePosterior, sd_m: float) -> list[SurfaceChoice]
 def joint_choices(
     materials: Sequence[SurfaceChoice], shifts: Sequence[SurfaceChoice], posterior: ScenePosterior
 ) -> list[SurfaceChoice]:
-    """Choices of material and shift together, for the surface with most paths of each of the first `JOINT` planes and
-    for supposed faces, and all other choices by themselves.
-    """
+    """Choices of material and shift together, and all other choices by themselves."""
+    # Together for the surface with most paths of each of the first `JOINT` planes, and for supposed faces.
     # At a wavelength of the size of the shifts, a wrong material makes the right shift look wrong, and conversely.
     # In reverse order, so that of several surfaces in a plane that with most paths stays.
     of_plane = {f"plane {material.what.rpartition('/')[2]}": material for material in reversed(materials)}

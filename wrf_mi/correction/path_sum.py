@@ -62,12 +62,7 @@ class _Touched:
 
 
 class PathSum:
-    """Residuals of a misfit near one vector. Trials may be computed on several threads.
-
-    Args:
-        misfit: residuals that are such sums (`serves`).
-        vector: vector [p] about which lengths are linear.
-    """
+    """Residuals of a misfit that it `serves`, near a vector [p] about which lengths are linear; for several threads."""
 
     def __init__(self, misfit: Misfit, vector: FloatArray) -> None:
         self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
@@ -187,10 +182,7 @@ class PathSum:
         self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
 
     def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
-        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received.
-
-        Those by materials are differences over `STEP`.
-        """
+        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; by materials over `STEP`."""
         touched, waves = self._changed(vector[None])
         present, total = self._waves.copy(), self._total.copy()
         present[touched.paths] = waves[:, 0]

@@ -65,10 +65,7 @@ def read(table: Any, i: Any, count: int) -> list[Any]:
 
 
 def along_azimuth(record: list[Any], azimuth: list[Any]) -> list[Any]:
-    """The products n . u, a . u and b . u as factors of the cosine and of the sine of the elevation.
-
-    All pixels of a lane share their azimuth (cosine, sine).
-    """
+    """Factors of the elevation's cosine and sine in n . u, a . u and b . u, at a lane's azimuth (cosine, sine)."""
     # u = (cos e cos a, cos e sin a, sin e): x cos a + y sin a is common to the pixels of a column, which saves half of
     # each pixel's products.
     cosine, sine = azimuth
@@ -130,19 +127,15 @@ class Lanes:
 
 @dataclass
 class Layout:
-    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``.
-
-    ``fields`` is the number of a record's floats without the signal, ``size`` that of transmitters whose sums a lane
-    keeps.
-    """
+    """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
 
     lists: TileLists
     plane: Plane
     n: int
     batch: int
     shared: bool
-    fields: int
-    size: int
+    fields: int  # number of a record's floats without the signal
+    size: int  # transmitters whose sums a lane keeps
 
 
 def lanes_of(layout: Layout) -> Lanes:
@@ -331,10 +324,7 @@ def blend(
 
 
 def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
-    """Complex signal that a receiver gets from each direction of a plane, for each transmitter of the batch.
-
-    Returns real and imaginary part, [batch * height * width], row-major.
-    """
+    """Complex signal (re, im) that a receiver gets from each pixel of a plane, [batch * height * width], row-major."""
     batch, signal = gaussians.batch, gaussians.signal
     if not gaussians.count:
         dark = type(gaussians.position[0])

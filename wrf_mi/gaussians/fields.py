@@ -50,17 +50,13 @@ class Encoding:
     carrier: bool = False
 
     def position(self, points: dr.ArrayBase) -> dr.ArrayBase:
-        """Encoded Gaussian centres [6 * octaves, n], detached.
-
-        The network does not move Gaussians: its gradient through the fast octaves would outweigh the one through the
-        footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
-        """
+        """Encoded Gaussian centres [6 * octaves, n], detached."""
+        # The network does not move Gaussians: its gradient through the fast octaves would outweigh the one through the
+        # footprint (as in Deformable 3D Gaussians, Yang et al. 2024).
         return encode(dr.detach(points), self.position_octaves, self.position_scale_m)
 
     def transmitter(self, points: dr.ArrayBase) -> dr.ArrayBase:
-        """Encoded transmitter positions [6 * octaves, batch], or the given features [features, batch]; with the
-        carrier a row more.
-        """
+        """Encoded transmitter positions [6 * octaves, batch], or features [features, batch]; with the carrier below."""
         if self.features or not self.carrier:
             return points if self.features else encode(points, self.tx_octaves, self.tx_scale_m)
         return dr.concat([encode(points[:3], self.tx_octaves, self.tx_scale_m), points[3:]], axis=0)

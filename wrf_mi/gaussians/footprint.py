@@ -52,11 +52,9 @@ class Footprints:
 
 
 def project(gaussians: Gaussians, pose: Pose) -> Footprints:
-    """Footprints of Gaussians as a receiver sees them. Differentiable in position, scale and rotation.
-
-    A Gaussian whose centre is nearer than ``NEAR_M`` contains the receiver and has no footprint; any other
-    keeps its footprint however large it is.
-    """
+    """Footprints of Gaussians as a receiver sees them. Differentiable in position, scale and rotation."""
+    # A Gaussian whose centre is nearer than ``NEAR_M`` contains the receiver and has no footprint; any other keeps its
+    # footprint however large it is.
     batch = gaussians.batch
     offset = [p - x for p, x in zip(gaussians.position, pose.position, strict=True)]
     local = pose.to_local(offset)
@@ -119,10 +117,8 @@ def depth_order(depth: dr.ArrayBase, position: list[dr.ArrayBase]) -> dr.ArrayBa
 
 @dr.syntax
 def ranked_order(keys: list[dr.ArrayBase]) -> dr.ArrayBase:
-    """Indices in ascending order of the first key, ties by those that follow, then by index.
-
-    Every lane counts the entries before its own: one kernel of n^2 comparisons.
-    """
+    """Indices in ascending order of the first key, ties by those that follow, then by index."""
+    # Every lane counts the entries before its own: one kernel of n^2 comparisons.
     index_type: Any = dr.uint32_array_t(type(keys[0]))
     n = dr.width(keys[0])
     lane = dr.arange(index_type, n)

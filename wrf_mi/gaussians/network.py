@@ -38,10 +38,9 @@ def linear(params: Params, name: str, x: dr.ArrayBase, part: str = "hidden") -> 
 
 
 class _Rectified(dr.CustomOp):
-    """max(product + per-transmitter + per-Gaussian part, 0) with a derivative that sums whole rows.
+    """max(product + per-transmitter + per-Gaussian part, 0) with a derivative that sums whole rows."""
 
-    Dr.Jit's derivative of a bias is a scatter of all columns into one number a row, which takes five times as long.
-    """
+    # Dr.Jit's derivative of a bias is a scatter of all columns into one number a row, which takes five times as long.
 
     def eval(self, product: Any, per_gaussian: Any, per_transmitter: Any) -> Any:
         outputs, self.batch = per_transmitter.shape

@@ -47,10 +47,8 @@ Coefficients = Callable[[NDArray[np.float32]], NDArray[np.complex64]]
 
 
 def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:
-    """The plane cut into rows of tiles, each as a plane with its first pixel and their number.
-
-    Pixels keep their numbers in the whole. The memory beside the result therefore does not grow with the rows.
-    """
+    """The plane cut into rows of tiles, each as a plane with its first pixel and their number."""
+    # Pixels keep their numbers in the whole. The memory beside the result therefore does not grow with the rows.
     across = -(-plane.width // TILE_COLUMNS)
     index_type: Any = type(plane.tile)
     for first in range(0, plane.tiles, across):
@@ -119,10 +117,7 @@ def _store(
 def _fill(
     table: Any, lists: TileLists, strip: Plane, n: int, fields: int, slots: list[Any], out: tuple[Any, ...]
 ) -> None:
-    """Fill ``out``: Gaussian of each entry and its weight (re, and im under product blending).
-
-    ``slots`` are the first entries of each pixel of a lane, ``fields`` the length of the table's records.
-    """
+    """Fill ``out``: Gaussian of each entry and its weight; ``slots`` are the first entries of each pixel of a lane."""
     float_type, index_type = type(table), type(lists.index)
     j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
     t = [(float_type(1), float_type(0)) for _ in slots]
@@ -217,11 +212,10 @@ class _Operator(ABC):
         """Write |R|^2 into ``out``, [batch, height * width]."""
 
     def magnitude(self, signals: ArrayLike, dark: float = 0.0) -> NDArray[Any]:
-        """Spectra sqrt(|R|^2 + dark), [batch, height, width], of complex numbers [batch, K].
-
-        Blocks of `BLOCK` spectra are computed on all processors, their products on one thread each: threads of the BLAS
-        wait for each other by spinning, and where a processor is busy otherwise a product of 0.1 ms then takes 16 ms.
-        """
+        """Spectra sqrt(|R|^2 + dark), [batch, height, width], of complex numbers [batch, K]."""
+        # Blocks of `BLOCK` spectra are computed on all processors, their products on one thread each: threads of the
+        # BLAS wait for each other by spinning, and where a processor is busy otherwise a product of 0.1 ms then takes
+        # 16 ms.
         rows = np.asarray(signals)
         single = self.kind == np.complex64
         out = np.empty((len(rows), self.height * self.width), np.float32 if single else np.float64)
@@ -240,11 +234,9 @@ class _Operator(ABC):
 
 
 class Images(_Operator):
-    """Complex images that add up to a spectrum: R = sum_k c_k image_k.
+    """Complex images [K, height * width] that add up to a spectrum: R = sum_k c_k image_k."""
 
-    ``images`` are complex, [K, height * width]. Real and imaginary parts are products of one real matrix, a fifth
-    faster than a complex product.
-    """
+    # Real and imaginary parts are products of one real matrix, a fifth faster than a complex product.
 
     def __init__(self, images: ArrayLike, height: int, width: int) -> None:
         values = np.asarray(images)

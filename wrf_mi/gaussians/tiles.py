@@ -118,12 +118,10 @@ class TileLists:
 
 
 def _boxes(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBase, ...]:
-    """First and last row, first column and column span of each footprint, in (fractional) pixels.
-
-    The box holds the spherical cap of the footprint's radius: half its azimuth span is
-    asin(sin radius / cos elevation), and all azimuths once the cap holds the zenith. It may start below
-    the horizon; the span wraps around the seam. A footprint that cannot be seen has an empty box.
-    """
+    """First and last row, first column and column span of each footprint, in (fractional) pixels."""
+    # The box holds the spherical cap of the footprint's radius: half its azimuth span is asin(sin radius / cos
+    # elevation), and all azimuths once the cap holds the zenith. It may start below the horizon; the span wraps around
+    # the seam. A footprint that cannot be seen has an empty box.
     x, y, z = (dr.detach(c) for c in footprints.direction)
     radius = footprints.radius
     elevation = dr.atan2(z, dr.sqrt(x * x + y * y))
@@ -184,10 +182,8 @@ def _meets_columns(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase
 
 
 def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> TileLists:
-    """Lists without spare room: those of each row of tiles first, then of its tiles, counted and filled.
-
-    Boxes are near to far for each transmitter, and ``column`` holds their numbers ``b * n + i``, [batch * n].
-    """
+    """Lists without spare room: those of each row of tiles first, then of its tiles, counted and filled."""
+    # Boxes are near to far for each transmitter, and ``column`` holds their numbers ``b * n + i``, [batch * n].
     index_type: Any = type(column)
     n = dr.width(column) // batch
     rows, row_of = np.unique(plane.tile_row.numpy(), return_inverse=True)
@@ -226,10 +222,8 @@ def _list_tiles(
     index: dr.ArrayBase | None,  # [entries of all tiles]
     start: dr.ArrayBase | None,  # [batch * tiles]
 ) -> dr.ArrayBase:
-    """Length of each tile's list, [batch * tiles]; with ``index``, the lists are written from ``start`` on.
-
-    Each tile visits the boxes within its bounds, or the boxes of its row that ``members`` lists there.
-    """
+    """Length of each tile's list, [batch * tiles]; with ``index``, the lists are written from ``start`` on."""
+    # Each tile visits the boxes within its bounds, or the boxes of its row that ``members`` lists there.
     index_type, float_type = type(column), type(boxes[0])
     (first_row, last_row, first_column, span), (begin, end) = boxes, bounds
     tile = dr.arange(index_type, dr.width(begin)) % plane.tiles

@@ -235,10 +235,7 @@ class Graph:
         return values
 
     def learned(self, number: int, params: Mapping[str, Any], batch: Batch, chunked: bool = False) -> Complex:
-        """Signal of the Gaussians on a port's directions, without the receiver's unit (`unit`).
-
-        With ``chunked`` as in `report`. Returns real and imaginary part, [batch * components * directions].
-        """
+        """Signal (re, im) of the Gaussians, [batch * components * directions], at a port, without the `unit`."""
         assert self.field is not None
         evaluate = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
         gaussians = by_component(evaluate(params, _condition(batch)), self.form.components)
@@ -248,11 +245,9 @@ class Graph:
         return self.evaluation(gaussians, pose, batch.plane, self.sphere, params)
 
     def unit(self, params: Mapping[str, Any], batch: Batch, paths: TracedPaths | None = None) -> Any | None:
-        """Factor of the learned signal of each transmitter: the receiver's unit and the batch's weights; None: 1.
-
-        Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
-        error of a mesh scales with its paths, near and far.
-        """
+        """Factor of the learned signal of each transmitter: the receiver's unit and the batch's weights; None: 1."""
+        # Where observations have a unit, it is exp(``level``), and with paths at least a share of their amplitude: the
+        # error of a mesh scales with its paths, near and far.
         if LEVEL not in params:
             return batch.weight
         kind = type(params[LEVEL].array)

@@ -185,10 +185,7 @@ RECEIVERS: Mapping[str, ReceiverKind] = _RECEIVERS  # all receiver models by nam
 
 
 def register(kind: ReceiverKind) -> None:
-    """Add a receiver model for this process (`InputError` if its name is taken).
-
-    An installed package names it by an entry point of `ENTRY_POINTS`.
-    """
+    """Add a receiver model for this process (`InputError` if its name is taken); packages state `ENTRY_POINTS`."""
     _RECEIVERS.add(kind.name, kind)
 
 

@@ -29,11 +29,7 @@ MIRRORED, ALIGNED = 1e-6, 1e-9
 
 
 def mirror_order(elements_m: ArrayLike) -> IntArray | None:
-    """Index of the element opposite to each through the array's centre, [m]; None where an element has no opposite.
-
-    Args:
-        elements_m: [m, 3], or [m, 1] on a line.
-    """
+    """Element [m] opposite to each of [m, 3] (or [m, 1]) through the array's centre; None where one has no opposite."""
     elements = np.asarray(elements_m, float)
     centre = elements.mean(axis=0)
     distance = cdist(2 * centre - elements, elements)

@@ -138,10 +138,8 @@ def _spherical_waves(
 
 
 def received_power(paths: Paths) -> FloatArray:
-    """Sum of the powers of all paths, shape [n_rx, n_tx]; 0 where no path arrives.
-
-    Powers of paths add up after averaging over positions of a wavelength or over a wide band.
-    """
+    """Sum of the powers of all paths, shape [n_rx, n_tx]; 0 where no path arrives."""
+    # Powers of paths add up after averaging over positions of a wavelength or over a wide band.
     power = np.zeros((paths.n_rx, paths.n_tx))
     np.add.at(power, (paths.rx, paths.tx), np.abs(paths.gain) ** 2)
     return power
@@ -153,10 +151,8 @@ def rssi_dbm(paths: Paths) -> FloatArray:
 
 
 def phase_draws(count: int) -> FloatArray:
-    """`DRAWS` quantiles of a standard normal variable for each of ``count`` paths [count, DRAWS], in random order.
-
-    Those of a path are the same for any number of others.
-    """
+    """`DRAWS` quantiles of a standard normal variable for each of ``count`` paths [count, DRAWS], in random order."""
+    # Those of a path are the same for any number of others.
     order = np.random.default_rng(0).random((count, DRAWS)).argsort(axis=1)
     return np.asarray(ndtri((order + 0.5) / DRAWS), float)
 

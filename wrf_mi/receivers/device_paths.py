@@ -46,12 +46,7 @@ class TracedPaths:
 
 
 class Ports:
-    """Positions and frequencies of a receiver's m complex signals, kept on the device.
-
-    Args:
-        offset_m: positions in the receiver's frame, [m, 3], metres.
-        frequency_hz: frequency of each port, [m].
-    """
+    """Positions [m, 3] in the receiver's frame, metres, and frequencies [m] of a receiver's signals, on the device."""
 
     def __init__(self, offset_m: FloatArray, frequency_hz: ArrayLike) -> None:
         frequencies = np.asarray(frequency_hz, float)

@@ -97,15 +97,12 @@ def remainder(changes: Sequence[float]) -> float:
 
 @dataclass
 class _Search:
-    """Reports of sampled transmitters [n, 3] under several settings, and the settings that were tried.
-
-    ``share_db`` is the largest change of a part that counts as converged.
-    """
+    """Reports of sampled transmitters [n, 3] under several settings, and the settings that were tried."""
 
     trace: Callable[..., TraceResult]
     positions_m: FloatArray
     spectra: Spectra | None
-    share_db: float
+    share_db: float  # largest change of a part that counts as converged
     trials: list[Trial] = field(default_factory=lambda: [Trial("depth", 1, None, True)])
     reports: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = field(default_factory=dict)
 

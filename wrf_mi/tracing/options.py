@@ -122,11 +122,7 @@ KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scatteri
 
 
 def stated_kinds(text: str) -> dict[str, bool]:
-    """Fields of `TraceOptions` that trace the kinds of path in a list separated by commas, and no others.
-
-    Raises:
-        InputError: a kind that is not among `KINDS`.
-    """
+    """Fields of `TraceOptions` for the kinds of path in a list separated by commas; `InputError` for unknown ones."""
     asked = [kind.strip() for kind in text.split(",")]
     if unknown := [kind for kind in asked if kind not in KINDS]:
         raise InputError(f"kind of path {unknown[0]!r}: unknown; choose from {', '.join(KINDS)}")

@@ -200,10 +200,8 @@ def load_trace(file: str | Path) -> TraceResult:
 
 
 def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[np.bool_]:
-    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all.
-
-    That bounds the error of a sum of the paths, whatever their phases.
-    """
+    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all."""
+    # That bounds the error of a sum of the paths, whatever their phases.
     # Cumulative sums of ascending amplitudes, transmitter by transmitter.
     order = np.lexsort((amplitude, tx))
     ordered, upto = tx[order], np.cumsum(amplitude[order])

@@ -161,10 +161,7 @@ def read_materials(scene: Any) -> SlabMaterials:
 
 
 def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
-    """The slabs of a ``sionna.rt.Scene``, by named material or by surface, and the index of each face's slab [f].
-
-    The index is -1 where the face's material is not a slab.
-    """
+    """Slabs of a ``sionna.rt.Scene``, by named material or surface, and the index of each face's slab [f], -1: none."""
     named = read_materials(scene)
     kinds = [scene.objects[name].radio_material.name for name in surfaces.names]
     number = np.array([named.names.index(kind) if kind in named.names else -1 for kind in kinds], np.int64)

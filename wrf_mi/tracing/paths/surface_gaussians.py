@@ -132,10 +132,7 @@ class PathWeights:
         return cls(on_device(indices, mi.UInt32), on_device(weights, Float64), depth * NEAREST)
 
     def factor(self, factors: Any, paths: Any | None = None) -> Complex:
-        """Complex factor of each path's gain, or of paths by their numbers ``paths``; None: all. Differentiable.
-
-        ``factors`` is the tensor `FACTOR`, [2, g].
-        """
+        """Complex factor of the gain of each path, or of the paths ``paths``, for `FACTOR` [2, g]. Differentiable."""
         index, weight = self.index, self.weight
         if paths is not None:
             slot = dr.arange(mi.UInt32, dr.width(paths) * self.each)

@@ -234,10 +234,8 @@ class TracedField:
         return PathStatistics.of_paths(transmitter, len(self), power, length_m.numpy(), world)
 
     def select(self, tables: SceneTables, planes: IntArray, slabs: IntArray) -> TracedField:
-        """The same paths with parameters of some planes and materials alone, all those that paths meet among them.
-
-        The result is not searched again: ``tables`` (`SceneTables.select`) have no other surfaces.
-        """
+        """The same paths with parameters of some planes and materials alone, all those that paths meet among them."""
+        # The result is not searched again: ``tables`` (`SceneTables.select`) have no other surfaces.
         result = copy(self)
         result._set_tables(tables)
         result.chains = replace(self.chains, levels=renumbered(self.chains.levels, planes, slabs))

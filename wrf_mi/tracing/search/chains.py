@@ -177,11 +177,9 @@ def _unique_rows(rows: IntArray) -> IntArray:
 def possible(
     surfaces: Surfaces, chains: ReflectionChains, targets_m: FloatArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Indices of chains and of targets [n, 3] whose points of reflection lie within the bounds of the chain's planes.
-
-    A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
-    Pairs come in chunks, each by the number of reflections.
-    """
+    """Indices of chains and targets [n, 3] whose points of reflection lie within the bounds of the chain's planes."""
+    # A test without rays in single precision, which a few in a thousand pairs pass; some in vain, as it has some slack.
+    # Pairs come in chunks, each by the number of reflections.
     import drjit as dr
     import mitsuba as mi
 

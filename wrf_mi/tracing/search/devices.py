@@ -29,10 +29,7 @@ PAIRS_PER_CHUNK = 1 << 20
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
-    """Warn of antennas at positions [n, 3], metres, outside the scene.
-
-    `InputError` names the first antenna inside a solid object by ``names``, such as ``transmitter 3``.
-    """
+    """Warn of antennas at positions [n, 3], metres, outside the scene; `InputError` names the first inside a solid."""
     enclosing = solid_around(surfaces, positions_m)
     if (enclosing >= 0).any():
         first = int(np.argmax(enclosing >= 0))

@@ -71,10 +71,7 @@ def meeting_point(
 def specular_paths(
     surfaces: Surfaces, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
 ) -> Legs:
-    """Unobstructed paths from sources [s, 3] to targets [n, 3], metres, by reflections of chains from these sources.
-
-    Vertices are in float64 on the surfaces' planes.
-    """
+    """Unobstructed paths, exact in float64, from sources [s, 3] to targets [n, 3], metres, by chains from sources."""
     depth = max(options.depth, 1)
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
     source, target = np.divmod(direct, len(targets_m))

@@ -224,10 +224,8 @@ def shape_id(mesh: Any) -> int:
 def find_planes(
     names: tuple[str, ...], shape_ids: NDArray[np.uint32], first_face: IntArray, triangles: FloatArray
 ) -> Surfaces:
-    """Group faces into planes by rounded normal and offset; the largest planes then take in all faces within them.
-
-    The second step joins a wall with its slivers, whose normals are inexact.
-    """
+    """Group faces into planes by rounded normal and offset; the largest planes then take in all faces within them."""
+    # The second step joins a wall with its slivers, whose normals are inexact.
     centre, cross = triangles.mean(axis=1), trimesh.triangles.cross(triangles)
     area = np.linalg.norm(cross, axis=1) / 2
     # Faces without area get any normal: no ray meets them.
