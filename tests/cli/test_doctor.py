@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from wrf_mi import backend
-from wrf_mi.backend import libraries, probe, remedy
+from wrf_mi.backend import libraries, probe
 from wrf_mi.cli import doctor
 from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError
@@ -92,8 +92,8 @@ def test_report_without_any_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
     found = doctor.report()
     assert not found["ok"]
     assert found["backend"] is None
-    assert {"problem": "no usable LLVM (none was found)", "remedy": remedy.install_line()} in found["problems"]
-    assert f"remedy: {remedy.install_line()}" in doctor.render(found)
+    assert {"problem": "no usable LLVM (none was found)", "remedy": libraries.install_line()} in found["problems"]
+    assert f"remedy: {libraries.install_line()}" in doctor.render(found)
 
 
 def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +130,7 @@ def test_apt_installs_the_newest_working_llvm(system: System, monkeypatch: pytes
 def test_line_for_a_system_without_package_lists(system: System) -> None:
     system.command("apt-get")
     system.command("apt-cache")
-    assert remedy.install_line() == f"apt-get update && {INSTALL} libllvm19 libatomic1"
+    assert libraries.install_line() == f"apt-get update && {INSTALL} libllvm19 libatomic1"
 
 
 def test_apt_fetches_missing_lists(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +155,7 @@ def test_without_rights_the_error_is_the_line_to_run(system: System, monkeypatch
     system.command("apt-get")
     system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
     works_after(monkeypatch, system, "never")
-    assert remedy.install_line() == f"sudo {INSTALL} libllvm22t64 libatomic1"
+    assert libraries.install_line() == f"sudo {INSTALL} libllvm22t64 libatomic1"
     with pytest.raises(BackendError, match="no usable LLVM"):
         doctor.install_llvm()
     system.command("sudo", "exit 1")  # asks for a password
@@ -184,8 +184,8 @@ def test_brew_needs_no_root(system: System, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_unknown_system_gets_advice(system: System) -> None:
-    assert remedy.install_commands() == []
-    assert "DRJIT_LIBLLVM_PATH" in remedy.install_line()
+    assert libraries.install_commands() == []
+    assert "DRJIT_LIBLLVM_PATH" in libraries.install_line()
 
 
 def test_a_named_library_is_not_replaced(system: System, monkeypatch: pytest.MonkeyPatch) -> None:

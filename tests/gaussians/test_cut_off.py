@@ -15,8 +15,8 @@ from scipy.special import logit
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core.angles import pixel_directions
-from wrf_mi.gaussians.density import LEAST_OPACITY, adapt
 from wrf_mi.gaussians.footprint import CUTOFF, depth_order, project, ranked_order
+from wrf_mi.gaussians.initial import LEAST_OPACITY, adapt
 from wrf_mi.gaussians.tiles import build_lists, perception_plane
 
 pytestmark = pytest.mark.all_threads

@@ -19,7 +19,7 @@ from scipy.stats import kstest
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
-from wrf_mi.gaussians.density import (
+from wrf_mi.gaussians.initial import (
     LEAST_OPACITY,
     RESET_OPACITY,
     SPLIT_SHRINK,

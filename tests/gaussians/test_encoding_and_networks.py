@@ -16,8 +16,7 @@ from hypothesis.extra.numpy import arrays
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.gaussians import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians
-from wrf_mi.gaussians.encoding import encode, encoded_size, unambiguous_scale
-from wrf_mi.gaussians.network import dense, dense_of_pairs, init_layer, linear
+from wrf_mi.gaussians.network import dense, dense_of_pairs, encode, encoded_size, init_layer, linear, unambiguous_scale
 
 FLOAT64_TOLERANCE = 1e-9
 """Ten octaves of a coordinate up to 100 m: sin(2^9 pi 100) in NumPy itself is good to 160,000 * 2e-16 = 4e-11."""

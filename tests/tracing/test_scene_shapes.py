@@ -19,7 +19,7 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.surfaces import Surfaces, scene_surfaces
-from wrf_mi.tracing.sionna.scene_shapes import SEGMENTS
+from wrf_mi.tracing.sionna.scenes import SEGMENTS
 
 METAL = '<bsdf type="itu-radio-material" id="mat-metal_of_test"><string name="type" value="metal"/></bsdf>'
 USED = '<ref id="mat-metal_of_test" name="bsdf"/>'

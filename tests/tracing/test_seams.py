@@ -17,8 +17,8 @@ from wrf_mi.backend.device import to_vectors
 from wrf_mi.core import Paths
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
+from wrf_mi.tracing.search.chains import TRANSMISSION
 from wrf_mi.tracing.search.images import displaced
-from wrf_mi.tracing.search.legs import TRANSMISSION
 from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, find_planes, screens
 
 LONG, WIDE, HIGH, WALL = 8.0, 4.0, 2.5, 4.0

@@ -12,7 +12,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
-from wrf_mi.tracing.search.legs import SPECULAR, TRANSMISSION
+from wrf_mi.tracing.search.chains import SPECULAR, TRANSMISSION
 from wrf_mi.tracing.search.surfaces import Surfaces
 from wrf_mi.tracing.search.visibility import unobstructed
 

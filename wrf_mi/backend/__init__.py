@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import BackendError, InputError
-from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary, find_cuda, find_llvm
+from .libraries import CUDA_VARIABLE, GOOD_FROM, LLVM_VARIABLE, LlvmLibrary, find_cuda, find_llvm, install_line
 from .probe import VARIANTS, try_cuda, try_llvm
-from .remedy import GOOD_FROM, install_line
 
 __all__ = [
     "VARIANTS",

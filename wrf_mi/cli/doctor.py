@@ -10,8 +10,8 @@ import sys
 from typing import Any
 
 from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
+from ..backend.libraries import install_commands, package_manager
 from ..backend.probe import installed_version, try_cuda, try_llvm
-from ..backend.remedy import install_commands, package_manager
 from ..parallel.threads import processors
 from .options import Arguments, add_command
 from .output import show

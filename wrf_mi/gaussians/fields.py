@@ -13,9 +13,8 @@ import drjit as dr
 import numpy as np
 
 from ..core import InputError
-from .encoding import encode, encoded_size
 from .initial import InitialGaussians
-from .network import Params, Weights, dense, dense_of_pairs, init_layer, linear
+from .network import Params, Weights, dense, dense_of_pairs, encode, encoded_size, init_layer, linear
 from .parameters import Gaussians, common_geometry, logistic, rows
 
 GEOMETRY = ("position", "log_scale", "rotation")
@@ -30,7 +29,7 @@ A field whose geometry and attenuation do not depend on the transmitter has ``st
 class Encoding:
     """Positional encoding of Gaussians and transmitters.
 
-    The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.gaussians.encoding`.
+    The paper has ten octaves (L = 9) for both and names no scale of coordinates; see `wrf_mi.gaussians.network`.
 
     Attributes:
         position_octaves: octaves of Gaussian centres.

@@ -1,8 +1,7 @@
 """Receiver models in NumPy: from traced paths to spectra, channel coefficients and signal strengths, and back."""
 
-from .array import array_response, bartlett_spectrum
+from .array import Lags, array_response, bartlett_spectrum
 from .channel import antenna_csi, array_channels, csi, received_power, rssi_dbm
-from .lags import Lags
 from .reports import minmax_scale
 
 __all__ = [

@@ -25,8 +25,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..parallel.threads import on_threads
-from .array import mirror_order
-from .lags import Lags
+from .array import Lags, mirror_order
 
 ComplexArray = NDArray[np.complex128]
 

@@ -21,7 +21,7 @@ from ..core.settings import (
     ShareBelow1,
     with_settings,
 )
-from ..gaussians.encoding import unambiguous_scale
+from ..gaussians.network import unambiguous_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
 from ..tasks import TASKS
@@ -123,7 +123,7 @@ class InitialConfig:
 
 @dataclass(frozen=True)
 class EncodingConfig:
-    """Positional encoding (`wrf_mi.gaussians.encoding`).
+    """Positional encoding (`wrf_mi.gaussians.network`).
 
     Attributes:
         position_octaves: octaves for Gaussians, L + 1 of the paper.
@@ -199,7 +199,7 @@ class OptimiserConfig(AdamConfig):
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Adaptive density control (Kerbl et al. 2023, section 5.2; `wrf_mi.gaussians.density`).
+    """Adaptive density control (Kerbl et al. 2023, section 5.2; `wrf_mi.gaussians.initial`).
 
     Attributes:
         every: steps between two rounds; 0 turns it off.
@@ -218,7 +218,7 @@ class DensityConfig:
     max_gaussians: Count = 320
     reset_every: int = 0
 
-    # Constants of `wrf_mi.gaussians.density`, which run files of earlier versions have as settings.
+    # Constants of `wrf_mi.gaussians.initial`, which run files of earlier versions have as settings.
     FIXED: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
 
 

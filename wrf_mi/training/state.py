@@ -12,7 +12,7 @@ from drjit.opt import Adam
 from numpy.typing import NDArray
 
 from ..backend.device import to_float, to_tensor
-from ..gaussians.density import DensityChange
+from ..gaussians.initial import DensityChange
 
 Arrays = dict[str, NDArray[Any]]
 KEPT = (

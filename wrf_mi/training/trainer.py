@@ -11,7 +11,7 @@ import numpy as np
 from ..backend import init
 from ..core import Record, Split
 from ..gaussians import InitialGaussians
-from ..gaussians.density import adapt, reset_opacity
+from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
 from .adam import NonFiniteReport
 from .by_distance import Reach

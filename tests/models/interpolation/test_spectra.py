@@ -26,7 +26,7 @@ from wrf_mi.models.interpolation.spectra import (
     signal_weight,
 )
 from wrf_mi.models.model import Inputs, field_arrays, from_field_arrays
-from wrf_mi.receivers.lags import Lags
+from wrf_mi.receivers.array import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
 from wrf_mi.training.session import FitSession, OnProgress, quiet
 

@@ -32,8 +32,7 @@ from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray, pixel_directions
 from ...core.settings import Count
 from ...parallel.threads import one_blas_thread
-from ...receivers.array import array_response
-from ...receivers.lags import Lags
+from ...receivers.array import Lags, array_response
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress

@@ -57,7 +57,7 @@ class DcganSettings(NetworkSettings):
         hidden: neurons before the coarse grid.
         channels: channels of the coarse grid; halved at each finer grid.
         octaves: octaves of the position's encoding.
-        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
+        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.network`).
     """
 
     steps: int = 1875

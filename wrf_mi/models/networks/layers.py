@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...backend.device import to_tensor
 from ...core import InputError
 from ...core.angles import FloatArray
-from ...gaussians.encoding import encode, encoded_size
+from ...gaussians.network import encode, encoded_size
 
 GAIN = float(np.sqrt(2.0))
 """Deviation of initial weights times the root of a layer's inputs, where a rectifier follows (He et al. 2015)."""
@@ -156,7 +156,7 @@ class Coordinates:
 def with_encoding(points: Any, octaves: int, scale_m: float, factor: Any) -> Any:
     """Points [3, n] times a factor, and their positional encoding, [3 + 6 octaves, n].
 
-    NeRF's code gives its network both. ``scale_m`` is the unit of the encoding (`wrf_mi.gaussians.encoding`).
+    NeRF's code gives its network both. ``scale_m`` is the unit of the encoding (`wrf_mi.gaussians.network`).
     """
     return dr.concat([points * factor, encode(points, octaves, scale_m)], axis=0)
 

@@ -47,7 +47,7 @@ class Networks:
         skip: hidden layers before the encoded point enters again; 0: it does not.
         point_octaves: octaves of the encoding of points.
         view_octaves: octaves of the encoding of directions.
-        scale_m: unit of encoded points and transmitters, metres (`wrf_mi.gaussians.encoding`).
+        scale_m: unit of encoded points and transmitters, metres (`wrf_mi.gaussians.network`).
     """
 
     layers: Count = 8

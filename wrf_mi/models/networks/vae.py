@@ -47,7 +47,7 @@ class VaeSettings(NetworkSettings):
         width: neurons of the hidden layers.
         last: neurons of the decoder's second hidden layer, which precedes the pixels: most weights lie behind it.
         octaves: octaves of the position's encoding.
-        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.encoding`).
+        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.network`).
     """
 
     steps: int = 3750

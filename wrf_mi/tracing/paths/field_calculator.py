@@ -26,7 +26,7 @@ from ...core import Antenna
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.types import IntArray
-from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 
 ALONG = 1e-12

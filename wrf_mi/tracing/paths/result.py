@@ -18,7 +18,7 @@ from ...core.paths import read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import IntArray
 from ..options import TraceOptions
-from ..search.legs import Legs
+from ..search.chains import Legs
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.materials import absorbs
 from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
@@ -33,8 +33,8 @@ class TraceResult:
         tx_pos_m: transmitters [n_tx, 3], metres.
         receivers: the ``n_rx`` receivers.
         primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
-        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.search.legs.Legs`.
-        wedge: edges of diffraction, see `wrf_mi.tracing.search.legs.Legs`; empty without diffraction.
+        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.search.chains.Legs`.
+        wedge: edges of diffraction, see `wrf_mi.tracing.search.chains.Legs`; empty without diffraction.
         options: the options of the trace.
         rays: number of rays from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: whether the search went from receivers to transmitters.

@@ -17,10 +17,9 @@ from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.types import IntArray
 from ..options import DEFAULTS, MAX_RAYS, TraceOptions
-from ..search.chains import ReflectionChains, check_search, shoot
+from ..search.chains import Legs, ReflectionChains, check_search, join, shoot
 from ..search.devices import before_surfaces, check_devices, from_behind
 from ..search.images import image_sources, specular_paths
-from ..search.legs import Legs, join
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scattering_materials
 from .result import TraceResult, device_ends

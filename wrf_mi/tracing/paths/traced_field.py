@@ -33,7 +33,7 @@ from ...core.types import IntArray
 from ...receivers.device_paths import TracedPaths
 from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions
-from ..search.legs import SPECULAR, TRANSMISSION
+from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
 from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths

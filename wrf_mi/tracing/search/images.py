@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..options import TraceOptions
-from .chains import ReflectionChains, possible
+from .chains import SPECULAR, Legs, ReflectionChains, join, possible
 from .devices import before_surfaces, clear_m
-from .legs import SPECULAR, Legs, join
 from .surfaces import Surfaces
 from .visibility import reflect_on_faces, unobstructed
 

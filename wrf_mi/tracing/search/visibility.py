@@ -16,7 +16,7 @@ from trimesh.triangles import closest_point
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .legs import SPECULAR, TRANSMISSION, Legs
+from .chains import SPECULAR, TRANSMISSION, Legs
 from .surfaces import ENLARGED, Surfaces
 
 STEP = 5e-7

@@ -20,8 +20,8 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.antenna import MountedAntenna
 from ..options import TraceOptions
+from ..search.chains import SPECULAR, TRANSMISSION, Legs, join
 from ..search.images import image_sources
-from ..search.legs import SPECULAR, TRANSMISSION, Legs, join
 from ..search.surfaces import Surfaces
 
 SLOTS_PER_CHUNK = 1 << 22

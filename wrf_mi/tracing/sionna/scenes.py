@@ -1,18 +1,32 @@
-"""Opening of Sionna RT scenes from a name, a scene folder, a Mitsuba XML or a bare mesh."""
+"""Opening of Sionna RT scenes from a name, a scene folder, a Mitsuba XML or a bare mesh.
+
+Sionna RT traces meshes of triangles only. Mitsuba fans polygons from their first corner, which covers more than a
+concave polygon, or refuses them, and its rectangles, disks, spheres and cylinders have no triangles.
+"""
 
 from __future__ import annotations
 
+import logging
+import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 
 from ... import backend
 from ...core import InputError
+from ...core.angles import FloatArray
+from ...core.files import one_line
 from ...core.yaml_files import read_yaml
 from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
@@ -20,9 +34,234 @@ from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import thicknesses
 from ...scene.mesh.files import mesh_parts
 from ...scene.mesh.surfaces import sampled
-from ...scene.xml_file import read_scene_xml
-from .materials import perfect_reflector, set_frequency
-from .scene_shapes import check_materials, load_checked, plain_ply, replace_shapes
+from ...scene.xml_file import FILES, named_shapes, read_scene_xml
+from .materials import CONSTANTS, perfect_reflector, set_frequency
+
+logger = logging.getLogger(__name__)
+
+MESHES = ("ply", "obj")  # shapes that are files of vertices and faces
+SEGMENTS = 32
+"""Segments of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off."""
+CHECKED_FILES = 4096  # files whose triangles are remembered: a scene is opened once for each carrier and fold
+REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)  # errors of Mitsuba and Sionna RT about a scene file
+PLACE = re.compile(r"^\[[\w.]+:\d+\] (((Error while|While) loading|At) string \(line \d+, col \d+\): )?")
+"""Begin of Mitsuba's messages: its source line, and a place in a text that is not the file."""
+PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")
+"""Properties of a radio material in a scene file."""
+VALUES = ("float", "integer", "boolean", "string", "point", "vector", "transform")
+"""Elements that are parameters of a shape without a file."""
+
+
+def _unit_shape(plugin: str) -> trimesh.Trimesh | None:
+    """Mesh of a Mitsuba plugin in its own frame, as its ``to_world`` places it; None for another plugin."""
+    if plugin == "rectangle":
+        return trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, SEGMENTS // 2 + 1)
+    # Radius and height along a line that is turned about z; on the axis it is 0, not its rounding, to close the mesh.
+    lines: dict[str, FloatArray] = {
+        "disk": np.array([[0, 0], [1, 0]]),
+        "cylinder": np.array([[1, 0], [1, 1]]),
+        "sphere": np.column_stack([np.cos(angle) * (np.abs(angle) < np.pi / 2), np.sin(angle)]),
+    }
+    if plugin not in lines:
+        return None
+    return trimesh.creation.revolve(lines[plugin], sections=SEGMENTS)
+
+
+def replace_shapes(root: Element, path: Path, folder: Path) -> None:
+    """Replace, in place, shapes that Mitsuba does not read as our triangles, and make names of files absolute.
+
+    Rectangles become two triangles; disks, spheres and cylinders become inscribed meshes of `SEGMENTS` segments
+    (logged). A mesh file whose polygons Mitsuba reads as other triangles than `mesh_parts` does, or not at all, becomes
+    a file of those triangles in ``folder``, which the scene needs until it is loaded. All other shapes stay as they
+    are.
+
+    Raises:
+        InputError: naming the file, the shape, and the remedy: a shape without triangles or with a parameter that
+            Mitsuba does not know, or a mesh that cannot be read.
+    """
+    for text in root.iter("string"):
+        if text.get("name") in FILES:
+            text.set("value", str((path.parent / text.get("value", "")).absolute()))
+    for number, (name, shape) in enumerate(named_shapes(root)):
+        plugin = shape.get("type", "")
+        try:
+            if plugin in ("instance", "shapegroup"):
+                raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
+            if plugin in MESHES:
+                content = _mesh_content(shape)
+            elif (mesh := _unit_shape(plugin)) is not None:
+                content = _placed_content(mesh, shape, root.get("version", ""), f"{path}: {name}")
+            else:
+                continue
+        except InputError as error:
+            raise InputError(f"{path}: {name}: {one_line(error)}") from None
+        if content is None:
+            continue
+        # Mitsuba describes a shape by the name of its file, by which messages name the object.
+        stated = next((text for text in shape.findall("string") if text.get("name") in FILES), None)
+        text = SubElement(shape, "string", name="filename", value=plugin) if stated is None else stated
+        place = folder / str(number) / Path(text.get("value", "")).name
+        place.parent.mkdir()
+        place.write_bytes(content)
+        text.set("value", str(place))
+        shape.set("type", "ply")
+
+
+def _mesh_content(shape: Element) -> bytes | None:
+    """PLY of a mesh file's triangles; None where Mitsuba reads the same ones."""
+    files = [text.get("value", "") for text in shape.findall("string") if text.get("name") in FILES]
+    if len(files) != 1:
+        raise InputError(f'has {len(files)} file names; give one: <string name="filename" value="..."/>')
+    file = Path(files[0])
+    stat = file.stat() if file.exists() else None
+    return _own_triangles(file, shape.get("type", ""), stat and (stat.st_ino, stat.st_size, stat.st_mtime_ns))
+
+
+@lru_cache(CHECKED_FILES)
+def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) -> bytes | None:
+    """`_mesh_content` of a file, which is read again if its state (inode, bytes, time of change) is another one."""
+    # Faces of vertices that are not there are refused first: Mitsuba follows them, and ends the process.
+    parts = mesh_parts(file)
+    if not parts:
+        raise InputError(f"{file}: holds no triangles; remove the shape or restore the file")
+    mesh = cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
+    corners = np.asarray(mesh.vertices, np.float32)[mesh.faces]
+    if not np.isfinite(corners).all():
+        raise InputError(f"{file}: an invalid vertex position, not a finite number; correct it")
+    if _same_triangles(corners, _triangles_by_mitsuba(file, plugin)):
+        return None
+    logger.info("%s: read as %d triangles, which Mitsuba reads otherwise or not at all", file, len(corners))
+    return plain_ply(mesh)
+
+
+def _triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
+    """Corners [f, 3, 3] of a mesh file as Mitsuba reads it; none where it refuses the file."""
+    import mitsuba as mi
+
+    try:
+        with _quiet_mitsuba():
+            # Normals of vertices are not needed, and cannot be computed for every file.
+            mesh: Any = mi.load_dict({"type": plugin, "filename": str(file), "face_normals": True})
+    except RuntimeError:
+        return np.zeros((0, 3, 3), np.float32)
+    corners = mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
+    return cast(NDArray[np.float32], corners[mesh.faces_buffer().numpy().reshape(-1, 3)])
+
+
+@contextmanager
+def _quiet_mitsuba() -> Iterator[None]:
+    """Without warnings, which loading of the scene repeats where they concern it."""
+    import mitsuba as mi
+
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
+
+
+def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
+    """Whether triangles [f, 3, 3] are the same, in any order and with any order of their corners."""
+    if first.shape != second.shape or np.array_equal(first, second):
+        return first.shape == second.shape
+    _, corner = np.unique(np.concatenate([first, second]).reshape(-1, 3), axis=0, return_inverse=True)
+    rows = np.sort(corner.reshape(2, -1, 3), axis=2)
+    return all(np.array_equal(*(part[np.lexsort(part.T)][:, k] for part in rows)) for k in range(3))
+
+
+def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: str) -> bytes:
+    """PLY of a unit shape's mesh in the scene's frame; the shape loses its parameters."""
+    import mitsuba as mi
+
+    # Mitsuba reads the parameters: its to_world then holds centre, radius and ends, too, and it names unknown ones.
+    alone = Element("scene", version=version)  # older versions have other names of parameters
+    stated = SubElement(alone, "shape", type=shape.get("type", ""))
+    stated.extend([child for child in shape if child.tag in VALUES])
+    for child in stated:
+        shape.remove(child)
+    try:
+        with _quiet_mitsuba():
+            loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
+        to_world = mi.traverse(loaded.shapes()[0])["to_world"].matrix.numpy().reshape(4, 4).astype(float)
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise InputError(f"cannot be opened ({reason(error)}); correct the shape") from None
+    placed = mesh.copy()
+    if np.isfinite(to_world).all():
+        placed.apply_transform(to_world)
+    if not np.isfinite(to_world).all() or not placed.area_faces.min() > 0:
+        raise InputError("has no area; give a radius and a transform that leave one")
+    if (plugin := shape.get("type", "")) != "rectangle":
+        # Facets of a sphere lie off it by both the angle between meridians and that between parallels.
+        round_axes, angles = (3, 2) if plugin == "sphere" else (2, 1)
+        off_m = (1 - np.cos(np.pi / SEGMENTS) ** angles) * np.linalg.norm(to_world[:3, :round_axes], 2)
+        logger.info("%s: a %s as %d triangles, up to %.2g m off it", where, plugin, len(placed.faces), off_m)
+    return plain_ply(placed)
+
+
+def plain_ply(mesh: trimesh.Trimesh) -> bytes:
+    """PLY of vertices and faces alone: Mitsuba warns of unknown attributes."""
+    bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return cast(bytes, bare.export(file_type="ply", vertex_normal=False))
+
+
+def check_materials(root: Element, path: Path) -> None:
+    """Refuse (`InputError`) a BSDF, in a shape or beside the shapes, without the id by which Sionna RT knows it."""
+    materials = [(f"<bsdf> {number}", bsdf) for number, bsdf in enumerate(root.findall("bsdf"), start=1)]
+    materials += [(f"{name}: its <bsdf>", bsdf) for name, shape in named_shapes(root) for bsdf in shape.findall("bsdf")]
+    for where, bsdf in materials:
+        if not bsdf.get("id"):
+            remedy = 'give it one of its own, such as id="mat-my_material"'
+            raise InputError(f"{path}: {where} ({bsdf.get('type')}) has no id; {remedy}")
+
+
+def load_checked(root: Element, path: Path, folder: Path) -> Any:
+    """Load a scene in Sionna RT from the root of its file, by way of a file in a folder.
+
+    `InputError` names the file, the shape at fault where it is one, and Mitsuba's or Sionna RT's reason.
+    """
+    try:
+        return _load(root, folder / "scene.xml")
+    except REFUSALS as error:
+        fault = error
+    # Most messages do not name the shape: the first that cannot be loaded alone is at fault.
+    shared = [element for element in root if element.tag != "shape"]
+    names = {id(shape): name for name, shape in named_shapes(root)}
+    name = ""
+    for shapes in [[], *([shape] for shape in root.findall("shape"))]:
+        part = Element("scene", root.attrib)
+        part.extend([*shared, *shapes])
+        try:
+            _load(part, folder / "scene.xml")
+        except REFUSALS as error:
+            fault, name = error, f"{names[id(shapes[0])]}: " if shapes else ""
+            break
+    if "ITU material" in str(fault):
+        known = ", ".join(THICKNESS_M)
+        raise InputError(f"{path}: {name}{reason(fault)}; known are {known}, and constants of your own")
+    raise InputError(f"{path}: {name}cannot be opened ({reason(fault)}); correct the scene")
+
+
+def _load(root: Element, file: Path) -> Any:
+    from sionna import rt
+
+    ElementTree.ElementTree(root).write(file)
+    # Merged shapes, and with them the paths, have a random order.
+    return rt.load_scene(str(file), merge_shapes=False)
+
+
+def reason(error: Exception) -> str:
+    """Mitsuba's or Sionna RT's reason for a refusal, without places in source code and in a text made by us."""
+    text = str(error).strip() or type(error).__name__
+    if "Traceback" in text:  # of Sionna RT's error, which Mitsuba repeats
+        text = re.sub(r"^\w+: ", "", text.splitlines()[-1])
+        if text.endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
+            text = f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
+    elif unknown := re.findall(r'^\s*- (\w+ "[^"]*")', text, re.MULTILINE):
+        text = f"unknown property {', '.join(unknown)}"
+    return one_line(PLACE.sub("", text))
+
 
 MESHES = (".stl", ".ply", ".obj", ".glb")
 HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
