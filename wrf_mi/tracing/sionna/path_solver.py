@@ -126,10 +126,7 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
 def sampled_paths(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions, rays: int
 ) -> Legs:
-    """Paths with at least one diffuse reflection or diffraction from a source [3] to each target [n, 3], metres.
-
-    Source 0, target 0..n-1; vertices are in single precision.
-    """
+    """Paths from a source [3] to targets [n, 3], metres, that scatter or diffract; vertices in single precision."""
     import drjit as dr
     import mitsuba as mi
     from sionna.rt.path_solvers.image_method import ImageMethod

@@ -39,7 +39,9 @@ from .materials import CONSTANTS, perfect_reflector, set_frequency
 
 logger = logging.getLogger(__name__)
 
-MESHES = ("ply", "obj")  # shapes that are files of vertices and faces
+MESH_PLUGINS = ("ply", "obj")  # Mitsuba's shapes that are files of vertices and faces
+MESHES = (".stl", ".ply", ".obj", ".glb")
+HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
 SEGMENTS = 32
 """Segments of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off."""
 CHECKED_FILES = 4096  # files whose triangles are remembered: a scene is opened once for each carrier and fold
@@ -88,7 +90,7 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
         try:
             if plugin in ("instance", "shapegroup"):
                 raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
-            if plugin in MESHES:
+            if plugin in MESH_PLUGINS:
                 content = _mesh_content(shape)
             elif (mesh := _unit_shape(plugin)) is not None:
                 content = _placed_content(mesh, shape, root.get("version", ""), f"{path}: {name}")
@@ -261,10 +263,6 @@ def reason(error: Exception) -> str:
     elif unknown := re.findall(r'^\s*- (\w+ "[^"]*")', text, re.MULTILINE):
         text = f"unknown property {', '.join(unknown)}"
     return one_line(PLACE.sub("", text))
-
-
-MESHES = (".stl", ".ply", ".obj", ".glb")
-HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
 
 
 def open_scene(
