@@ -27,16 +27,13 @@ import platformdirs
 from ..core.files import write_atomically
 from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary
 
-VARIANTS = {"llvm": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
-"""Mitsuba's variant of each backend: the ones in which Sionna RT works."""
+VARIANTS = {"llvm": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}  # in which Sionna RT works
 
-OLDEST_TRIED = 17
-"""LLVM 14 is refused by Dr.Jit 1.5; 15 and 16 have no instruction for a minimum or maximum and end the process."""
+OLDEST_TRIED = 17  # Dr.Jit 1.5 refuses LLVM 14; 15 and 16 end the process, as they lack minimum and maximum
 
 TRIAL_TIMEOUT_S = 180  # a trial takes about a second, with the first start of a CUDA driver up to a minute
 
-FAILURE_KEPT_S = 24 * 3600
-"""A failed library is tried again after a day: the GPU may have been busy. `wrf-mi doctor` tries at once."""
+FAILURE_KEPT_S = 24 * 3600  # a failed library is tried again after a day: the GPU may have been busy
 
 _REASON_LENGTH = 160
 _SCRIPT = Path(__file__).with_name("trial.py")

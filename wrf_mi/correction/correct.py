@@ -39,10 +39,8 @@ from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS
 from .state import LEAST_PATHS, ScenePosterior, State
 
 LEVEL = 0.9  # level of the intervals for which errors of rows that a scene knows are enlarged
-NO_ROWS = np.zeros((0, 2), np.int64)
-"""Empty array of rows retained by receivers that are held out (`wrf_mi.core.Split`)."""
-CONFIDENCE = 0.95
-"""One-sided confidence in the gain of a stage: fits with more freedom also fit what no surface explains."""
+NO_ROWS = np.zeros((0, 2), np.int64)  # no rows retained by receivers that are held out (`wrf_mi.core.Split`)
+CONFIDENCE = 0.95  # one-sided, in the gain of a stage: fits with more freedom also fit what no surface explains
 LEAST_RECEIVERS = 4  # fewest trained receivers of which half decide what is kept, where a split holds receivers out
 
 

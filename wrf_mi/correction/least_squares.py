@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 
-FREEDOM = 4.0
-"""Degrees of freedom of the rows' distribution: a row of ten times the median squared error weighs a quarter."""
+FREEDOM = 4.0  # degrees of freedom of the rows' t distribution: ten times the median squared error weighs a quarter
 MEDIAN_OF_MEAN = 0.8
 """Median of a row's mean squared residual in units of the variance: that of a chi-squared variable of 3 to 10 degrees
 of freedom, divided by its mean, is 0.79 to 0.93."""
@@ -32,8 +31,7 @@ LEAST_VARIANCE = 1e-10  # smallest variance of a residual in a unit of about 1: 
 TRIALS = 8  # largest number of damping factors tried in a step, each `HARDER` times the one before
 HARDER = 8.0
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6  # damping of the first step and the smallest, relative to the diagonal
-CONVERGED = 0.1
-"""Decrease of the cost below which no further step is taken: a parameter's error of a standard deviation costs 0.5."""
+CONVERGED = 0.1  # least decrease of the cost in a step: a parameter off by a standard deviation costs 0.5
 
 
 @dataclass(frozen=True)

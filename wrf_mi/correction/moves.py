@@ -35,18 +35,15 @@ COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboa
 JOINT = 10  # number of planes whose material and shift are chosen together
 STEP = 1 / 16  # step of the shifts, wavelengths: paths change by up to an eighth
 FARTHEST = 2.0  # largest shift tried, in standard deviations of the prior
-GAIN = 0.5
-"""Least increase of the log-posterior for which a state changes: that of a parameter off by a standard deviation."""
+GAIN = 0.5  # least increase of the log-posterior for which a state changes: that of a standard deviation of a parameter
 SWEEPS, ROUNDS = 3, 3
 """Most sweeps over choices, and rounds: planes that are off hide the right material, and conversely."""
 ROUND_STEPS = 3  # largest number of least-squares steps between choices
 REFINED = 8  # number of shifts, the best with their best materials, that are compared after least-squares steps
 SHIFTS_EACH = 3  # number of shifts of each material that are compared so, where materials are in doubt
-LIKELY = 3.0
-"""Log-likelihood that counts for each face that becomes of the material of the others: most boxes are of one."""
+LIKELY = 3.0  # log-likelihood for each face that becomes of the material of the others: most boxes are of one
 RECONSIDERED = 4  # largest number of times that doubtful surfaces are chosen anew
-ELSEWHERE, MINIMA = 3, 2
-"""Number of the least plausible planes or materials that are tried otherwise, and of other choices of each."""
+ELSEWHERE, MINIMA = 3, 2  # least plausible planes or materials that are tried otherwise, other choices of each
 APART = 1 / 8  # least distance of minima, wavelengths: paths change by up to a quarter
 
 

@@ -31,12 +31,10 @@ DEVIATIONS = {
 }
 """Standard deviations of parameters before the correction, by the last part of their names."""
 TILT_SD_RAD = 0.005  # standard deviation of a plane's tilts
-FRAME_SD = np.repeat([0.05, 0.02], 3)
-"""Standard deviations of the common displacement of all planes against the devices, metres, and rotation, rad."""
+FRAME_SD = np.repeat([0.05, 0.02], 3)  # of the common displacement of planes against devices, metres, and rotation, rad
 HELD = 0.01  # share of the deviations of planes that remains where they move with the frame alone
 
-OnStage = Callable[[str, float], None]
-"""``on_stage(what, share)``: what is done, and the share of it that is done, 0 to 1."""
+OnStage = Callable[[str, float], None]  # ``on_stage(what, share)``: what is done, and its share that is done, 0 to 1
 
 Interactions = Annotated[int, Field(ge=1, le=MAX_DEPTH, description=f"1 to {MAX_DEPTH}")]
 Degree = Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")]

@@ -36,13 +36,11 @@ from .options import FRAME, MATERIALS
 from .state import LEAST_PATHS, rigid_motion, scene_entries
 
 PAGE, PICTURE = "correction.md", "correction.png"
-SUPPORTED = 0.5
-"""Largest ratio of standard deviations after and before the correction at which a quantity counts as measured."""
+SUPPORTED = 0.5  # largest ratio of standard deviations after and before at which a quantity counts as measured
 CONSTANTS = ("permittivity", "conductivity", "thickness_m", "conductivity_exponent")
 """Constants of a material in ``correction.json``, each before and after."""
 AS_STATED, FITTED, ANOTHER, LEFT_OUT = "as stated", "constants fitted", "another material", "left out"
-CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OUT: "tab:red"}
-"""Colours of the changes of materials."""
+CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OUT: "tab:red"}  # and colours
 
 
 def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:

@@ -35,10 +35,8 @@ if TYPE_CHECKING:
     from .misfit import Misfit
 
 MOST_WAVES = 1 << 24  # most element signals of paths, of 16 bytes each, that are kept for spectra
-TOGETHER = 512
-"""Rows, over all vectors, of which trials are computed at once: their spectra fit into the cache of a processor."""
-MOST_KEPT = 64
-"""Most sets of paths that are kept for further trials: each takes up to a megabyte, and a Jacobian has hundreds."""
+TOGETHER = 512  # rows, over all vectors, of which trials are computed at once: their spectra fit into a cache
+MOST_KEPT = 64  # sets of paths that are kept for trials: each takes up to a megabyte, and a Jacobian has hundreds
 STEP = 1e-4
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
 centimetres resonate within a few per cent of their thickness."""

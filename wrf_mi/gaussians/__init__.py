@@ -9,8 +9,7 @@ from .fields import Encoding, Factorised, WrfGs, WrfGsPlus
 from .initial import InitialGaussians, gaussians_from_points, random_gaussians
 from .parameters import Gaussians, rows
 
-FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus, "factorised": Factorised}
-"""Field classes by the name that `wrf-mi train --model` takes."""
+FIELDS = {"wrf-gs": WrfGs, "wrf-gs+": WrfGsPlus, "factorised": Factorised}  # by name of ``--model``
 
 __all__ = [
     "FIELDS",

@@ -21,8 +21,7 @@ import drjit as dr
 from ..backend.vectors import Pose, centre_distance, dot, principal_axes, tangent_basis
 from .parameters import Gaussians
 
-LOW_PASS_RAD = math.radians(0.3)
-"""Standard deviation added in quadrature to each footprint: 0.3 pixel at one degree per pixel."""
+LOW_PASS_RAD = math.radians(0.3)  # added in quadrature to each footprint: 0.3 pixel at a degree per pixel
 
 CUTOFF = 3.0  # Mahalanobis radius beyond which a footprint is zero; the jump there is exp(-4.5) = 0.011
 

@@ -120,11 +120,9 @@ def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.ran
 Arrays = dict[str, NDArray[np.float32]]
 
 SPLIT_SHRINK = 1.6  # ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)
-SPLIT_RAD = float(np.radians(5.0))
-"""Size as seen from the receiver above which a growing Gaussian is split instead of cloned."""
+SPLIT_RAD = float(np.radians(5.0))  # size from the receiver above which a growing Gaussian is split, not cloned
 LEAST_OPACITY = 0.005  # opacity below which a Gaussian is pruned (Kerbl et al. 2023)
-RESET_OPACITY = 0.05
-"""Largest opacity after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow back."""
+RESET_OPACITY = 0.05  # largest after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow
 
 
 @dataclass(frozen=True)

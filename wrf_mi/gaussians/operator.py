@@ -39,11 +39,9 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 MOST_IN_STRIP = 2**32 - 1  # largest number of entries of one row of tiles
 BLOCK = 16  # transmitters at once: 4 MB of complex numbers for 360 x 90 directions, which stay in the cache
-PAIRS_PER_CHUNK = 1 << 15
-"""Pairs of Gaussian and transmitter whose signals are computed at once: 16 MB of a layer of 128."""
+PAIRS_PER_CHUNK = 1 << 15  # pairs of Gaussian and transmitter at once: 16 MB of a layer of 128
 
-Coefficients = Callable[[NDArray[np.float32]], NDArray[np.complex64]]
-"""Coefficients c of transmitters [m, 3] in metres: [m, K], or signals [m, n]."""
+Coefficients = Callable[[NDArray[np.float32]], NDArray[np.complex64]]  # of transmitters [m, 3], metres: [m, K or n]
 
 
 def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:

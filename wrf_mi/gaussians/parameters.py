@@ -11,8 +11,7 @@ import numpy as np
 
 from ..backend.device import on_device
 
-PER_PAIR = ("scale", "rotation", "opacity", "attenuation")
-"""Attributes beside the signal that may differ between transmitters."""
+PER_PAIR = ("scale", "rotation", "opacity", "attenuation")  # that transmitters may differ in, beside the signal
 
 
 @dataclass

@@ -25,8 +25,7 @@ LANE_ROWS = 5
 TILE_ROWS, TILE_COLUMNS = 2 * LANE_ROWS, 8
 LANES = TILE_ROWS * TILE_COLUMNS // LANE_ROWS
 
-RESERVED = 1 << 21
-"""Largest number of entries that are allocated without counting, 8 MB; counting fewer takes longer than listing."""
+RESERVED = 1 << 21  # most entries that are allocated without counting, 8 MB: counting fewer takes longer than listing
 
 
 @dataclass

@@ -68,8 +68,7 @@ class Batch:
 
 
 Alone = Literal["traced", "learned"]  # component reported alone: traced or learned
-Report = Callable[[Mapping[str, Any], Batch], Any]
-"""``report(params, batch)``: flat observations of a batch of transmitters, differentiable."""
+Report = Callable[[Mapping[str, Any], Batch], Any]  # ``report(params, batch)``: flat, differentiable observations
 
 
 class Graph:

@@ -47,8 +47,7 @@ class ReceiverModel(Protocol):
         """Logarithm of the missing amplitude of reports."""
 
 
-GAPS = ("frequencies_hz", "floor_db")
-"""Attributes of `Form` that hold NaN where they are unknown, or where there is none."""
+GAPS = ("frequencies_hz", "floor_db")  # attributes of `Form` that are NaN where they are unknown, or there is none
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,11 @@ from ..core.types import IntArray
 
 ComplexArray = NDArray[np.complex128]
 
-TABLE_BYTES = 1 << 25
-"""Largest table of responses; 360 x 90 directions of a 4 x 4 array take 8 MB. `KEPT_TABLES` are kept between calls."""
+TABLE_BYTES = 1 << 25  # largest table of responses; `KEPT_TABLES` are kept, of 8 MB for 4 x 4 and 360 x 90 directions
 KEPT_TABLES = 4
 CHUNK_SIZE = 16  # signals whose spectra are computed together
 LINES_FROM = 64  # number of elements from which a planar grid is summed line by line
-MIRRORED, ALIGNED = 1e-6, 1e-9
-"""Distances within which positions are opposite or on one line, as shares of the array's extent."""
+MIRRORED, ALIGNED = 1e-6, 1e-9  # distances of opposite, or aligned, positions as shares of the array's extent
 
 
 def mirror_order(elements_m: ArrayLike) -> IntArray | None:
@@ -127,8 +125,7 @@ def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin:
     return steering_matrix(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).copy()
 
 
-SAME_LAG = 1e-6
-"""Differences closer than this share of the array's extent are one lag: positions in files have six digits."""
+SAME_LAG = 1e-6  # differences closer than this share of the array's extent are one: files have six digits
 LEAST_CONDITION = 1e-7  # singular values below this share of the greatest: the directions do not distinguish the lags
 
 

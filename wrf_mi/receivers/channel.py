@@ -18,8 +18,7 @@ from .reports import strength_db
 ComplexArray = NDArray[np.complex128]
 
 WAVES_PER_CHUNK = 1 << 20  # pairs of path and antenna in one chunk: 16 MiB for each complex array
-SPECULAR_KINDS = (0, 1, 4)
-"""Kinds of interaction (`wrf_mi.core.Paths`) that keep a wave spherical: none, reflection, transmission."""
+SPECULAR_KINDS = (0, 1, 4)  # kinds of interaction that keep a wave spherical: none, reflection, transmission
 CERTAIN_KINDS = (0, 4)  # kinds of interaction that add no uncertain phase: none, transmission
 DRAWS = 16  # draws of uncertain phases: their mean differs from that of 512 by 0.005 of grey in a furnished room
 

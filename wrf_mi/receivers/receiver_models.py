@@ -44,10 +44,8 @@ from .reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS, arrives, minma
 
 How = Literal["coherent", "power"]
 ComplexArray = NDArray[np.complex128]
-Slopes = Callable[[ComplexArray, IntArray], FloatArray]
-"""Derivatives of the reports of rows ``which`` [k] by changes of their signals [k, values]."""
-CHUNK_SIZE = 64
-"""Transmitters whose spectra are observed together: float64 spectra of all would take several times the result."""
+Slopes = Callable[[ComplexArray, IntArray], FloatArray]  # of reports, by changes [k, values] of rows ``which``
+CHUNK_SIZE = 64  # transmitters observed together: float64 spectra of all would take several times the result
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray
 
-SQUARED_MAGNITUDE_EPS = 1e-8
-"""Addend of |R|^2 under a root or a logarithm, whose gradient is unbounded at zero: magnitudes are at least 1e-4."""
+SQUARED_MAGNITUDE_EPS = 1e-8  # added to |R|^2 under a root or logarithm, whose gradient is unbounded at zero
 LEAST_POWER = 1e-20  # constant added to a power before its logarithm in a fit: the lowest report is -200 dB
 SILENCE = 4 * LEAST_POWER  # power up to which nothing arrives in a fit: above the constants that are added to powers
 FLOOR_DB = 1e-3  # distance from the floor up to which a report is the floor, dB: rounding to single precision

@@ -33,8 +33,7 @@ SAMPLE = 24  # transmitters on which convergence is judged
 SAMPLED_KINDS = 6  # transmitters for diffraction and scattering, where each transmitter takes a separate search
 CHOSEN_KINDS = ("diffraction", "scattering")  # kinds of path that are switched on where they count
 PARTS = 5  # depth, rays, diffraction, scattering, their rays: each takes an equal share of the error
-MOST_SAMPLED_RAYS = 1 << 19
-"""Largest number of rays with diffraction or scattering, where time and memory of each search grow with the rays."""
+MOST_SAMPLED_RAYS = 1 << 19  # largest number of rays with diffraction or scattering, with which time and memory grow
 STEEPEST = 0.95  # largest q that is extrapolated; a series with a larger one does not count as convergent
 
 

@@ -32,8 +32,7 @@ logger = logging.getLogger(__name__)
 STATIONS, USERS = 0, 1  # numbers of the sets of base stations and of users
 CODES = {0: 0, 1: 1, 2: 3, 4: 4, 8: 2}
 """DeepMIMO's codes (1 reflection, 2 diffraction, 3 scattering, 4 transmission) of Sionna RT's kinds of interaction."""
-LOADED_PATHS = 25
-"""Paths of a user that ``deepmimo.load`` reads by default (``max_paths``), and ``compute_channels`` sums."""
+LOADED_PATHS = 25  # paths of a user that ``deepmimo.load`` reads (``max_paths``) and ``compute_channels`` adds
 
 
 def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:

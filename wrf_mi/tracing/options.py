@@ -117,8 +117,7 @@ DEFAULTS = TraceOptions()
 
 FURTHER = ("transmission", "diffraction", "scattering")  # kinds of path that are traced only where they are asked for
 
-KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")
-"""Kinds of path in the command's terms."""
+KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")  # kinds of path, for the command
 
 
 def stated_kinds(text: str) -> dict[str, bool]:

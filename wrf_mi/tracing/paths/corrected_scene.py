@@ -32,14 +32,11 @@ from ..sionna.materials import absorbs, in_itu_range
 from .scene_parameters import QUANTITIES, SHIFT, TILT, MaterialGrouping, read_materials, slabs_of_faces
 from .solve import Prepared
 
-FLAT = 0.2
-"""Sine of the angle, 11 degrees, within which a plane at a corner counts as parallel to larger ones: their intersection
-may lie far from it."""
+FLAT = 0.2  # sine of the angle up to which a plane is parallel to larger ones: their intersection may be far away
 FACET_M2, CREASE_COS = 0.01, np.cos(np.radians(30))
 """Area in square metres below which a surface is a facet, and cosine of the bend towards a neighbour below which both
 are: sides of boxes are none."""
-UNCHANGED = 1e-4
-"""Relative change of a constant below which a material keeps its name: less than any measurement supports."""
+UNCHANGED = 1e-4  # relative change of a constant below which a material keeps its name: no measurement supports less
 ODD_IN_FILES, ODD_IN_MATERIALS = r"[^\w.-]", r"[^A-Za-z0-9_]"
 """Characters of other scenes' names that those of surfaces and materials of a scene folder do not have."""
 

@@ -29,11 +29,9 @@ from ...core.types import IntArray
 from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 
-ALONG = 1e-12
-"""Squared sine below which a direction lies along a wall's normal, where the plane of incidence is arbitrary."""
+ALONG = 1e-12  # squared sine below which a direction is along a normal, and the plane of incidence is arbitrary
 
-Tables = tuple[Any, Any, Any, Any]
-"""Permittivity, conductivity, thickness and reflected share [n] of materials, as `SlabMaterials.constants`."""
+Tables = tuple[Any, Any, Any, Any]  # permittivity, conductivity, thickness and reflected share [n] of materials
 
 
 @dataclass
@@ -78,8 +76,7 @@ class Chains:
         return plane, material, reflects
 
 
-EvaluatedPaths = tuple[Complex, Any, Vector, Vector]
-"""Gain, length, departure and arrival of q paths, see `evaluate_paths`."""
+EvaluatedPaths = tuple[Complex, Any, Vector, Vector]  # gain, length, departure, arrival, see `evaluate_paths`
 
 
 def evaluate_paths(

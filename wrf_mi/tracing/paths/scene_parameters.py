@@ -39,8 +39,7 @@ from ..search.surfaces import Surfaces
 from ..sionna.materials import conductivity_exponent
 from .field_calculator import Level
 
-LEAST_SUSCEPTIBILITY = 1e-3
-"""Start of permittivity - 1 for materials of permittivity 1 (metal, air), whose logarithm has no derivative."""
+LEAST_SUSCEPTIBILITY = 1e-3  # start of permittivity - 1 where it is 0 (metal, air) and has no logarithm
 LEAST_CONDUCTIVITY = 1e-6  # start of the conductivity of lossless materials, S/m
 
 PREFIX, EXPONENT = "material.", "exponent"
@@ -50,10 +49,8 @@ TRAINED = QUANTITIES[:2]  # those that are by default
 LEAST = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
 """Least value of the constants whose parameter is the logarithm of what they are above it."""
 COLUMNS = (*QUANTITIES, "reflected")  # constants of `SlabMaterials`, each an array
-MaterialGrouping = Literal["named", "surface"]
-"""Whether each named material, or each surface, has a permittivity and a conductivity."""
-SHIFT, TILT = "plane.shift", "plane.tilt"
-"""Names of the parameters [q] in metres and [q, 2] in rad of the q planes of `Surfaces`, shared by all receivers."""
+MaterialGrouping = Literal["named", "surface"]  # whether each named material, or each surface, has parameters
+SHIFT, TILT = "plane.shift", "plane.tilt"  # parameters [q], metres, and [q, 2], rad, of the planes of `Surfaces`
 
 
 def name_of(material: str, quantity: str) -> str:

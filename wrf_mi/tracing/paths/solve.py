@@ -32,8 +32,7 @@ logger = logging.getLogger(__name__)
 SOURCES_TOGETHER = 32  # sources whose paths are searched together: a search has a fixed cost
 PAIRS_TOGETHER = 4096  # pairs of source and target in a chunk
 FIRST_RAYS = 1 << 14  # first number of rays of `converged_rays`
-GROWTH = 5e-4
-"""Share by which paths, and their summed free-space power, grow at most in each of two doublings at convergence."""
+GROWTH = 5e-4  # share by which paths, and their summed free-space power, grow at most in two doublings at convergence
 SAMPLE = (4, 256)  # sources and targets on which convergence is judged
 
 

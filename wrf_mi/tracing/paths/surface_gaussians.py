@@ -33,8 +33,7 @@ NEAREST = 6  # gaussians that change one interaction
 SIZE = 0.75  # standard deviation of a Gaussian in the plane, as a share of the spacing
 EXTENT = 4.0  # distance in standard deviations beyond which a Gaussian does not count: its weight is below 4e-4
 LEAST_POINTS = 4  # fewest interactions of training paths in a cell of the lattice that gets a Gaussian
-SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99
-"""Largest distance along the normal, and smallest cosine between normals, of a plane that scans find twice."""
+SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99  # most distance, least cosine of a plane that scans find twice
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from ..options import TraceOptions
 from .surfaces import Surfaces
 
 SPECULAR, TRANSMISSION = 1, 4  # values of Sionna RT's ``InteractionType``
-ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")
-"""Fields of `Legs` with a value, or a row, for each path."""
+ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")  # fields of `Legs` by path
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
 displaced by `wrf_mi.tracing.search.images`."""
 MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
-SECONDS_PER_HIT = 1.2e-7
-"""Of each surface that a ray meets, on two cores; finding duplicates takes most of it (docs/limits.md)."""
+SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/limits.md)
 WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 

@@ -19,12 +19,9 @@ logger = logging.getLogger(__name__)
 BEHIND_M = 0.01  # distance behind an outer wall, or inside a solid, up to which an antenna counts as mounted on it
 BEFORE_M = 1e-4  # least distance before a surface from which an antenna on it is traced
 CLEAR = 2.5e-5  # that distance as a share of `Surfaces.scale_m`: twice as far as `images.displaced` moves an antenna
-ON_M = 1e-6
-"""Distance from a sheet within which rounding decides on which side an antenna is; it then takes that of the normal."""
-ON_SHARE = 0.1
-"""Depth behind a surface, as a share of `clear_m`, up to which an antenna counts as on it: rounding of its position."""
-OUTSIDE_M = 0.02
-"""Distance beyond the box around the scene from which an antenna is named: the wall before it may let no path pass."""
+ON_M = 1e-6  # distance from a sheet within which rounding decides an antenna's side; it then takes that of the normal
+ON_SHARE = 0.1  # depth behind a surface, as a share of `clear_m`, up to which an antenna is on it but for rounding
+OUTSIDE_M = 0.02  # distance beyond the scene's box from which an antenna is named: a wall may let no path pass
 PAIRS_PER_CHUNK = 1 << 20
 
 

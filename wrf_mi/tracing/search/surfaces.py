@@ -24,17 +24,11 @@ from ...core.types import IntArray
 from ...scene.mesh.surfaces import Body, bodies, bounds, shared_edges
 
 COPLANAR_M = 2e-5  # largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m
-COPLANAR_COS = 0.99
-"""Smallest cosine between normals of a face and its plane, 8 degrees: more than a sliver's rounding, less than a thin
-object's rim."""
+COPLANAR_COS = 0.99  # of the normals of a face and its plane, 8 degrees: above a sliver's rounding, below a thin rim
 MERGED_M2 = 0.01  # smallest area of a plane that takes in other faces
-MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)
-"""Mesh file in Mitsuba's description of a shape; there is no attribute."""
-MERGED_COUNT = 1000
-"""Number of planes, largest first, that take in other faces: bounds the time for meshes without planes."""
-SOLID_M = 0.5
-"""Largest mean thickness, 2 volume / area, of a closed body that is an object and not a room. A cabinet has 0.3 m, a
-room of 3 x 3 x 2.5 m 0.94 m."""
+MESH_FILE = re.compile(r'^\s*name = "(.*)",?$', re.MULTILINE)  # Mitsuba has it in a description alone
+MERGED_COUNT = 1000  # number of planes, largest first, that take in other faces: bounds the time for meshes without any
+SOLID_M = 0.5  # mean thickness, 2 volume / area, below which a body is an object (cabinet: 0.3 m), not a room (0.94 m)
 ENLARGED = 4e-5
 """Distance by which faces are enlarged, as a share of `scale_m`: 0.4 mm at 10 m. Four times as far as positions are
 displaced (`images.DISPLACED`), so that a path through a free edge stays blocked when displaced."""
@@ -45,9 +39,7 @@ SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""
 FARTHEST = 25.0  # largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors
-MOST_AT_CORNER = 8.0
-"""Largest distance of an enlarged corner from the corner, in units of the enlargement: corners of slivers reach to
-infinity."""
+MOST_AT_CORNER = 8.0  # farthest that a corner moves, in units of the enlargement: slivers reach to infinity
 
 
 @dataclass(frozen=True)

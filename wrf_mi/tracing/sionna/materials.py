@@ -41,8 +41,7 @@ CONSTANTS_XML = (
 )
 """A material of Sionna RT with constants; its name must not begin with itu."""
 
-CONSTANTS_FROM_HZ = 0.3e9
-"""Lower end of the constants: below, the conductivity would be off by more than a factor of three."""
+CONSTANTS_FROM_HZ = 0.3e9  # lower end of the constants: below, the conductivity would be off by a factor of three
 
 
 def perfect_reflector() -> Any:
@@ -61,8 +60,7 @@ def absorbs(material: Any) -> bool:
     return isinstance(material, AbsorberRadioMaterial)
 
 
-CONSTANTS = ("relative_permittivity", "conductivity", "thickness")
-"""Constants of a radio material that differ between materials."""
+CONSTANTS = ("relative_permittivity", "conductivity", "thickness")  # those in which materials differ
 
 
 def set_frequency(

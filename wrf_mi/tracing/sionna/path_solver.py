@@ -27,11 +27,9 @@ from ..search.surfaces import Surfaces
 SLOTS_PER_CHUNK = 1 << 22
 """Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
 for an entry of the buffer, which has room for all so that no path is dropped: about 1 GB at a depth of 3."""
-WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")
-"""Fields of Sionna RT's ``WedgeGeometry`` besides the shape."""
+WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")  # fields of ``WedgeGeometry``
 PATHS_PER_CHUNK = 1 << 19  # paths in a chunk; the field calculator takes some 300 bytes per path and interaction
-AT_ANTENNA_M = 1e-9
-"""Distance within which an interaction is at the antenna, or at its image, so that it tells no direction."""
+AT_ANTENNA_M = 1e-9  # distance within which an interaction is at the antenna or its image and tells no direction
 SHORT = 1e-4
 """Distance to which coinciding points are moved apart, as a share of `Surfaces.scale_m`: single precision gives the
 direction from one to the other to 1e-3 rad."""

@@ -42,16 +42,13 @@ logger = logging.getLogger(__name__)
 MESH_PLUGINS = ("ply", "obj")  # Mitsuba's shapes that are files of vertices and faces
 MESHES = (".stl", ".ply", ".obj", ".glb")
 HIGHEST_M = 500.0  # height above which a scene counts as one in millimetres
-SEGMENTS = 32
-"""Segments of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off."""
+SEGMENTS = 32  # of a full circle of a curved shape, whose corners lie on it: its outline is 0.5 % of the radius off
 CHECKED_FILES = 4096  # files whose triangles are remembered: a scene is opened once for each carrier and fold
 REFUSALS = (RuntimeError, ValueError, SyntaxError, TypeError)  # errors of Mitsuba and Sionna RT about a scene file
 PLACE = re.compile(r"^\[[\w.]+:\d+\] (((Error while|While) loading|At) string \(line \d+, col \d+\): )?")
 """Begin of Mitsuba's messages: its source line, and a place in a text that is not the file."""
-PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")
-"""Properties of a radio material in a scene file."""
-VALUES = ("float", "integer", "boolean", "string", "point", "vector", "transform")
-"""Elements that are parameters of a shape without a file."""
+PROPERTIES = (*CONSTANTS, "scattering_coefficient", "xpd_coefficient", "color")  # of a radio material
+VALUES = ("float", "integer", "boolean", "string", "point", "vector", "transform")  # parameters of a shape
 
 
 def _unit_shape(plugin: str) -> trimesh.Trimesh | None:
