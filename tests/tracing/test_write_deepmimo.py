@@ -116,47 +116,41 @@ def test_users_without_a_path_and_long_chains_of_interactions(traced: TraceResul
         vertices_m=np.ones((len(paths), depth, 3)),
         objects=np.zeros((len(paths), depth), np.int32),
     )
-    folder = write_deepmimo(tmp_path / "deep", replace(traced, paths=wide), max_paths=2)
+    folder = write_deepmimo(tmp_path / "deep", replace(traced, paths=wide))
     record = read_deepmimo(folder, params={"base_stations": [0]})
     np.testing.assert_array_equal(np.isnan(record.observation[0, :, 0]), np.arange(5) == 3)
     with np.load(folder / "inter_t000_tx000_r001.npz") as stored:
         codes = stored["inter"]
-    assert codes.shape == (5, 2)
+    assert len(codes) == 5
     assert (codes[np.isfinite(codes)] == 444444444444).all()
 
 
-def test_largest_number_of_paths_keeps_the_first_ones(
-    traced: TraceResult, scenario: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_more_paths_than_deepmimo_reads_are_warned_of(
+    traced: TraceResult, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    few = write_deepmimo(tmp_path / "few", traced, max_paths=4)
-    assert not caplog.records
-    file = "power_t000_tx001_r001.npz"
-    with np.load(few / file) as first, np.load(scenario / file) as every:
-        np.testing.assert_array_equal(first["power"], every["power"][:, :4])
-    write_deepmimo(tmp_path / "few", traced, replace=True)
+    write_deepmimo(tmp_path / "all", traced)
     (warning,) = caplog.records
     assert "of which DeepMIMO uses 25 by default; load with max_paths=" in warning.getMessage()
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "options", "message"),
+    ("name", "changes", "message"),
     [
-        ("Street", {}, {}, "'Street' as name of a scenario, which deepmimo.load turns into lower case; choose small"),
-        ("a:b", {}, {}, "choose small letters"),
-        ("there", {}, {}, "exists; remove it or choose another folder"),
-        ("none", {"paths": None}, {}, "no path from 5 users to 2 base stations"),
-        ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, {}, "several carriers"),
-        ("zero", {}, {"max_paths": 0}, "max_paths 0; give 1 or more"),
+        ("Street", {}, "'Street' as name of a scenario, which deepmimo.load turns into lower case; choose small"),
+        ("a:b", {}, "choose small letters"),
+        ("there", {}, "exists; remove it or choose another folder"),
+        ("none", {"paths": None}, "no path from 5 users to 2 base stations"),
+        ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, "several carriers"),
     ],
 )
 def test_what_cannot_be_written_is_refused(
-    traced: TraceResult, tmp_path: Path, name: str, changes: dict[str, Any], options: dict[str, Any], message: str
+    traced: TraceResult, tmp_path: Path, name: str, changes: dict[str, Any], message: str
 ) -> None:
     (tmp_path / "there").mkdir()
     if "paths" in changes:
         changes = {"paths": traced.paths.select(np.zeros(len(traced.paths), bool))}
     with pytest.raises(InputError, match=message) as error:
-        write_deepmimo(tmp_path / name, replace(traced, **changes), **options)
+        write_deepmimo(tmp_path / name, replace(traced, **changes))
     assert "\n" not in str(error.value)
     assert {path.name for path in tmp_path.iterdir()} == {"there"}
 

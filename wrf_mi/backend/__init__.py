@@ -234,14 +234,10 @@ def _other_llvm() -> str:
 
 
 def _llvm(path: Path | None, version: str) -> Backend:
-    return Backend("llvm", VARIANTS["llvm"], None if path is None else str(path), version, _processor())
-
-
-def _processor() -> str:
-    """Name of the processor (``/proc/cpuinfo`` on Linux)."""
     try:
         with open("/proc/cpuinfo") as lines:
             name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
     except OSError:
         name = ""
-    return name or platform.processor() or platform.machine()
+    processor = name or platform.processor() or platform.machine()
+    return Backend("llvm", VARIANTS["llvm"], None if path is None else str(path), version, processor)

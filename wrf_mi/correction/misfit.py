@@ -95,29 +95,12 @@ class _Port:
 
 
 class Misfit:
-    """Reports of the paths of some rows, as a function of a vector of parameters.
+    """Reports of the paths of some rows of a record, as a function of a vector of parameters.
 
-    Args:
-        record: measurements of any task.
-        rows: rows that are compared.
-        prepared: shared state of the scene, at the record's carrier or, of several, at the one at which parameters of
-            materials hold.
-        options: options of the search, and which parameters of `TracedField.parameters` are entries of the vector.
-        searched: where paths are searched; None: in the scene as stated.
-        surfaces: numbers of planes and of surfaces of the scene that have parameters though no path meets them; all
-            others have none. None: all have parameters.
-
-    Attributes:
-        receivers: receivers that have an observation of one of the rows; paths to others are not searched, though their
-            parameters are entries of the vector.
-        tables: materials and planes of the scene.
-        ports: each of these receivers at each carrier, receiver by receiver.
-        planes: numbers of the scene's planes whose shifts and tilts are entries of the vector, in their order.
-        slabs: numbers of the scene's surfaces whose materials are.
-        start: stated values of the vector [p].
-        parts: slice of each parameter in the vector, by name.
-        observed: observations [n_rx * rows, values] in the residuals' unit, NaN where nothing was received.
-        unit: unit of each row's residuals [n_rx * rows].
+    ``prepared`` is the shared state of the scene, at the record's carrier or, of several, at the one at which
+    parameters of materials hold; ``options`` say which parameters of `TracedField.parameters` are entries of the
+    vector. Paths are ``searched`` in another scene than the stated one, if there is one. ``surfaces``: numbers of
+    planes and of surfaces that have parameters though no path meets them, all others have none; None: all have.
     """
 
     def __init__(
@@ -130,15 +113,17 @@ class Misfit:
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
         self.record, self.rows, self._traced, self._task = record, rows, options.traced, task_of(record)
-        self.tables = prepared.tables(self._traced.materials)
+        self.tables = prepared.tables(self._traced.materials)  # materials and planes of the scene
         placed = placed_receivers(record, by_uplink=False)
-        # Receivers without any observation are not traced: some hundred others may have heard these rows.
+        # Receivers without any observation are not traced, though their parameters are entries of the vector: some
+        # hundred others may have heard these rows.
         known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
         numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in numbers]
         shape, is_image = record.observation.shape[2:], self._task.image
         self._strides = [_stride(n, most) for n, most in zip(shape, LATTICE, strict=True)] if is_image else []
-        self.ports = self._traced_ports(numbers, prepared, searched)
+        self.ports = self._traced_ports(numbers, prepared, searched)  # receiver by receiver, at each carrier
+        # Numbers of the scene's planes and of its surfaces whose parameters are entries of the vector, in their order.
         self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
             self.planes, self.slabs = _met_surfaces(self.sides, len(self.planes), len(self.slabs), *surfaces)
@@ -156,8 +141,8 @@ class Misfit:
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *(value.size for value in values.values())])
         self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
-        self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)
-        self.observed, self.unit = self._observations()
+        self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)  # stated values [p]
+        self.observed, self.unit = self._observations()  # [n_rx * rows, values], NaN for none, and [n_rx * rows]
         for port in self.ports:
             port.record(self._device(self.start))
 

@@ -139,19 +139,8 @@ class State:
 class ScenePosterior:
     """Likelihood of the rows of one misfit, and the prior of its parameters.
 
-    Args:
-        misfit: residuals of the rows.
-        options: options of the correction.
-        on_stage: called as a search goes on.
-        hidden: names of objects that the stated scene lacks.
-        bodies: names of the objects of each box.
-
-    Attributes:
-        stated: vector [p] of the stated scene, without the objects that it lacks and with gains that match.
-        supposed: surfaces of objects that the stated scene lacks: their places in `Misfit.slabs` by name.
-        bodies: places in `Misfit.slabs` of the faces of each box.
-        planes, slabs: places in `Misfit.planes` and `Misfit.slabs` of those that enough paths meet, most paths first.
-        prior_deviation: standard deviations of the parameters [p] before the correction.
+    ``hidden`` are names of objects that the stated scene lacks, ``bodies`` names of the objects of each box;
+    ``on_stage`` is called as a search goes on.
     """
 
     def __init__(
@@ -166,10 +155,12 @@ class ScenePosterior:
         names = misfit.sides[0].slabs.names  # <object>/<plane>
         objects = [name.partition("/")[0] for name in names]
         faces = [np.flatnonzero([thing in body for thing in objects]) for body in bodies]
-        self.bodies = [slabs for slabs in faces if len(slabs) > 1]
+        self.bodies = [slabs for slabs in faces if len(slabs) > 1]  # places in `Misfit.slabs` of the faces of each box
+        # Surfaces of objects that the stated scene lacks: their places in `Misfit.slabs` by name.
         self.supposed = {name: slab for slab, name in enumerate(names) if objects[slab] in hidden}
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
-        # Few paths tell of no surface: their noise would move it anywhere within the prior.
+        # Places among the misfit's planes and slabs, most paths first. Few paths tell of no surface: their noise would
+        # move it anywhere within the prior.
         ranked = [(np.argsort(-count, kind="stable"), count) for count in misfit.counts()]
         self.planes, self.slabs = (order[count[order] >= LEAST_PATHS] for order, count in ranked)
         self.prior_deviation = np.ones(len(misfit.start))

@@ -144,15 +144,10 @@ def adapt(
 ) -> DensityChange:
     """One round of pruning, cloning and splitting.
 
-    Args:
-        parameters: per-Gaussian parameters, [k, n] each; ``position``, ``log_scale`` and ``rotation`` among them.
-            Under alpha blending also ``opacity`` (logits).
-        view_gradient_norm: mean gradient of the loss by each Gaussian's direction since the last round, [n]; zero: no
-            pixel saw it.
-        distance_m: distance of each Gaussian from the nearest receiver, [n].
-        rng: generator of the positions of split Gaussians.
-        growth_fraction: share of the Gaussians that are cloned or split.
-        max_gaussians: largest number of Gaussians.
+    ``parameters`` are those per Gaussian, [k, n] each, with ``position``, ``log_scale`` and ``rotation``, and under
+    alpha blending ``opacity`` (logits). ``view_gradient_norm`` [n] is the mean gradient of the loss by each Gaussian's
+    direction since the last round, zero where no pixel saw it, ``distance_m`` [n] that from the nearest receiver. The
+    share ``growth_fraction`` of the Gaussians is cloned or split, up to ``max_gaussians``.
     """
     keep = view_gradient_norm > 0
     if "opacity" in parameters:

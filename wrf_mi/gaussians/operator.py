@@ -159,14 +159,9 @@ def _weights(
 def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: float = np.inf) -> csr_array:
     """The weights of Gaussians for one transmitter on the perception plane, one row of tiles after the other.
 
-    Returns:
-        Matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a row
-        are ordered from near to far.
-
-    Raises:
-        ValueError: Gaussians for several transmitters.
-        InputError: more entries in one row of tiles than 32 bits count.
-        MemoryError: more than ``most_bytes``; after the row of tiles with which they are.
+    Returns a matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a
+    row are ordered from near to far. `ValueError` for several transmitters, `InputError` for more entries in a row of
+    tiles than 32 bits count, `MemoryError` for more than ``most_bytes``, after the row of tiles with which they are.
     """
     if gaussians.batch != 1:
         raise ValueError(f"weights: Gaussians for {gaussians.batch} transmitters; give those of one")

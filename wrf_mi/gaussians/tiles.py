@@ -171,15 +171,6 @@ def check_entries(entries: int) -> int:
     return entries
 
 
-def _meets_columns(column: dr.ArrayBase, first: dr.ArrayBase, span: dr.ArrayBase, width: dr.ArrayBase) -> Any:
-    """Whether a tile that begins at a column meets columns from ``first`` on, around the full circle."""
-    # Columns from the footprint's first one to the tile, counted forwards around the circle; a tile that begins before
-    # the seam and ends behind it meets footprints that start there.
-    ahead = column - first
-    ahead -= width * dr.floor(ahead / width)
-    return (ahead <= span) | (ahead + (TILE_COLUMNS - 1) >= width)
-
-
 def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> TileLists:
     """Lists without spare room: those of each row of tiles first, then of its tiles, counted and filled."""
     # Boxes are near to far for each transmitter, and ``column`` holds their numbers ``b * n + i``, [batch * n].
@@ -231,7 +222,11 @@ def _list_tiles(
     length, k, last = dr.zeros(index_type, dr.width(begin)), index_type(begin), index_type(end)
     while k < last:
         i = k if members is None else dr.gather(index_type, members, k)
-        hit = _meets_columns(column0, dr.gather(float_type, first_column, i), dr.gather(float_type, span, i), width)
+        # Columns from the footprint's first one to the tile, counted forwards around the circle; a tile that begins
+        # before the seam and ends behind it meets footprints that start there.
+        ahead = column0 - dr.gather(float_type, first_column, i)
+        ahead -= width * dr.floor(ahead / width)
+        hit = (ahead <= dr.gather(float_type, span, i)) | (ahead + (TILE_COLUMNS - 1) >= width)
         if dr.hint(members is None, mode="scalar"):
             hit &= dr.gather(float_type, first_row, i) <= row + (TILE_ROWS - 1)
             hit &= dr.gather(float_type, last_row, i) >= row

@@ -83,11 +83,6 @@ class Graph:
         tx_antenna: antenna of the transmitters.
         evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
 
-    Attributes:
-        surface: Gaussians on the scene's surfaces, which change its paths; None: none (`cover`).
-        models: receiver model of each port, receiver by receiver.
-        carriers: number of carriers, the ports of a receiver.
-
     Raises:
         InputError: a receiver model or a scene without the array or carrier it needs, or nothing to evaluate.
     """
@@ -117,7 +112,7 @@ class Graph:
             raise InputError("neither Gaussians nor a scene: there is nothing to evaluate; give one")
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.tx_antenna = tx_antenna
-        self.surface: SurfaceGaussians | None = None
+        self.surface: SurfaceGaussians | None = None  # on the scene's surfaces, changing its paths (`cover`)
         self.evaluation: Evaluation = resolve(EVALUATIONS[evaluation])(scene, traced)
         self._stated_hz = form.carrier_hz
         self._take(form)
@@ -129,7 +124,7 @@ class Graph:
         return graph
 
     def _take(self, form: Form) -> None:
-        """Take a form, with the models of its ports."""
+        """Take a form, with the receiver model of each port, receiver by receiver."""
         forms = form.of_ports
         self.form, self.carriers = form, len(forms)
         self.models = tuple(self.kind.make(of_port, receiver) for receiver in self.receivers for of_port in forms)
@@ -268,16 +263,12 @@ class Graph:
     ) -> Report:
         """Reports of a port as a function of parameters, for transmitters of a traced side.
 
-        Args:
-            number: number of the port.
-            side: its traced side, or None.
-            learned: with the learned side, where the graph has one.
-            chunked: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`).
-            surface: with the Gaussians on surfaces, where the graph has some.
-            alone: report one of both sides alone, without an instrument's scaling of each report, so that the two
-                compare; the unit of the Gaussians is that beside the paths. None: both together.
-            phase_error: standard deviation of the phase that each reflection of a path adds, rad; the report is then
-                the expectation (`wrf_mi.receivers.instruments.SpectrumInstrument`).
+        ``learned`` and ``surface``: with the learned side and the Gaussians on surfaces, where the graph has them;
+        ``chunked``: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`); ``alone``:
+        report one of both sides alone, without an instrument's scaling of each report, so that the two compare (the
+        unit of the Gaussians is that beside the paths). With ``phase_error``, the standard deviation in rad of the
+        phase that each reflection of a path adds, the report is the expectation
+        (`wrf_mi.receivers.instruments.SpectrumInstrument`).
         """
         model: Any = self.models[number]
         if alone is not None:

@@ -149,10 +149,6 @@ def _elements(receiver: Receiver, count: int = 0) -> FloatArray:
     return np.zeros((count, 3)) if receiver.array_m is None else np.asarray(receiver.array_m, float)
 
 
-def _pixel(form: Form, receiver: Receiver) -> PixelReceiver:
-    return PixelReceiver(*form.size, _elements(receiver), form.carrier_hz)
-
-
 def _array(form: Form, receiver: Receiver) -> ArrayReceiver:
     return ArrayReceiver(*form.size, _elements(receiver), form.carrier_hz, instrument_scale=True)
 
@@ -174,7 +170,7 @@ def _csi(form: Form, receiver: Receiver) -> CsiReceiver:
 
 
 _BUILT_IN = (
-    ReceiverKind(PIXEL, ("spectrum",), _pixel),
+    ReceiverKind(PIXEL, ("spectrum",), lambda form, rx: PixelReceiver(*form.size, _elements(rx), form.carrier_hz)),
     ReceiverKind("array", ("spectrum",), _array, needs_array=True, needs_carrier=True),
     ReceiverKind("power", ("rssi",), _power, levels=True),
     ReceiverKind("csi", ("csi",), _csi, levels=True, complex_valued=True),

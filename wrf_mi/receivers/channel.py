@@ -87,11 +87,7 @@ def array_channels(paths: Paths, receiver: Receiver, array_m: FloatArray, freque
         Complex coefficients [n, m, k], 0 where no path arrives.
     """
     elements = np.broadcast_to(array_m @ receiver.to_world.T, (paths.n_rx, *array_m.shape))
-    return _spherical_waves(paths, paths.departure, _wave_radius(paths, receiver), elements, frequencies_hz)
-
-
-def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
-    """Unfolded distance [p] from the array to the source of each path's spherical wave."""
+    # Unfolded distance from the array to the source of each path's spherical wave.
     count, depth = paths.interactions.shape
     last_m = np.broadcast_to(receiver.position_m, (count, 3))
     radius, unfinished = np.zeros(count), np.ones(count, bool)
@@ -102,7 +98,8 @@ def _wave_radius(paths: Paths, receiver: Receiver) -> FloatArray:
         last_m = np.where(unfinished[:, None], vertex_m, last_m)
         unfinished &= np.isin(kind, SPECULAR_KINDS)
     scattered = (~np.isin(paths.interactions, SPECULAR_KINDS)).any(axis=1)
-    return np.where(scattered, radius, paths.length_m)
+    radius = np.where(scattered, radius, paths.length_m)
+    return _spherical_waves(paths, paths.departure, radius, elements, frequencies_hz)
 
 
 def _spherical_waves(

@@ -121,7 +121,12 @@ class _Search:
         # Each transmitter takes a search of its own where paths are sampled, so fewer of them are compared.
         few = options.sampled or other.sampled
         (a, before), (b, after) = self._report(options, few), self._report(other, few)
-        spectrum = None if before is None or after is None else _relative(before, after)
+        spectrum = None
+        if before is not None and after is not None:
+            # Relative L2 difference of images: 0 if both are dark, infinite if the second one alone is.
+            size, by = (np.sqrt(np.square(x, dtype=float).sum(axis=(-2, -1))) for x in (after, before - after))
+            share = np.divide(by, size, out=np.where(by > 0, np.inf, 0.0), where=size > 0)
+            spectrum = float(share.max(initial=0.0))
         change = float("inf")  # a pair of devices that gains or loses its only path
         if (np.isnan(a) == np.isnan(b)).all():
             power = float(np.nanmax(np.abs(a - b), initial=0.0))
@@ -151,13 +156,6 @@ class _Search:
         return replace(options, rays=rays), change
 
 
-def _relative(a: FloatArray, b: FloatArray) -> float:
-    """Largest relative L2 difference of images [..., height, width]; 0 if both are dark, infinite if ``b`` alone is."""
-    difference, size = (np.sqrt(np.square(x, dtype=float).sum(axis=(-2, -1))) for x in (a - b, b))
-    share = np.divide(difference, size, out=np.where(difference > 0, np.inf, 0.0), where=size > 0)
-    return float(share.max(initial=0.0))
-
-
 def choose_options(
     scene: Any,
     tx_pos_m: ArrayLike,
@@ -171,19 +169,10 @@ def choose_options(
 ) -> Choice:
     """Choose depth, rays and kinds of path for a stated error of received power, and of spectra if there are any.
 
-    Args:
-        scene: from `wrf_mi.tracing.open_scene`.
-        tx_pos_m: transmitter positions [n, 3], metres; a sample of them is traced.
-        receivers: one or several.
-        target_db: error to reach, dB.
-        options: settings to keep: kinds that are on, seed. Depth and rays are chosen.
-        kinds: kinds of `CHOSEN_KINDS` that may be switched on.
-        spectra: spectra [n_rx, n, height, width] of paths, see `wrf_mi.receivers.instruments.SpectrumInstrument`;
-            None: power alone is judged.
-        tx_antenna: antenna of the transmitters.
-
-    Returns:
-        The choice. Where the estimate stays above the target (a warning says so), the largest settings are taken.
+    A sample of the transmitters [n, 3] is traced. Kept are kinds of path that are on in ``options``, and the seed;
+    ``kinds`` of `CHOSEN_KINDS` may be switched on. ``spectra``: see `wrf_mi.receivers.instruments.SpectrumInstrument`;
+    None: power alone is judged. Where the estimate stays above ``target_db`` (a warning says so), the largest settings
+    are taken.
 
     Raises:
         InputError: a target that is no positive number.

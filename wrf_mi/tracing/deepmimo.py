@@ -47,39 +47,29 @@ def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
     return folder
 
 
-def write_deepmimo(path: str | Path, traced: TraceResult, replace: bool = False, max_paths: int | None = None) -> Path:
+def write_deepmimo(path: str | Path, traced: TraceResult, replace: bool = False) -> Path:
     """Write a trace atomically as a scenario of DeepMIMO 4.
 
     Powers and phases are those of the traced gains, antennas included, and phases include the carrier's exp(-j 2 pi f
-    delay). Scene and materials are not written. Paths of a user are ordered as line of sight, then by falling power.
+    delay). Scene and materials are not written. Paths of a user are ordered as line of sight, then by falling power;
+    ``deepmimo.load`` reads 25 of them unless its ``max_paths`` states more.
 
     Args:
         path: folder of the scenario; its name is that of the scenario, in small letters.
         traced: paths from users (transmitters) to base stations (receivers).
         replace: replace an existing folder.
-        max_paths: largest number of paths of a user at a base station, of which the first are written; None: all.
-            ``deepmimo.load`` reads 25 unless its ``max_paths`` states more.
-
-    Returns:
-        The folder.
 
     Raises:
         InputError: no path, several carriers, or a folder as `check_deepmimo_folder` refuses it.
     """
     folder = check_deepmimo_folder(path, replace)
     if traced.carriers_hz is not None and len(np.unique(traced.carriers_hz)) > 1:
-        raise InputError(
-            f"{folder}: paths of several carriers; DeepMIMO has one, so trace the rows of each by themselves"
-        )
-    if max_paths is not None and max_paths < 1:
-        raise InputError(f"{folder}: max_paths {max_paths}; give 1 or more, or None for all")
+        raise InputError(f"{folder}: paths of several carriers; DeepMIMO has one, so trace the rows of each alone")
     carrier_hz = traced.frequency_hz if traced.carriers_hz is None else float(traced.carriers_hz[0])
     paths = traced.paths.select(traced.paths.gain != 0)
     if not len(paths):
         raise InputError(f"{folder}: no path from {paths.n_tx} users to {paths.n_rx} base stations; nothing to write")
     rank = _ranks(paths)
-    if max_paths is not None:
-        paths, rank = paths.select(rank < max_paths), rank[rank < max_paths]
     matrices, most = _matrices(paths, carrier_hz), int(rank.max()) + 1
     if most > LOADED_PATHS:
         text = "%s: up to %d paths of a user, of which DeepMIMO uses %d by default; load with max_paths=%d and compute "

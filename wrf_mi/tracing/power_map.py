@@ -66,13 +66,9 @@ Tracer = Callable[[FloatArray, IntArray | None], FloatArray]
 class TracedPower:
     """Power traced at each position itself, and the local mean where no path arrives and inside solids.
 
-    Args:
-        local: local means at n_rx receivers.
-        trace: tracer.
-        places: places of these receivers among those of the tracer [n_rx].
-        known: powers at all receivers of the tracer by position.
-        keeps: whether a new position is traced for all receivers and kept, as further fits ask for it again; otherwise
-            it is traced for the receiver that is asked for.
+    ``local`` are means at n_rx receivers, which have the ``places`` [n_rx] among those of the tracer, ``known`` powers
+    at all receivers of the tracer by position. A new position is traced for all receivers and kept, as further fits ask
+    for it again, or without ``keeps`` for the receiver that is asked for.
     """
 
     exact: ClassVar[Literal[True]] = True
@@ -139,17 +135,11 @@ def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
 
 
 def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions) -> PowerMap:
-    """Trace a scene on a grid over its extent and all of a record's positions.
+    """Trace a scene on a grid over its extent and all of a record's positions, at heights of its transmitter.
 
     Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: they take the
-    mean of the points around them that are outside, or the nearest such mean.
-
-    Args:
-        scene: from `wrf_mi.tracing.open_scene`.
-        record: receivers and heights of the transmitter.
-        spacing_m: spacing of the grid.
-        smooth_m: standard deviation of the Gaussian over which powers are averaged; 0: none.
-        options: kinds of path, depth, rays.
+    mean of the points around them that are outside, or the nearest such mean. Means are over a Gaussian of the standard
+    deviation ``smooth_m``; 0: none.
 
     Raises:
         InputError: no path to a receiver from anywhere, or a scene filled by a solid.

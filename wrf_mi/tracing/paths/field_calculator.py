@@ -87,15 +87,7 @@ def evaluate_paths(
     rx_antenna: Antenna = ANTENNA,
     tx_antenna: Antenna = ANTENNA,
 ) -> EvaluatedPaths:
-    """Evaluate paths to a receiver. Differentiable in pose, sources, planes and materials.
-
-    Args:
-        chains: q paths.
-        pose: pose of the receiver, numbers or arrays [q].
-        tables: tables of the n materials.
-        frequency_hz: carrier frequency.
-        rx_antenna: antenna of the receiver.
-        tx_antenna: antenna of the transmitters.
+    """Evaluate q paths to a receiver. Differentiable in pose (numbers or arrays [q]), sources, planes and materials.
 
     Returns:
         Gain lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length);

@@ -83,18 +83,8 @@ class TracedField:
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
         present: parameter values used to prune weak paths, Dr.Jit tensors by name; None: as stated.
 
-    Attributes:
-        frequency_hz: carrier of the paths.
-        chains: surfaces that each path meets, planes as stated.
-        bounces: square roots of the numbers of reflections of paths [n * each], on the device.
-        interactions: points at which paths meet surfaces, with the planes as stated.
-        slabs: stated materials of the scene, or of its surfaces in the order of their parameters.
-        surfaces: surfaces of the scene, with the planes of the parameters.
-        searches: number of searches so far, without that of ``traced``.
-        searched_at_m: receiver position [3] of the last search, metres.
-
     Raises:
-        ValueError: positions or headings of another shape or not finite.
+        ValueError: headings of another shape or not finite.
         InputError: paths through a material that is not a slab.
     """
 
@@ -122,8 +112,8 @@ class TracedField:
         self._weights: PathWeights | None = None
         self._stated_hz = float(scene.frequency[0])
         self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
-        self.searches = 0
-        self.surfaces: Surfaces = self._shared.surfaces
+        self.searches = 0  # without that of ``traced``
+        self.surfaces: Surfaces = self._shared.surfaces  # with the planes of the parameters
         position_m = receiver.position_m if searched_at_m is None else searched_at_m
         self._set_tables(self._shared.tables(options.materials))
         if traced is None:
