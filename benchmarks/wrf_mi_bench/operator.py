@@ -11,8 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from wrf_mi.backend.device import to_tensor
-from wrf_mi.backend.recorded import Recorded
+from wrf_mi.backend.device import Recorded, to_tensor
 from wrf_mi.gaussians import Factorised, Gaussians, WrfGs, WrfGsPlus
 from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.operator import PixelOperator, pixel_weights, static_signals

@@ -25,8 +25,7 @@ from drjit.opt import Adam
 from threadpoolctl import threadpool_limits
 
 from wrf_mi.backend import init
-from wrf_mi.backend.device import on_device, to_tensor
-from wrf_mi.backend.recorded import Recorded
+from wrf_mi.backend.device import Recorded, on_device, to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.files import one_line, write_atomically

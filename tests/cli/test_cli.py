@@ -22,7 +22,7 @@ import pytest
 from calling import SET, SMALL, call, refused
 from made_spectra import SIZE
 
-from wrf_mi.backend.recorded import Recorded
+from wrf_mi.backend.device import Recorded
 from wrf_mi.cli import demo
 from wrf_mi.cli.main import build_parser, main
 from wrf_mi.cli.output import Watch

@@ -180,13 +180,13 @@ def test_receivers_share_materials_and_steps_are_recorded_once(tmp_path: Path) -
     assert {PERMITTIVITY, "receiver.array.gain", "receiver.tag.gain"} <= set(trainer.state.adam)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
         trainer.run(stop=stop_after(12))
-        recorded = {key: step.n_recordings for key, step in trainer.steps.recorded.items()}
+        recorded = {key: step.frozen.n_recordings for key, step in trainer.steps.recorded.items()}
         dr.kernel_history_clear()
         trainer.run(stop=stop_after(12))
         history = dr.kernel_history([dr.KernelType.JIT])
     assert trainer.state.step == 24
     assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
-    assert {key: step.n_recordings for key, step in trainer.steps.recorded.items()} == recorded
+    assert {key: step.frozen.n_recordings for key, step in trainer.steps.recorded.items()} == recorded
     assert len(recorded) == 2
 
 

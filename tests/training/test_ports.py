@@ -199,7 +199,7 @@ def test_single_predictions_are_those_of_a_batch(receiver_model: str, xml: Path)
     traced = Predictor(Graph(None, (array(),), form, graph.scene, CONFIG), {})
     assert np.abs(alone - traced(tx, 0)).max() > 0.01  # the Gaussians tell
     np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=SINGLE if receiver_model == "array" else SINGLE_DB)
-    assert any(name[0] == "both" and one.n_recordings for (name, _), one in predict.evaluate.recordings.items())
+    assert any(name[0] == "both" and one.frozen.n_recordings for (name, _), one in predict.evaluate.recordings.items())
 
 
 @pytest.mark.parametrize(("off_m", "certain"), [(0.0, True), (0.03, False)])

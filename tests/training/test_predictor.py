@@ -55,4 +55,4 @@ def test_predictions_are_recorded_once(one_gateway: Record) -> None:
     after = predictor(one_gateway.tx_pos_m[:3])
     assert np.abs(after - before).max() > 0
     recorded = predictor.evaluate.recordings.values()
-    assert 1 <= sum(one.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm
+    assert 1 <= sum(one.frozen.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm

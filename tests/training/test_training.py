@@ -176,14 +176,14 @@ def test_nothing_is_compiled_after_the_first_steps(model: str, two_gateways: Rec
     trainer = Trainer(two_gateways, official(two_gateways), settings(*own, model=model))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):  # a recording belongs to such flags
         trainer.run(stop=stop_after(10))
-        recordings = sum(step.n_recordings for step in trainer.steps.recorded.values())
+        recordings = sum(step.frozen.n_recordings for step in trainer.steps.recorded.values())
         dr.kernel_history_clear()
         trainer.run(stop=stop_after(20))
         history = dr.kernel_history([dr.KernelType.JIT])
     assert trainer.state.step == 30
     assert len(history) >= 20
     assert [entry["hash"] for entry in history if not entry["cache_hit"]] == []
-    assert sum(step.n_recordings for step in trainer.steps.recorded.values()) == recordings
+    assert sum(step.frozen.n_recordings for step in trainer.steps.recorded.values()) == recordings
 
 
 def test_garbage_collector_is_off_during_recording(one_gateway: Record) -> None:

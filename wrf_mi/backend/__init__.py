@@ -99,7 +99,7 @@ def set_threads(threads: int) -> None:
 
     Kernels traced or launched before have room for the sums of the threads at that time, and more threads write beyond
     it (Dr.Jit 1.5, ``scatter_reduce``), so they are evaluated first. For recorded functions see
-    `wrf_mi.backend.recorded`.
+    `wrf_mi.backend.device`.
 
     Args:
         threads: 1 or more.

@@ -1,4 +1,4 @@
-"""Copies of NumPy arrays in memory that Dr.Jit owns.
+"""Copies of NumPy arrays in memory that Dr.Jit owns, and functions that it records.
 
 On a CPU, Dr.Jit 1.5 wraps NumPy's memory, with three defects. Kernels read whole packets of 8 or 16 numbers, beyond the
 end of an array whose size is not a multiple: on an unmapped page the process ends. A thread of Dr.Jit that drops the
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from operator import and_, mul
 from typing import Any
 
@@ -89,3 +89,34 @@ def quads(float_type: Any) -> Any:
     """The type of four numbers of a float array's type, which gathers and scatters move as one packet."""
     module = sys.modules[float_type.__module__]
     return module.Array4f64 if dr.type_v(float_type) == dr.VarType.Float64 else module.Array4f
+
+
+class Recorded:
+    """A function that Dr.Jit records on its first call and replays from then on (`dr.freeze`).
+
+    Python's garbage collector is off meanwhile: freeing an array while Dr.Jit records, such as one that wraps NumPy's
+    memory, ends the process. A recording has room for the sums of the threads at that time, and more threads write
+    beyond it (Dr.Jit 1.5): with more threads the function is recorded anew.
+
+    Args:
+        function: function to record.
+        state: returns arrays that the function reads beside its arguments, called before each call; None: no arrays.
+    """
+
+    def __init__(self, function: Callable[..., Any], state: Callable[[], Any] | None = None) -> None:
+        self.frozen: Any = dr.freeze(function, state_fn=None if state is None else lambda *_: state())
+        self._threads = 0
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            threads = dr.thread_count()
+            if threads > self._threads:
+                self.frozen.clear()
+                self._threads = threads
+            return self.frozen(*arguments)
+        finally:
+            if collecting:
+                gc.enable()

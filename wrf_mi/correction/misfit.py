@@ -17,8 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.device import to_tensor, to_uint
-from ..backend.recorded import Recorded
+from ..backend.device import Recorded, to_tensor, to_uint
 from ..core import Record
 from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, vstack
 
-from ..backend.device import on_device, to_tensor
-from ..backend.recorded import Recorded
+from ..backend.device import Recorded, on_device, to_tensor
 from ..backend.vectors import Complex, Pose
 from ..core import InputError
 from ..parallel.threads import one_blas_thread, processors

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ..backend.device import to_float, to_tensor
-from ..backend.recorded import Recorded
+from ..backend.device import Recorded, to_float, to_tensor
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest

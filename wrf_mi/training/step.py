@@ -18,8 +18,7 @@ import numpy as np
 from drjit.opt import Adam
 from numpy.typing import NDArray
 
-from ..backend.device import on_device, to_float, to_tensor
-from ..backend.recorded import Recorded
+from ..backend.device import Recorded, on_device, to_float, to_tensor
 from ..backend.vectors import Complex, Pose
 from ..core import Receiver
 from ..gaussians.tiles import Plane, perception_plane

@@ -29,8 +29,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.device import to_tensor
-from ...backend.recorded import Recorded
+from ...backend.device import Recorded, to_tensor
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from ...backend.recorded import Recorded
+from ...backend.device import Recorded
 from ...core import InputError
 from ...core.types import IntArray
 from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
