@@ -59,9 +59,9 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     counts, search = list[int](), solve._search
 
-    def counted(scene: Any, shared: Any, sources: Any, targets: Any, *rest: Any) -> Any:
+    def counted(shared: Any, sources: Any, targets: Any, *rest: Any) -> Any:
         counts.append(len(targets))
-        return search(scene, shared, sources, targets, *rest)
+        return search(shared, sources, targets, *rest)
 
     monkeypatch.setattr(solve, "_search", counted)
     return counts
