@@ -107,7 +107,7 @@ class PathSum:
         if others or moved or len(gains) * carriers < len(models):
             return False
         if task.in_decibel:
-            return all(isinstance(model, PowerReceiver) for model in models)
+            return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
         if task.image:
             arrays = [m for m in models if isinstance(m, ArrayReceiver) and m.instrument_scale]
             sizes, count = {len(m.elements_m) for m in arrays}, len(misfit.paths.row)

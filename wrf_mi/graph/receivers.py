@@ -157,7 +157,7 @@ def _power(form: Form, receiver: Receiver) -> PowerReceiver:
     known = form.frequencies_hz is not None
     # As the instrument of the task: powers of paths are added.
     floor = LEAST_POWER if np.isnan(form.floor_db) else 10 ** (form.floor_db / 10)
-    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), floor=floor)
+    return PowerReceiver(*form.size, (form.carrier_hz if known else 0.0,), interference=False, floor=floor)
 
 
 def _csi(form: Form, receiver: Receiver) -> CsiReceiver:

@@ -78,7 +78,7 @@ class PowerInstrument(Instrument):
         """A single antenna that adds the powers of paths."""
         from .receiver_models import PowerReceiver
 
-        return PowerReceiver(1, 1, (self.carrier_hz,))
+        return PowerReceiver(1, 1, (self.carrier_hz,), interference=False)
 
 
 @dataclass(frozen=True)

@@ -330,10 +330,14 @@ class PowerReceiver(CsiReceiver):
 
     Attributes:
         how: sum of the sides.
+        interference: traced paths interfere with each other; False: their powers add, as in an average over positions
+            within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
+            side its root enters as a positive real number.
         floor: power that is reported where neither side arrives.
     """
 
     how: How = "coherent"
+    interference: bool = True
     floor: float = LEAST_POWER
 
     @property
@@ -344,10 +348,9 @@ class PowerReceiver(CsiReceiver):
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Powers [batch] in dB of the two sides; either may be None."""
         count = self._ports.count
-        of_paths, of_gaussians = self.signals(None, learned)
-        if traced is not None:
-            # Powers of paths add, as in an average over positions within a wavelength or over a wide band: the root of
-            # their sum, equal at all frequencies, is a signal of phase zero.
+        of_paths, of_gaussians = self.signals(traced if self.interference else None, learned)
+        if traced is not None and not self.interference:
+            # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
             mean = dr.repeat(_float_type(learned)(dr.sqrt(traced.power + LEAST_POWER)), count)
             of_paths = mean, dr.zeros(type(mean), dr.width(mean))
         received = dr.block_reduce(dr.ReduceOp.Add, power(of_paths, of_gaussians, self.how), count) / count
