@@ -9,7 +9,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from .angles import FloatArray, rotation_matrix
+from .angles import FloatArray as FloatArray
+from .angles import rotation_matrix
 from .antenna import ANTENNA, Antenna, AntennaOptions
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..datasets.observations import check_observations, fitted_receivers, warn_of_left_out
 from ..scene.correction_data import CorrectionData
 from ..scene.folder import read_scene_folder

@@ -20,8 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 
 FREEDOM = 4.0  # degrees of freedom of the rows' t distribution: ten times the median squared error weighs a quarter
 MEDIAN_OF_MEAN = 0.8

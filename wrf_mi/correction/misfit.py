@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from ..backend.device import Recorded, to_tensor, to_uint
 from ..core import Record
-from ..core.angles import FloatArray
 from ..core.carriers import rows_by_carrier
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..graph.receivers import RECEIVERS, Form
 from ..receivers import minmax_scale
 from ..tasks import task_of

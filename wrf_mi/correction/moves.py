@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..parallel.threads import on_threads
 from ..tracing.paths.scene_parameters import LEAST_CONDUCTIVITY, LEAST_SUSCEPTIBILITY, QUANTITIES, SHIFT, TILT
 from ..tracing.sionna.materials import itu_constants, itu_exponent

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.sparse import coo_array, csr_array
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..parallel.threads import on_threads
 from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
 from ..receivers.receiver_models import ComplexArray as Complex

@@ -14,8 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..tracing.paths.scene_parameters import (
     EXPONENT,
     LEAST_CONDUCTIVITY,

@@ -11,8 +11,7 @@ from scipy.constants import speed_of_light
 from scipy.special import ndtri
 
 from ..core import Paths, Receiver
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from .reports import strength_db
 
 ComplexArray = NDArray[np.complex128]

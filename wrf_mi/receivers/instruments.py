@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Antenna, Paths, Receiver
-from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from .receiver_models import ArrayReceiver, CsiReceiver

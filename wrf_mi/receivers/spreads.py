@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core import Paths
-from ..core.angles import FloatArray
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 
 SURE = 1e-12  # concentrations of azimuths above 1 - SURE count as 1: rounding of float64
 

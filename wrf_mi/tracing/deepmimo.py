@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from ..core import InputError, Paths
-from ..core.angles import FloatArray
 from ..core.array_files import write_arrays
 from ..core.files import atomic_folder
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..datasets.deepmimo import PARAMS, VERSION
 from ..version import __version__
 from .paths.result import TraceResult

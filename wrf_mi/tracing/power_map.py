@@ -22,10 +22,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from ..core import Antenna, InputError, Receiver, Record, receiver_arrays
-from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..datasets import user_cache
 from ..receivers import rssi_dbm
 from .options import TraceOptions

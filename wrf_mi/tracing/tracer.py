@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core import Antenna, InputError, Receiver
-from ..core.angles import FloatArray
 from ..core.carriers import by_carrier
-from ..core.types import IntArray
+from ..core.types import FloatArray, IntArray
 from ..receivers import received_power
 from ..receivers.instruments import Instrument, SpectrumInstrument
 from .options import DEFAULTS, TraceOptions

@@ -21,8 +21,7 @@ from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
 from ...backend.device import on_device, to_tensor
 from ...core import InputError
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ...scene.folder import plain_name, write_scene
 from ...scene.materials import CARRIER, THICKNESS_M, Materials
 from ...scene.materials import EXPONENT as LAW

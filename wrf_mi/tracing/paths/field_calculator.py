@@ -23,9 +23,8 @@ from scipy.constants import epsilon_0, speed_of_light
 from ...backend.device import columns_on_device
 from ...backend.vectors import Complex, Float64, Pose, Vector, cross, dot, tangent_basis, times
 from ...core import Antenna
-from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
-from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.paths import read_paths_file, save_paths
 from ...core.settings import settings_from
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from ..search.chains import Legs
 from ..search.surfaces import Surfaces, scene_surfaces

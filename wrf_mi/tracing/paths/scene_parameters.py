@@ -33,8 +33,7 @@ from numpy.typing import NDArray
 
 from ...backend.device import columns_on_device, on_device, to_uint
 from ...backend.vectors import Float64, Vector
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..search.surfaces import Surfaces
 from ..sionna.materials import conductivity_exponent
 from .field_calculator import Level

@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from ...core import Antenna, InputError, Paths, Receiver
-from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..options import DEFAULTS, MAX_RAYS, TraceOptions
 from ..search.chains import Legs, ReflectionChains, check_search, join, shoot
 from ..search.devices import before_surfaces, check_devices, from_behind

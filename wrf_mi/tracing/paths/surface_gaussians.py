@@ -25,8 +25,7 @@ from scipy.spatial import cKDTree
 
 from ...backend.device import on_device
 from ...backend.vectors import Complex, Float64, complex_exponential
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..options import DISC, FACTOR
 
 NEAREST = 6  # gaussians that change one interaction

@@ -26,10 +26,9 @@ from scipy.constants import speed_of_light
 from ...backend.device import columns_on_device, on_device
 from ...backend.vectors import Float64, times
 from ...core import Antenna, InputError, Receiver
-from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import rows_by_carrier
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ...receivers.device_paths import TracedPaths
 from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...core import InputError
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from .surfaces import Surfaces
 

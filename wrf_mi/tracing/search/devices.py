@@ -9,8 +9,7 @@ import numpy as np
 from trimesh.triangles import closest_point
 
 from ...core import InputError
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ...scene.mesh.surfaces import Body, bounds
 from .surfaces import Surfaces
 

@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from .chains import SPECULAR, Legs, ReflectionChains, join, possible
 from .devices import before_surfaces, clear_m

@@ -18,9 +18,8 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
-from ...core.angles import FloatArray
 from ...core.digest import content_digest
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from ...scene.mesh.surfaces import Body, bodies, bounds, shared_edges
 
 COPLANAR_M = 2e-5  # largest distance of a face's corners from its plane: 30 times the rounding of float32 at 10 m

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
-from ...core.angles import FloatArray
-from ...core.types import IntArray
+from ...core.types import FloatArray, IntArray
 from .chains import SPECULAR, TRANSMISSION, Legs
 from .surfaces import ENLARGED, Surfaces
 
