@@ -226,7 +226,6 @@ def _loaded_llvm() -> Path | None:
 
 
 def _other_llvm() -> str:
-    """Remedy for an LLVM that was loaded too early."""
     other = _good_llvm()
     if other is None:
         return install_line()

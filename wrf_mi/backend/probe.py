@@ -124,7 +124,6 @@ def _run_trial(variant: str, variable: str, library: Path) -> tuple[Verdict, boo
 
 
 def _reason(status: int, errors: str) -> str:
-    """Reason for a failed trial from its status and standard error."""
     missing = re.search(r"(\S+): cannot open shared object file", errors)
     if missing:
         return f"fails: {missing[1]} is missing"

@@ -118,9 +118,8 @@ def correct_scene(
     if not any(side.exists.any() for side in trial.misfit.sides):
         raise InputError(f"{record.name}: no path reaches a receiver in {scene}; trace more interactions")
     if not len(trial.free("+".join(trial.options.parts))):
-        raise InputError(
-            f"{record.name}: no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
-        )
+        text = f"no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
+        raise InputError(f"{record.name}: {text}")
     judged = _judged_stages(trial, traced, held_out)
     units = ((stage, held_out.units(result.score)) for stage, result in judged.items())
     best_stage = last_gain(units, held_out.higher_is_better, confidence=CONFIDENCE)

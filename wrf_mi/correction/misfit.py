@@ -213,10 +213,8 @@ class Misfit:
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
-        return {
-            name: np.ascontiguousarray(vector[part].reshape(self._shapes[name]), np.float32)
-            for name, part in self.parts.items()
-        }
+        shaped = ((name, vector[part].reshape(self._shapes[name])) for name, part in self.parts.items())
+        return {name: np.ascontiguousarray(values, np.float32) for name, values in shaped}
 
     def _device(self, vector: FloatArray) -> dict[str, Any]:
         return {name: to_tensor(value) for name, value in self.named(vector).items()}

@@ -65,7 +65,6 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
 
 
 def _facts(correction: Correction) -> dict[str, Any]:
-    """Everything that the page states."""
     misfit, task = correction.misfit, task_of(correction.misfit.record)
     changed = np.isin(np.arange(len(correction.vector)), correction.state.free)
     values, sd_before = misfit.named(correction.vector), correction.state.posterior.prior_deviation
@@ -160,7 +159,6 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
 
 
 def _frame(correction: Correction) -> dict[str, Any] | None:
-    """The common motion of the planes, and its standard deviations."""
     misfit = correction.misfit
     if FRAME not in correction.kept.split("+"):
         return None

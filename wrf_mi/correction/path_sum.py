@@ -67,11 +67,8 @@ class PathSum:
         self._coherent = not task_of(misfit.record).in_decibel
         material = [np.arange(part.start, part.stop) for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
-        self._factors = [
-            (misfit.parts[port.side.gain_name], port.places)
-            for port in misfit.ports
-            if port.side.gain_name in misfit.parts
-        ]
+        gains = [(port.side.gain_name, port.places) for port in misfit.ports]
+        self._factors = [(misfit.parts[name], places) for name, places in gains if name in misfit.parts]
         self._models, self._model_of = _distinct_models(misfit)
         # What does not change with materials: lengths of paths, and the waves of gains of one.
         self._mirrors = np.where(self._paths.reflects, self._paths.plane, -1)
@@ -190,9 +187,8 @@ class PathSum:
             if column in gain_columns:
                 of_phase, rows = gain_columns[column]
                 # Of exp(x + j y) for fields, and of exp(2 x) for powers.
-                changes.append(
-                    (rows, ((1j if of_phase else 1) if self._coherent else 2 * (not of_phase)) * total[rows])
-                )
+                slope = (1j if of_phase else 1) if self._coherent else 2 * (not of_phase)
+                changes.append((rows, slope * total[rows]))
             else:
                 moved, change = self._change_by(int(column), vector, present)
                 changes.append((moved.rows, moved.sums(change)))

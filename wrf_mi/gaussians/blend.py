@@ -101,7 +101,6 @@ def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
 
 
 def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
-    """Signals of a group for one Gaussian."""
     # Packets of four floats hold two signals; an odd group leaves half a packet and reads its floats one by one.
     if group % 2:
         values = [dr.gather(type(table), table, slot * (2 * group) + k) for k in range(2 * group)]
@@ -269,8 +268,6 @@ def _backward(
 
 
 class _Blend(dr.CustomOp):
-    """Blending as one differentiable operation over per-Gaussian columns and signals."""
-
     def eval(self, layout: Layout, columns: list[Any], signal: list[Any]) -> Any:
         self.layout = layout
         self.table = pack([*columns, *([] if layout.shared else signal)])

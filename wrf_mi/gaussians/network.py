@@ -91,10 +91,8 @@ class _Rectified(dr.CustomOp):
         # Columns are batch-major (b * n + i): a transmitter's part repeats, a Gaussian's is tiled.
         total = dr.repeat(per_transmitter.array, self.columns)
         if per_gaussian is not None and self.batch > 1:
-            wide = dr.reshape(per_gaussian, (outputs, 1, self.columns)) + dr.zeros(
-                type(per_transmitter), (1, self.batch, 1)
-            )
-            total += wide.array
+            zeros = dr.zeros(type(per_transmitter), (1, self.batch, 1))
+            total += (dr.reshape(per_gaussian, (outputs, 1, self.columns)) + zeros).array
         elif per_gaussian is not None:
             total += per_gaussian.array
         if product is not None:

@@ -71,13 +71,11 @@ def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:
 
 
 def _footprints(record: list[Any], strip: Plane) -> list[Any]:
-    """Footprint of one Gaussian at each pixel of the lanes."""
     along = along_azimuth(record, strip.azimuth)
     return [footprint_at(along, elevation)[0] for elevation in strip.elevation]
 
 
 def _counted(counts: list[Any], footprints: list[Any]) -> list[Any]:
-    """Counters after one more Gaussian."""
     return [s + dr.select(g > 0, type(s)(1), type(s)(0)) for s, g in zip(counts, footprints, strict=True)]
 
 

@@ -87,9 +87,8 @@ def reverse_start(
     float_type: Any = type(total[0])
     slopes, state = [], ReverseState([], [])
     for numbers, is_active in zip(pixels, active, strict=True):
-        g, r = (
-            [tuple(dr.gather(float_type, a, i, is_active) for a in pair) for i in numbers] for pair in (gradient, total)
-        )
+        pairs = gradient, total
+        g, r = ([tuple(dr.gather(float_type, a, i, is_active) for a in pair) for i in numbers] for pair in pairs)
         slopes.append(g)
         state.q.append(_summed(g, r))
         state.t.append((float_type(1), float_type(0)))

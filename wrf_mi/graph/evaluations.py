@@ -63,10 +63,8 @@ def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool =
     lower = splat(gaussians, facing_down(pose), plane)
     tensor_type: Any = dr.tensor_t(type(upper[0]))
     shape = (gaussians.batch, plane.pixels)
-    re, im = (
-        dr.concat([tensor_type(half, shape) for half in halves], axis=1).array
-        for halves in zip(upper, lower, strict=True)
-    )
+    pairs = ([tensor_type(half, shape) for half in halves] for halves in zip(upper, lower, strict=True))
+    re, im = (dr.concat(pair, axis=1).array for pair in pairs)
     return re, im
 
 

@@ -148,9 +148,8 @@ class Graph:
     @property
     def corrects(self) -> bool:
         """Whether the Gaussians correct a report without them: paths, or a channel of zero."""
-        return self.field is not None and (
-            self.scene is not None or (self.kind.complex_valued and not self.form.features)
-        )
+        is_channel = self.kind.complex_valued and not self.form.features
+        return self.field is not None and (self.scene is not None or is_channel)
 
     @cached_property
     def _prepared(self) -> Prepared:
@@ -298,10 +297,8 @@ class Graph:
         """Constants on the device that a report reads beside its arguments, inputs of a recording."""
         if side is None and self.form.receiver == "pixel":
             return []
-        return [
-            self.models[number].arrays(mi.Float),
-            [] if side is None else [side.arrays, draws_on_device(side.form[0])],
-        ]
+        of_side = [] if side is None else [side.arrays, draws_on_device(side.form[0])]
+        return [self.models[number].arrays(mi.Float), of_side]
 
     def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
         """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""

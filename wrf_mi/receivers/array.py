@@ -195,7 +195,6 @@ class Lags:
 
     @cached_property
     def _factors(self) -> tuple[FloatArray, FloatArray]:
-        """QR decomposition of the basis."""
         orthonormal, triangle = np.linalg.qr(self.basis)
         values = np.linalg.svd(triangle, compute_uv=False)
         if len(values) < self.count or values[-1] < LEAST_CONDITION * values[0]:

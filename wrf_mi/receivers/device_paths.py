@@ -106,9 +106,8 @@ def expected_report(
     source = copy // DRAWS * each + path
     draw = dr.gather(Float64, draws_on_device(each), path * DRAWS + copy % DRAWS)
     sine, cosine = dr.sincos(dr.gather(Float64, deviation, source) * draw)
-    re, im, length_m, *arrival = (
-        dr.gather(Float64, part, source) for part in (*paths.gain, paths.length_m, *paths.arrival)
-    )
+    parts = *paths.gain, paths.length_m, *paths.arrival
+    re, im, length_m, *arrival = (dr.gather(Float64, part, source) for part in parts)
     if learned is not None:  # the same beside all draws
         size = dr.width(learned[0]) // batch
         lane = dr.arange(mi.UInt32, drawn * size)

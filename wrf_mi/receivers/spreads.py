@@ -96,6 +96,5 @@ class PathStatistics:
 
 def joined(parts: Sequence[PathStatistics]) -> PathStatistics:
     """Statistics of groups of transmitters one after the other."""
-    return PathStatistics(
-        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(PathStatistics))
-    )
+    names = [field.name for field in fields(PathStatistics)]
+    return PathStatistics(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

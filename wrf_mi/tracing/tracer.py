@@ -131,9 +131,8 @@ def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
     heard = ~np.isnan(measured).all(axis=1)
     for receiver, known in enumerate(~np.isnan(difference)):
         if heard[receiver] and not known.any():
-            raise InputError(
-                f"receiver {receiver}: no training row is both received and reached by a path; trace more kinds of path"
-            )
+            text = "no training row is both received and reached by a path; trace more kinds of path"
+            raise InputError(f"receiver {receiver}: {text}")
     offset_db, floor_dbm = np.empty((2, len(measured)))
     # The median minimises the absolute error, by which signal strengths are scored.
     offset_db[heard], floor_dbm[heard] = np.nanmedian(difference[heard], axis=1), np.nanmin(measured[heard], axis=1)

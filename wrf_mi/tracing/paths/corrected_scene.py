@@ -146,9 +146,8 @@ def write_corrected_scene(
     fitted, exponent = corrected.table, corrected.exponent
     # As stated, or as parameters state it: metal has a permittivity of 1, of whose logarithm less one there is none.
     stated = [slabs.table, slabs.fitted(slabs.parameters(QUANTITIES)).table]
-    changed: NDArray[np.bool_] = np.all(
-        [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated], axis=0
-    )
+    differs = [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated]
+    changed: NDArray[np.bool_] = np.all(differs, axis=0)
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
     entries, constants = dict[str, str](), dict[str, dict[str, float]]()

@@ -184,7 +184,6 @@ def trace_paths(
 
 
 def _names(transmitters: int, receivers: Sequence[Receiver], first_row: int) -> tuple[list[str], list[str]]:
-    """Names of transmitters, by their rows from 1, and of receivers in messages."""
     rows = range(first_row + 1, first_row + 1 + transmitters)
     return [f"transmitter {row}" for row in rows], [f"receiver {receiver.name}" for receiver in receivers]
 

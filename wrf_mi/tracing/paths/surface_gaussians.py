@@ -56,7 +56,6 @@ class SurfaceGaussians:
     size_m: float  # standard deviation s in the plane, metres
 
     def __len__(self) -> int:
-        """Number of Gaussians."""
         return self.discs.shape[1]
 
     @cached_property

@@ -166,9 +166,7 @@ class TracedField:
         self.search(position_m)
         return True
 
-    def __call__(
-        self, parameters: Mapping[str, Any], rows: Any | None = None, entries: Any | None = None
-    ) -> TracedPaths:
+    def __call__(self, parameters: Mapping[str, Any], rows: Any = None, entries: Any = None) -> TracedPaths:
         """Paths of some transmitters with the given parameters. Differentiable in all parameters.
 
         Args:
@@ -200,7 +198,7 @@ class TracedField:
         slot = dr.arange(mi.UInt32, dr.width(rows) * self._each)
         return dr.gather(mi.UInt32, rows, slot // self._each) * self._each + slot % self._each
 
-    def bounces_of(self, rows: Any | None) -> Any:
+    def bounces_of(self, rows: Any) -> Any:
         """Square roots of the numbers of reflections of paths of some transmitters, or with None of all."""
         return self.bounces if rows is None else dr.gather(Float64, self.bounces, self._entries_of(rows))
 
@@ -294,7 +292,6 @@ class TracedField:
         return [*self.tx_pos_m[tx].T, np.cos(heading), np.sin(heading)]
 
     def _amplitudes(self, chains: Chains) -> FloatArray:
-        """Amplitudes of paths, with the present parameters."""
         if not dr.width(chains.exists):
             return np.zeros(0)
         with dr.suspend_grad():

@@ -40,7 +40,6 @@ class Legs:
     wedge: dict[str, NDArray[Any]]
 
     def __len__(self) -> int:
-        """Number of paths."""
         return len(self.source)
 
     def select(self, which: NDArray[Any] | slice) -> Legs:
@@ -90,7 +89,6 @@ class ReflectionChains:
     source: IntArray  # number of the source of each chain, shape [c]
 
     def __len__(self) -> int:
-        """Number of chains."""
         return len(self.plane)
 
     @cached_property

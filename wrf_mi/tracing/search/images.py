@@ -78,15 +78,13 @@ def specular_paths(
     columns = [(np.full(np.count_nonzero(apart), -1), source[apart], target[apart])]
     columns += [(chain, chains.source[chain], target) for chain, target in possible(surfaces, chains, targets_m)]
     candidates = [np.concatenate(column) for column in zip(*columns, strict=True)]
-    clear_sources, clear_targets = (
-        before_surfaces(surfaces, ends) - surfaces.centre_m for ends in (sources_m, targets_m)
-    )
+    clear = [before_surfaces(surfaces, ends) - surfaces.centre_m for ends in (sources_m, targets_m)]
     parts = []
     for start in range(0, max(1, len(candidates[0])), CANDIDATES_PER_CHUNK):
         chain, source, target = (column[start : start + CANDIDATES_PER_CHUNK] for column in candidates)
         plane = np.where(chain[:, None] >= 0, chains.plane[chain], -1) if len(chains) else chain[:, None][:, :0]
         # Existence of a path is judged for displaced antennas (`displaced`); its points are exact for the stated ones.
-        near = displaced(surfaces.scale_m, clear_sources[source], clear_targets[target])
+        near = displaced(surfaces.scale_m, clear[0][source], clear[1][target])
         vertices, meets = _vertices(surfaces, plane, *(ends + surfaces.centre_m for ends in near))
         meets &= ~_mounted(surfaces, plane, sources_m[source], targets_m[target])
         row = np.flatnonzero(meets)

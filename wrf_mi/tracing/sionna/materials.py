@@ -48,9 +48,8 @@ def perfect_reflector() -> Any:
     """Radio material with reflection coefficients of -1 and +1 to single precision, by a high conductivity."""
     from sionna import rt
 
-    return rt.RadioMaterial(
-        PERFECT, thickness=PERFECT_THICKNESS_M, relative_permittivity=1.0, conductivity=PERFECT_CONDUCTIVITY
-    )
+    slab = {"thickness": PERFECT_THICKNESS_M, "conductivity": PERFECT_CONDUCTIVITY}
+    return rt.RadioMaterial(PERFECT, relative_permittivity=1.0, **slab)
 
 
 def absorbs(material: Any) -> bool:
@@ -120,7 +119,6 @@ def _extend(material: Any, name: str, frequency_hz: float) -> None:
 
 
 def _share_kernels(scene: Any, frequency_hz: float) -> None:
-    """Make carrier and constants inputs of Dr.Jit's kernels."""
     import drjit as dr
     import mitsuba as mi
 
