@@ -44,7 +44,7 @@ CHANGES = {AS_STATED: "0.85", FITTED: "tab:blue", ANOTHER: "tab:orange", LEFT_OU
 
 
 def write_page(correction: Correction, folder: str | Path, replace: bool = False) -> dict[str, Any]:
-    """Write a corrected scene and its page atomically as a new scene folder; returns what its JSON file holds.
+    """Write a corrected scene and its page atomically as a new scene folder; returns the content of its JSON file.
 
     Raises:
         InputError: a folder that exists and is not to be replaced, or cannot be written, or no surface is left.

@@ -209,10 +209,8 @@ class ScenePosterior:
         return Prior(mean[free], np.linalg.inv(covariance))
 
     def trial_costs(self, trials: Misfit | PathSum, noise: Noise, vectors: FloatArray) -> list[float]:
-        """Negative logarithms of the likelihood of vectors [v, p] and of the planes' prior, without its constant.
-
-        Materials have no prior here: alternatives are other means of it.
-        """
+        """Negative logarithms of the likelihood of vectors [v, p] and of the planes' prior, without its constant."""
+        # Materials have no prior here: alternatives are other means of it.
         free, prior = self._planes_prior
         costs = noise.costs(trials.mean_squares(vectors))
         return [float(cost) + prior.cost(vector[free]) for cost, vector in zip(costs, vectors, strict=True)]
@@ -238,10 +236,8 @@ class ScenePosterior:
         return by_frame[places]
 
     def motion(self, vector: FloatArray, without: IntArray) -> FloatArray:
-        """Rigid motion [6] of the planes that enough paths meet, but for those of some entries.
-
-        The mean of its Gaussian posterior, planes being measurements of it with the errors of their prior.
-        """
+        """Rigid motion [6] of the planes that enough paths meet, but for those of some entries."""
+        # The mean of its Gaussian posterior, planes being measurements of it with the errors of their prior.
         planes, motions = self.misfit.plane_entries, self.motions
         measured = np.isin(planes, np.setdiff1d(self.free(PLANES), without))
         weight = measured / np.square(self.prior_deviation[planes])

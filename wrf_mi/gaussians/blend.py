@@ -301,16 +301,10 @@ def blend(
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel: real and imaginary part, [batch * height * width], row-major.
 
-    Differentiable in footprints, signal and ``blending``.
-
-    Args:
-        footprints: footprints of ``batch * n`` Gaussians, or of n that all transmitters share.
-        signal: complex signal (re, im), two arrays [batch * n], batch-major.
-        lists: Gaussians of each tile, near to far; of one transmitter where footprints are shared.
-        plane: the perception plane.
-        batch: number of transmitters.
-        blending: one array of opacities in [0, 1) (alpha blending), or real and imaginary part of delta, |delta| < 1
-            (product blending), as many numbers as footprints.
+    Differentiable in footprints of ``batch * n`` Gaussians, or of n that all transmitters share, in the signal (re,
+    im), two arrays [batch * n], batch-major, and in ``blending``: an array of opacities in [0, 1) (alpha blending), or
+    real and imaginary part of delta, |delta| < 1 (product blending), as many numbers as footprints. ``lists`` are the
+    Gaussians of each tile, near to far, of one transmitter where footprints are shared.
     """
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)

@@ -62,10 +62,8 @@ Params = Mapping[str, dr.ArrayBase]
 def init_layer(
     name: str, inputs: Mapping[str, int], outputs: int, rng: np.random.Generator, gain: float = np.sqrt(2.0)
 ) -> Weights:
-    """A layer whose input is a concatenation of named parts, as one matrix [outputs, size] a part and a bias.
-
-    Normal weights with deviation gain / sqrt(total inputs) (He et al. 2015), zero bias [outputs, 1].
-    """
+    """A layer whose input is a concatenation of named parts, as one matrix [outputs, size] a part and a bias."""
+    # Normal weights with deviation gain / sqrt(total inputs) (He et al. 2015), zero bias [outputs, 1].
     deviation = gain / np.sqrt(sum(inputs.values()))
     weights = {
         f"{name}.{part}": (rng.standard_normal((outputs, size)) * deviation).astype(np.float32)

@@ -270,10 +270,8 @@ class PixelOperator(_Operator):
 
 
 def static_signals(field: Any, params: Mapping[str, Any]) -> tuple[NDArray[np.complex64] | None, Coefficients]:
-    """Signals S = C c of a field: factors C [n, K], or None where the coefficients are the signals, and c.
-
-    Other classes, subclasses included, may compute signals otherwise; theirs are `recorded_signals`.
-    """
+    """Signals S = C c of a field: factors C [n, K], or None where the coefficients are the signals, and c."""
+    # Other classes, subclasses included, may compute signals otherwise; theirs are `recorded_signals`.
     # In NumPy: the start of a recorded Dr.Jit function takes longer than these small products.
     if type(field) is Factorised:
         factors, functions = _complex(params["signal"].reshape(2, field.terms, -1)).T, cast(Any, field.functions)

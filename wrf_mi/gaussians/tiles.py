@@ -62,9 +62,8 @@ class Plane:
 def tiling(height: int, width: int, tile: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Pixels of an image in tiles of (rows, columns), whose lanes have several rows of one column.
 
-    Returns:
-        Numbers of the pixels of each tile [tiles, pixels] and of each lane [rows, lanes], clamped to the image, and a
-        mask [rows, lanes] of those inside it.
+    Numbers of the pixels of each tile [tiles, pixels] and of each lane [rows, lanes], clamped to the image, and a mask
+    [rows, lanes] of those inside it.
     """
     rows, columns, group = tile
     down, across = -(-height // rows), -(-width // columns)
@@ -134,14 +133,11 @@ def _boxes(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBas
 
 
 def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch: int) -> TileLists:
-    """List the Gaussians of each tile in depth order.
+    """List the Gaussians of each tile in depth order; `InputError` for more entries than 32 bits count.
 
     Where room for every Gaussian in every tile takes more than `RESERVED` entries, entries are counted first and only
     their room is allocated. A function that Dr.Jit records cannot count: there, room is for all. Footprints are of
     ``batch * n`` columns, ``order`` lists the n Gaussians from near to far.
-
-    Raises:
-        InputError: more entries than 32 bits count.
     """
     index_type: Any = type(order)
     float_type: Any = type(footprints.radius)

@@ -41,10 +41,7 @@ def arrives(report_db: NDArray[Any], floor: float) -> NDArray[np.bool_]:
 
 
 def minmax_scale(spectrum: ArrayLike) -> FloatArray:
-    """Scale each image [..., height, width] by its minimum and maximum to 0..1, as the instrument does.
-
-    A constant image (nothing received) becomes 0.
-    """
+    """Scale each image [..., height, width] by its extremes to 0..1, as the instrument does; a constant one to 0."""
     image = np.asarray(spectrum, float)
     low = image.min(axis=(-2, -1), keepdims=True)
     span = image.max(axis=(-2, -1), keepdims=True) - low
@@ -53,10 +50,8 @@ def minmax_scale(spectrum: ArrayLike) -> FloatArray:
 
 
 def scaled(image: Any, pixels: int) -> Any:
-    """`minmax_scale` of Dr.Jit images of ``pixels`` values each, flat.
-
-    Differentiable, extremes included: a pixel that sets the scale moves all others.
-    """
+    """`minmax_scale` of Dr.Jit images of ``pixels`` values each, flat."""
+    # Differentiable, extremes included: a pixel that sets the scale moves all others.
     import drjit as dr
 
     index = dr.arange(dr.uint32_array_t(type(image)), dr.width(image)) // pixels

@@ -138,10 +138,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
 
     Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: they take the
     mean of the points around them that are outside, or the nearest such mean. Means are over a Gaussian of the standard
-    deviation ``smooth_m``; 0: none.
-
-    Raises:
-        InputError: no path to a receiver from anywhere, or a scene filled by a solid.
+    deviation ``smooth_m``; 0: none. `InputError` for a receiver that no path reaches, or a scene filled by a solid.
     """
     # The grid covers the scene and all positions; storeys of the transmitter's heights are layers of it.
     box = scene.mi_scene.bbox()

@@ -121,10 +121,7 @@ def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
     """Fit an offset to each receiver: the median of measured minus traced training rows [n_rx, n].
 
     Values are NaN where no path arrives, or where nothing was received. A receiver that received nothing takes the mean
-    offset of the others, and their weakest signal.
-
-    Raises:
-        InputError: a receiver that received rows, but none that was traced.
+    offset of the others, and their weakest signal; `InputError` for one whose rows are not traced.
     """
     traced, measured = np.asarray(traced_dbm, float), np.asarray(measured_dbm, float)
     difference = measured - traced

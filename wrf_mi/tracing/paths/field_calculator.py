@@ -60,10 +60,7 @@ class Chains:
         return dr.gather(Chains, self, index)
 
     def met(self, depth: int) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
-        """Planes, materials and whether they reflect, at up to ``depth`` interactions of the p paths that exist.
-
-        Each is [p, depth]; planes and materials are -1 for none.
-        """
+        """Planes and materials that the p existing paths meet [p, depth], -1 for none, and whether these reflect."""
         exists = np.flatnonzero(self.exists.numpy() > 0)
         plane, material = np.full((2, len(exists), depth), -1)
         reflects = np.zeros((len(exists), depth), bool)
@@ -166,10 +163,7 @@ def _interact(
 
 
 def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
-    """Real field vectors of an antenna, three arrays [q] in the world's frame, with derivatives.
-
-    As `wrf_mi.core.Antenna.field`, of unit vectors ``direction`` and the antenna's axes x, y and z in that frame.
-    """
+    """Field vectors as of `wrf_mi.core.Antenna.field`, three arrays [q] in the arguments' frame, differentiable."""
     local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
     return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
 

@@ -54,10 +54,7 @@ def pose_names(receiver: Receiver) -> tuple[str, str]:
 
 
 def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type: Any) -> Pose:
-    """Corrected pose of a receiver, of a float type, in which the stated position is added. Differentiable.
-
-    ``parameters``: the receiver's position and rotation, tensors [3]; missing ones are zero.
-    """
+    """Corrected pose in a float type, by tensors [3] of position and rotation; missing: as stated. Differentiable."""
 
     def correction(name: str) -> list[Any]:
         if name not in parameters:
@@ -99,10 +96,7 @@ def spread_pose(pose: Pose, count: int) -> Pose:
 def with_antennas(
     gain: Complex, receiver: Receiver, parameters: Mapping[str, Any], arrival: Vector, departure: Vector
 ) -> Complex:
-    """Gains of paths times the instrument's gain and both antennas' pattern factors, of those that are parameters.
-
-    Directions are those of `wrf_mi.tracing.paths.field_calculator.evaluate_paths`. Differentiable.
-    """
+    """Gains of paths times those of the instrument and of both patterns that are parameters. Differentiable."""
     if (name := gain_name(receiver)) in parameters:
         float_type = type(gain[0])
         gain = times(gain, complex_exponential(*(float_type(component(parameters[name], i)) for i in (0, 1))))

@@ -251,10 +251,8 @@ class SceneTables:
 
 
 def renumbered(levels: Sequence[Level], planes: IntArray, slabs: IntArray) -> list[Level]:
-    """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``, ascending.
-
-    Both have all those that a path meets; place holders get any of these numbers.
-    """
+    """Interactions with planes and materials numbered by their places in ``planes`` and ``slabs``, ascending."""
+    # Both have all those that a path meets; place holders get any of these numbers.
 
     def places(numbers: Any, chosen: IntArray) -> Any:
         return to_uint(np.minimum(np.searchsorted(chosen, np.asarray(numbers)), len(chosen) - 1))

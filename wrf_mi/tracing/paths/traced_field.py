@@ -169,11 +169,9 @@ class TracedField:
     def __call__(self, parameters: Mapping[str, Any], rows: Any = None, entries: Any = None) -> TracedPaths:
         """Paths of some transmitters with the given parameters. Differentiable in all parameters.
 
-        Args:
-            parameters: Dr.Jit tensors by the names of `parameters`; missing ones keep their initial values.
-            rows: transmitters of the batch, an unsigned integer array; None: all.
-            entries: paths of the batch by their places in `exists`, an unsigned integer array, in place of ``rows``:
-                each counts as a transmitter's only path. None: all paths of ``rows``.
+        Of the transmitters ``rows`` (None: all), or in their place the paths ``entries`` by their places in `exists`,
+        each as a transmitter's only path; both are unsigned integer arrays. Missing parameters keep their initial
+        values.
         """
         # Which paths: those of the rows of a batch, single ones, or all.
         chains, batch, each, chosen = self.chains, len(self), self._each, entries

@@ -48,11 +48,9 @@ def clear_m(surfaces: Surfaces) -> float:
 
 
 def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
-    """Move antennas at positions [n, 3] that are mounted on a surface before it, so that they have a side.
-
-    Outer walls, with all of the scene on one side, and solids have a right side, to which antennas up to `BEHIND_M`
-    behind are moved; at other sheets an antenna keeps its side.
-    """
+    """Move antennas at positions [n, 3] that are mounted on a surface before it, so that they have a side."""
+    # Outer walls, with all of the scene on one side, and solids have a right side, to which antennas up to `BEHIND_M`
+    # behind are moved; at other sheets an antenna keeps its side.
     # Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where
     # no path arrives, or inside a cabinet.
     moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)

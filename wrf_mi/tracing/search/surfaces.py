@@ -156,10 +156,8 @@ class Surfaces:
 
     @cached_property
     def solids(self) -> list[tuple[Body, FloatArray]]:
-        """Each closed, consistently oriented body that is an object rather than a room, and its normals outwards.
-
-        There are fewer normals than faces where faces have no area.
-        """
+        """Each closed, consistently oriented body that is an object rather than a room, and its normals outwards."""
+        # There are fewer normals than faces where faces have no area.
         solids = []
         for body in bodies(self.triangles):
             # Mean thickness 2 V / A of a slab: thin bodies are objects, thick ones rooms, whose inside is air.
@@ -288,10 +286,8 @@ def screens(triangles: FloatArray, scale_m: float) -> Any:
 
 
 def enlarged(triangles: FloatArray, scale_m: float) -> FloatArray:
-    """Triangles [f, 3, 3] enlarged in their planes by `ENLARGED` at edges that are free, sharp or of three faces.
-
-    At other edges they overlap by rounding. Degenerate triangles stay as they are.
-    """
+    """Triangles [f, 3, 3] enlarged in their planes by `ENLARGED` at edges that are free, sharp or of three faces."""
+    # At other edges they overlap by rounding. Degenerate triangles stay as they are.
     if not len(triangles):
         return triangles
     along = np.roll(triangles, -1, axis=1) - triangles  # edge k runs from corner k to corner k + 1

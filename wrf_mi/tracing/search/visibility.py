@@ -189,10 +189,8 @@ _Near = tuple[IntArray, IntArray, FloatArray]  # indices of points on planes, a 
 
 
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
-    """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there.
-
-    Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`.
-    """
+    """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there."""
+    # Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`.
     met, faces = _with_faces(surfaces, vertices_m, plane, met)
     vertices_m, plane = vertices_m[faces], plane[faces]
     crossings = _crossings(surfaces, vertices_m, plane, met)
