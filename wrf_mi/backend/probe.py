@@ -70,8 +70,12 @@ def try_cuda(driver: Path, *, fresh: bool = False) -> Verdict:
 
 
 def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
+    versions = [f"{package} {installed_version(package) or '?'}" for package in ("drjit", "mitsuba")]
+    # Several machines may share a home folder. Of the devices, an empty variable hides all, one that is unset none.
+    devices = str(os.environ.get("CUDA_VISIBLE_DEVICES")) if name == "cuda" else ""
     try:
-        key = "|".join([name, file_key(library), *_environment(name)])
+        script = sha256(_SCRIPT.read_bytes()).hexdigest()[:12]
+        key = "|".join([name, file_key(library), *versions, script, platform.node(), devices])
     except OSError as error:
         return Verdict(False, f"cannot be read: {error.strerror}")
     known = None if fresh else recall(key)
@@ -81,14 +85,6 @@ def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
     if final:
         remember(key, vars(verdict), float("inf") if verdict.usable else FAILURE_KEPT_S)
     return verdict
-
-
-def _environment(name: str) -> list[str]:
-    """Packages, script, machine and devices; several machines may share a home folder."""
-    versions = [f"{package} {installed_version(package) or '?'}" for package in ("drjit", "mitsuba")]
-    # Empty hides every device, unset none.
-    devices = str(os.environ.get("CUDA_VISIBLE_DEVICES")) if name == "cuda" else ""
-    return [*versions, sha256(_SCRIPT.read_bytes()).hexdigest()[:12], platform.node(), devices]
 
 
 def _run_trial(variant: str, variable: str, library: Path) -> tuple[Verdict, bool]:

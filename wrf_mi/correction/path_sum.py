@@ -69,7 +69,12 @@ class PathSum:
         self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
         gains = [(port.side.gain_name, port.places) for port in misfit.ports]
         self._factors = [(misfit.parts[name], places) for name, places in gains if name in misfit.parts]
-        self._models, self._model_of = _distinct_models(misfit)
+        # Receiver models with different reports of signals, and the number of that of each row.
+        models, self._model_of = dict[Any, Any](), np.zeros(len(misfit.observed), np.int64)
+        for port in misfit.ports:
+            models.setdefault(port.model.signal_key, port.model)
+            self._model_of[port.places] = list(models).index(port.model.signal_key)
+        self._models = list(models.values())
         # What does not change with materials: lengths of paths, and the waves of gains of one.
         self._mirrors = np.where(self._paths.reflects, self._paths.plane, -1)
         self._slope, length = csr_array((len(self._paths.row), 0)), np.zeros(0)
@@ -313,15 +318,6 @@ def _unit_waves(misfit: Misfit, vector: FloatArray, length_m: FloatArray) -> tup
     assert misfit.record.frequencies_hz is not None
     k = 2 * np.pi * np.asarray(misfit.record.frequencies_hz, float)[None] / speed_of_light
     return k, np.exp(-1j * length_m[:, None] * k)
-
-
-def _distinct_models(misfit: Misfit) -> tuple[list[Any], IntArray]:
-    """Receiver models with different reports of signals, and the number of that of each row."""
-    models, number = dict[Any, Any](), np.zeros(len(misfit.observed), np.int64)
-    for port in misfit.ports:
-        models.setdefault(port.model.signal_key, port.model)
-        number[port.places] = list(models).index(port.model.signal_key)
-    return list(models.values()), number
 
 
 def _joined(parts: Sequence[FloatArray], misfit: Misfit) -> FloatArray:

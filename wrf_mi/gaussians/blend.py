@@ -91,15 +91,6 @@ def _signal_slots(n: int, batch: int, index_type: Any) -> Any:
     return ((b // group) * n + i) * (2 * group) + (b % group) * 2
 
 
-def _pack_signals(signal: list[Any], n: int, batch: int) -> Any:
-    """Signals (re, im) [batch * n] as a table that gives those of a group with one lookup."""
-    slots = _signal_slots(n, batch, dr.uint32_array_t(type(signal[0])))
-    table = dr.zeros(type(signal[0]), 2 * batch * n)
-    for part in (0, 1):
-        dr.scatter(table, signal[part], slots + part)
-    return table
-
-
 def _read_signals(table: Any, slot: Any, group: int) -> list[Complex]:
     # Packets of four floats hold two signals; an odd group leaves half a packet and reads its floats one by one.
     if group % 2:
@@ -271,7 +262,12 @@ class _Blend(dr.CustomOp):
     def eval(self, layout: Layout, columns: list[Any], signal: list[Any]) -> Any:
         self.layout = layout
         self.table = pack([*columns, *([] if layout.shared else signal)])
-        self.signals = _pack_signals(signal, layout.n, layout.batch) if layout.shared else None
+        self.signals = None
+        if layout.shared:  # a table that gives the signals of a group with one lookup
+            slots = _signal_slots(layout.n, layout.batch, dr.uint32_array_t(type(signal[0])))
+            self.signals = dr.zeros(type(signal[0]), 2 * layout.batch * layout.n)
+            for part in (0, 1):
+                dr.scatter(self.signals, signal[part], slots + part)
         dr.eval(self.table, self.signals)
         self.total = _forward(self.table, self.signals, layout)
         dr.eval(self.total)

@@ -190,9 +190,18 @@ _Near = tuple[IntArray, IntArray, FloatArray]  # indices of points on planes, a 
 
 def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there."""
-    # Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`.
-    met, faces = _with_faces(surfaces, vertices_m, plane, met)
-    vertices_m, plane = vertices_m[faces], plane[faces]
+    # Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`, in
+    # whose place the nearest face is put, if there is one at the point.
+    path, slot = np.nonzero(met.face == UNKNOWN_FACE)
+    if len(path):
+        level, has_faces = met.leg[path, slot], np.ones(len(plane), bool)
+        points = vertices_m[path, level + 1]
+        nearest, away_m = nearest_faces(surfaces, plane[path, level], points)
+        face, points_m = met.face.copy(), met.points_m.copy()
+        face[path, slot], points_m[path, slot] = nearest, points
+        has_faces[path[away_m > ENLARGED * surfaces.scale_m]] = False
+        met = met._replace(face=face, points_m=points_m).select(has_faces)
+        vertices_m, plane = vertices_m[has_faces], plane[has_faces]
     crossings = _crossings(surfaces, vertices_m, plane, met)
     if not len(crossings.path):
         return met
@@ -236,21 +245,6 @@ def _inserted(met: Met, further: _Crossings, vertices_m: FloatArray) -> tuple[Me
     for array, values in ((longer.interactions, kinds), (longer.face, faces), (longer.points_m, points)):
         array[paths[within], slots[within]] = values[within]
     return longer, np.bincount(paths, minlength=len(met.face)) <= met.face.shape[1]
-
-
-def _with_faces(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met) -> tuple[Met, NDArray[np.bool_]]:
-    """Paths with a face for each `UNKNOWN_FACE`, and the mask of those that have one at each point."""
-    path, slot = np.nonzero(met.face == UNKNOWN_FACE)
-    has_faces = np.ones(len(plane), bool)
-    if not len(path):
-        return met, has_faces
-    level = met.leg[path, slot]
-    points = vertices_m[path, level + 1]
-    nearest, away_m = nearest_faces(surfaces, plane[path, level], points)
-    face, points_m = met.face.copy(), met.points_m.copy()
-    face[path, slot], points_m[path, slot] = nearest, points
-    has_faces[path[away_m > ENLARGED * surfaces.scale_m]] = False
-    return met._replace(face=face, points_m=points_m).select(has_faces), has_faces
 
 
 def reflect_on_faces(surfaces: Surfaces, legs: Legs) -> NDArray[np.bool_]:
