@@ -11,7 +11,7 @@ import numpy as np
 
 from ..backend.device import on_device
 
-PER_PAIR = ("scale", "rotation", "opacity", "attenuation")  # that transmitters may differ in, beside the signal
+PER_PAIR = ("scale", "rotation", "opacity", "attenuation")  # transmitters may differ in them
 
 
 @dataclass

@@ -44,7 +44,7 @@ LEAST_CONDUCTIVITY = 1e-6  # start of the conductivity of lossless materials, S/
 PREFIX, EXPONENT = "material.", "exponent"
 SURFACE = "surface"  # in place of a material's name: parameters [n] of all surfaces
 QUANTITIES = ("permittivity", "conductivity", "thickness", EXPONENT)  # constants of a material that may be parameters
-TRAINED = QUANTITIES[:2]  # those that are by default
+TRAINED = QUANTITIES[:2]  # those that are parameters by default
 LEAST = {"permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0}
 """Least value of the constants whose parameter is the logarithm of what they are above it."""
 COLUMNS = (*QUANTITIES, "reflected")  # constants of `SlabMaterials`, each an array

@@ -28,7 +28,7 @@ from ...backend.vectors import Complex, Float64, complex_exponential
 from ...core.types import FloatArray, IntArray
 from ..options import DISC, FACTOR
 
-NEAREST = 6  # gaussians that change one interaction
+NEAREST = 6  # Gaussians that change one interaction
 SIZE = 0.75  # standard deviation of a Gaussian in the plane, as a share of the spacing
 EXTENT = 4.0  # distance in standard deviations beyond which a Gaussian does not count: its weight is below 4e-4
 LEAST_POINTS = 4  # fewest interactions of training paths in a cell of the lattice that gets a Gaussian
