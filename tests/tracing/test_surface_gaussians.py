@@ -69,7 +69,9 @@ def test_gaussians_cover_each_plane_where_enough_paths_meet_it() -> None:
     rng = np.random.default_rng(0)
     places = [tuple(place) for place in rng.uniform(-0.2, 0.2, (8, 2))]
     low, high, few = on_floor(*places), on_floor(*places, height_m=0.1), on_floor((3.0, 3.0))
-    gaussians = SurfaceGaussians.covering(Interactions.joined([low, high, few]), SPACING_M)
+    gaussians = SurfaceGaussians.covering(
+        Interactions(*map(np.concatenate, zip(low, high, few, strict=True))), SPACING_M
+    )
     assert len(gaussians) == 2
     np.testing.assert_allclose(np.sort(gaussians.discs[2]), [0, 0.1], atol=FLOAT32)
     np.testing.assert_allclose(gaussians.discs[:2].T, [np.mean(places, axis=0)] * 2, atol=FLOAT32)

@@ -136,7 +136,10 @@ def correct_scene(
     facts: dict[str, Any] = {"rows": len(split.all_train), "held_out": len(held_out.rows)}
     facts |= {"held_out_receivers": list(held_out.out), "paths": len(final.misfit.paths.row)}
     scores = {stage: result.score for stage, result in judged.items()}
-    return Correction(state, deviation, scores, _kinds(scene), data, time.perf_counter() - begun, facts)
+    # Kinds of the surfaces of a scene folder; other scenes state none.
+    entries = read_scene_folder(Path(scene)).materials.surfaces if (Path(scene) / MATERIALS_FILE).is_file() else {}
+    kinds: dict[str, Kind] = {name: entry for name, entry in entries.items() if entry in KINDS}
+    return Correction(state, deviation, scores, kinds, data, time.perf_counter() - begun, facts)
 
 
 def _checked(
@@ -214,7 +217,12 @@ class _Judged(NamedTuple):
 
 def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
     """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
-    states = {stage: Moves(trial, stage).best() for stage in _stages(trial.options)}
+    # Parts that are changed together: materials without planes, and all.
+    parts = trial.options.parts
+    stages, still = ["+".join(parts)], [part for part in parts if part not in (PLANES, FRAME)]
+    if MATERIALS in still and len(still) < len(parts):
+        stages.insert(0, "+".join(still))
+    states = {stage: Moves(trial, stage).best() for stage in stages}
     stated = traced.posterior(held_out.record, held_out.rows).misfit
     judged = {"": held_out.judged(trial.start(""), stated)}
     for stage, state in states.items():
@@ -227,14 +235,6 @@ def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldO
             state = Moves(along_moved, stage).continued(state)
             judged[stage] = held_out.judged(state, traced.posterior(held_out.record, held_out.rows, state).misfit)
     return judged
-
-
-def _stages(options: CorrectionOptions) -> list[str]:
-    """Parts that are changed together: materials without planes, and all."""
-    stages, still = ["+".join(options.parts)], [part for part in options.parts if part not in (PLANES, FRAME)]
-    if MATERIALS in still and len(still) < len(options.parts):
-        stages.insert(0, "+".join(still))
-    return stages
 
 
 def _moves(stage: str) -> bool:
@@ -324,12 +324,3 @@ def _last_is_best(scores: Mapping[str, FloatArray], higher_is_better: bool) -> b
     """Whether no stage has a better mean than the last, over what is known of both."""
     *before, last = scores.values()
     return all(improves(last, score, higher_is_better, errors=0.0) for score in before)
-
-
-def _kinds(scene: str | Path) -> dict[str, Kind]:
-    """Kinds of the surfaces of a scene folder by name; none for other scenes."""
-    folder = Path(scene)
-    if not (folder / MATERIALS_FILE).is_file():
-        return {}
-    entries = read_scene_folder(folder).materials.surfaces
-    return {name: entry for name, entry in entries.items() if entry in KINDS}

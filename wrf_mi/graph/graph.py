@@ -204,7 +204,8 @@ class Graph:
         if fitted is not None:
             self.surface = SurfaceGaussians.of(fitted, spacing_m)
         elif self.traced.surface > 0 and present:
-            self.surface = SurfaceGaussians.covering(Interactions.joined([s.interactions for s in present]), spacing_m)
+            joint = Interactions(*map(np.concatenate, zip(*(side.interactions for side in present), strict=True)))
+            self.surface = SurfaceGaussians.covering(joint, spacing_m)
         if not self.surface:
             return {}
         for side in present:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -35,17 +35,11 @@ LEAST_POINTS = 4  # fewest interactions of training paths in a cell of the latti
 SAME_PLANE_M, SAME_PLANE_COS = 0.03, 0.99  # most distance, least cosine of a plane that scans find twice
 
 
-@dataclass(frozen=True)
-class Interactions:
+class Interactions(NamedTuple):
     """Interactions of paths with surfaces."""
 
     position_m: FloatArray  # points [m, 3], world frame, metres
     normal: FloatArray  # unit normals of the planes, either sign, [m, 3]
-
-    @classmethod
-    def joined(cls, parts: list[Interactions]) -> Interactions:
-        """Interactions of several receivers."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("position_m", "normal")))
 
 
 @dataclass(frozen=True)
