@@ -25,6 +25,7 @@ CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"  # environment variables that name the libr
 READ_TIMEOUT_S = 60  # reading the linker's cache takes milliseconds; a cold network disk may need much longer
 
 _LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
+GOOD_FROM = 19  # oldest LLVM that works with Dr.Jit 1.5 in our tests
 
 
 @dataclass(frozen=True)
@@ -119,9 +120,6 @@ def _linker_cache(start: str) -> list[Path]:
         return []
     pairs = (line.strip().split(" => ") for line in listing.splitlines() if " => " in line)
     return [Path(target) for name, target in pairs if name.startswith(start)]
-
-
-GOOD_FROM = 19  # oldest LLVM that works with Dr.Jit 1.5 in our tests
 
 
 def package_manager() -> str | None:

@@ -20,6 +20,12 @@ from scipy.special import expit, logit
 from ..core import InputError, Receiver, rotation_matrix, unit_vectors
 from .network import Weights
 
+Arrays = dict[str, NDArray[np.float32]]
+SPLIT_SHRINK = 1.6  # ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)
+SPLIT_RAD = float(np.radians(5.0))  # size from the receiver above which a growing Gaussian is split, not cloned
+LEAST_OPACITY = 0.005  # opacity below which a Gaussian is pruned (Kerbl et al. 2023)
+RESET_OPACITY = 0.05  # largest after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow
+
 
 @dataclass(frozen=True)
 class InitialGaussians:
@@ -115,14 +121,6 @@ def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.ran
     scale = np.sqrt((gaps[:, 1:] ** 2).mean(axis=1))
     # Repeated points would give scale 0, whose logarithm is the parameter.
     return InitialGaussians(chosen, np.maximum(scale, 1e-3))
-
-
-Arrays = dict[str, NDArray[np.float32]]
-
-SPLIT_SHRINK = 1.6  # ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)
-SPLIT_RAD = float(np.radians(5.0))  # size from the receiver above which a growing Gaussian is split, not cloned
-LEAST_OPACITY = 0.005  # opacity below which a Gaussian is pruned (Kerbl et al. 2023)
-RESET_OPACITY = 0.05  # largest after a reset, well above `LEAST_OPACITY`: Gaussians in use have a round to grow
 
 
 @dataclass(frozen=True)

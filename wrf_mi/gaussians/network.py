@@ -21,6 +21,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Weights = dict[str, NDArray[np.float32]]
+Params = Mapping[str, dr.ArrayBase]
+
 
 def unambiguous_scale(points_m: ArrayLike, least_m: float) -> float:
     """Scale in metres, ``least_m`` or more, at which points [n, 3] have different encodings: none is a period apart."""
@@ -53,10 +56,6 @@ def encode(points: Any, octaves: int, scale_m: float) -> Any:
     turns = dr.concat([t - dr.round(dr.detach(t)) for t in octave], axis=0)
     sine, cosine = dr.sincos(2 * dr.pi * turns)
     return dr.concat([sine, cosine], axis=0)
-
-
-Weights = dict[str, NDArray[np.float32]]
-Params = Mapping[str, dr.ArrayBase]
 
 
 def init_layer(

@@ -35,6 +35,8 @@ KEPT_TABLES = 4
 CHUNK_SIZE = 16  # signals whose spectra are computed together
 LINES_FROM = 64  # number of elements from which a planar grid is summed line by line
 MIRRORED, ALIGNED = 1e-6, 1e-9  # distances of opposite, or aligned, positions as shares of the array's extent
+SAME_LAG = 1e-6  # differences closer than this share of the array's extent are one: files have six digits
+LEAST_CONDITION = 1e-7  # singular values below this share of the greatest: the directions do not distinguish the lags
 
 
 def mirror_order(elements_m: ArrayLike) -> IntArray | None:
@@ -123,10 +125,6 @@ def _beams(elements: bytes, frequency_hz: float, height: int, width: int, begin:
     """Factors exp(-j k p_m . u) [m, pixels] of some of the pixels of a spectrum."""
     directions = pixel_directions(height, width).reshape(-1, 3)[begin:end]
     return steering_matrix(np.frombuffer(elements).reshape(-1, 3), directions, frequency_hz).copy()
-
-
-SAME_LAG = 1e-6  # differences closer than this share of the array's extent are one: files have six digits
-LEAST_CONDITION = 1e-7  # singular values below this share of the greatest: the directions do not distinguish the lags
 
 
 class Lags:

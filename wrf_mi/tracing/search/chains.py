@@ -19,16 +19,28 @@ from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from .surfaces import Surfaces
 
+logger = logging.getLogger(__name__)
+
 SPECULAR, TRANSMISSION = 1, 4  # values of Sionna RT's ``InteractionType``
 ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")  # fields of `Legs` by path
+PAIRS_PER_CHUNK = 1 << 24  # pairs of chain and position in a chunk: 64 MiB for each single-precision array
+RAYS_PER_CHUNK = 1 << 20  # rays in a chunk
+MARGIN_M = 1e-3  # slack of the bounds of planes
+BESIDE = 1e-5
+"""Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
+displaced by `wrf_mi.tracing.search.images`."""
+MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
+SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/limits.md)
+WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
+_kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
 @dataclass(frozen=True)
 class Legs:
     """Interactions of p paths from source to target, the input of Sionna RT's stages."""
 
-    source: IntArray  # indices of the points that each path joins, shape [p]
-    target: IntArray  # indices of the points that each path joins, shape [p]
+    source: IntArray  # index of the point from which each path comes, shape [p]
+    target: IntArray  # index of the point to which it leads, shape [p]
     # ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last
     interactions: NDArray[np.uint8]
     # index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last
@@ -64,20 +76,6 @@ def join(parts: list[Legs]) -> Legs:
         zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
         wedge[name] = np.concatenate([part.wedge.get(name, zero) for part, zero in zip(parts, zeros, strict=True)])
     return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)
-
-
-logger = logging.getLogger(__name__)
-
-PAIRS_PER_CHUNK = 1 << 24  # pairs of chain and position in a chunk: 64 MiB for each single-precision array
-RAYS_PER_CHUNK = 1 << 20  # rays in a chunk
-MARGIN_M = 1e-3  # slack of the bounds of planes
-BESIDE = 1e-5
-"""Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
-displaced by `wrf_mi.tracing.search.images`."""
-MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
-SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/limits.md)
-WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
-_kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
 @dataclass(frozen=True)
