@@ -52,8 +52,7 @@ class SurfaceChoice:
 
     what: str  # name of the surface or plane
     places: IntArray  # its entries of the vector
-    # values of these entries by ``material``, ``shift`` or ``material, shift``; NaN: as other planes predict
-    values: Mapping[str, FloatArray]
+    values: Mapping[str, FloatArray]  # by ``material``, ``shift`` or both, joined by ", "; NaN: as other planes predict
     of_plane: NDArray[np.bool_]  # whether each entry is of a plane, not of a material
 
     @property

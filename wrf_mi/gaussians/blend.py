@@ -107,8 +107,7 @@ class Lanes:
 
     azimuth: list[Any]  # cosine and sine, [lanes] each
     elevation: list[list[Any]]  # for each of a lane's pixels cosine and sine, [lanes] each
-    # for each of a lane's pixels its numbers in the images of the group's transmitters, [lanes] each
-    pixel: list[list[Any]]
+    pixel: list[list[Any]]  # for each of a lane's pixels its numbers in the images of the group, [lanes] each
     active: list[Any]  # for each of a lane's pixels a mask [lanes]
     start: Any  # begin of the lane's list, [lanes]
     end: Any  # length of the lane's list, [lanes]

@@ -76,10 +76,8 @@ class Retrieved:
     """Element signals of spectra."""
 
     signals: ComplexArray  # [n, m], each row up to a common phase (and the exchange with its mirror image)
-    # root mean square over pixels of the unexplained squared spectrum in the span of the lags, [n]
-    residual: FloatArray
-    # whether grey levels explain the residual, [n]; otherwise a local minimum, or not a single snapshot
-    explained: NDArray[np.bool_]
+    residual: FloatArray  # root mean square over pixels of the unexplained squared spectrum in the lags' span, [n]
+    explained: NDArray[np.bool_]  # whether grey levels explain it, [n]; else a local minimum, or several snapshots
 
 
 def retrieve_signals(unscaled: Unscaled, lags: Lags, seed: int = 0, starts: int = STARTS) -> Retrieved:

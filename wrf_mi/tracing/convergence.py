@@ -43,11 +43,9 @@ class Trial:
 
     part: str  # depth, rays, diffraction or scattering
     value: int | bool  # the setting's value
-    # largest change against the previous setting, of power or of a spectrum; None for the first
-    change_db: float | None
+    change_db: float | None  # largest change against the previous setting, of power or spectrum; None for the first
     kept: bool  # whether the setting was taken
-    # largest change of a reported spectrum, relative L2; None for the first, and without spectra
-    spectrum: float | None = None
+    spectrum: float | None = None  # largest change of a reported spectrum, relative L2; None for the first, or without
 
 
 @dataclass(frozen=True)

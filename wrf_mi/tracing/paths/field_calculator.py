@@ -37,8 +37,7 @@ Tables = tuple[Any, Any, Any, Any]  # permittivity, conductivity, thickness and 
 class Level:
     """Interactions of q paths at the same depth; place holders where a path has fewer."""
 
-    # unit normals of the planes, either sign, world frame; zeros for place holders; three float arrays [q]
-    normal: Vector
+    normal: Vector  # unit normals of the planes, either sign, world; zeros for place holders; three float arrays [q]
     offset_m: Any  # offsets n . x of the planes, metres; float [q]
     reflects: Any  # mask of reflections
     transmits: Any  # mask of transmissions

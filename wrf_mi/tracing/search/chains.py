@@ -41,15 +41,11 @@ class Legs:
 
     source: IntArray  # index of the point from which each path comes, shape [p]
     target: IntArray  # index of the point to which it leads, shape [p]
-    # ``InteractionType`` of each interaction, uint8, shape [p, depth], 0 beyond the last
-    interactions: NDArray[np.uint8]
-    # index of the face at each interaction into `Surfaces.triangles`, shape [p, depth], -1 beyond the last
-    face: IntArray
+    interactions: NDArray[np.uint8]  # ``InteractionType`` of each interaction, shape [p, depth], 0 beyond the last
+    face: IntArray  # index of the face at each interaction into `Surfaces.triangles`, [p, depth], -1 beyond the last
     vertices_m: FloatArray  # interaction points [p, depth, 3], metres, NaN beyond the last
-    # probability of the interaction in a random search, shape [p, depth]; 1 in an exhaustive one
-    probability: NDArray[np.float32]
-    # edges of diffraction, fields of ``WedgeGeometry`` by name with first axis p; empty without diffraction
-    wedge: dict[str, NDArray[Any]]
+    probability: NDArray[np.float32]  # of the interaction in a random search, [p, depth]; 1 in an exhaustive one
+    wedge: dict[str, NDArray[Any]]  # edges of diffraction, fields of ``WedgeGeometry`` [p, ...]; empty without
 
     def __len__(self) -> int:
         return len(self.source)

@@ -44,8 +44,7 @@ class Met(NamedTuple):
     """Paths and what they meet."""
 
     candidate: IntArray  # indices of the candidates that are paths [k]
-    # ``InteractionType`` of each interaction from the source on [k, depth], 0 beyond the last
-    interactions: NDArray[np.uint8]
+    interactions: NDArray[np.uint8]  # ``InteractionType`` of each one from the source on [k, depth], else 0
     face: IntArray  # faces [k, depth], -1 beyond the last
     points_m: FloatArray  # points in single precision [k, depth, 3], metres, NaN beyond the last
 
