@@ -37,27 +37,16 @@ def inputs_of(record: Record, rows: IntArray) -> Inputs:
 
 @dataclass
 class Problem:
-    """Data, scene and settings that a model is fitted to, and loaded with.
+    """Data, scene and settings that a model is fitted to, and loaded with."""
 
-    Attributes:
-        dataset: name, folder, or a loaded record.
-        settings: settings of the model's class.
-        seed: seed of split and fit.
-        scene: name, scene folder, Mitsuba XML or mesh, or None.
-        material: material of a bare mesh, or None.
-        antennas: patterns and polarisations in place of those of the data.
-        operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
-        left_out: names of receivers that are left out of the data, as if they had not been there.
-    """
-
-    dataset: str | Path | Record
-    settings: Any
-    seed: int = 0
-    scene: str | None = None
-    material: str | None = None
-    antennas: AntennaOptions = AS_STATED
-    operator: bool = True
-    left_out: tuple[str, ...] = ()
+    dataset: str | Path | Record  #: name, folder, or a loaded record
+    settings: Any  #: settings of the model's class
+    seed: int = 0  #: seed of split and fit
+    scene: str | None = None  #: name, scene folder, Mitsuba XML or mesh, or None
+    material: str | None = None  #: material of a bare mesh, or None
+    antennas: AntennaOptions = AS_STATED  #: patterns and polarisations in place of those of the data
+    operator: bool = True  #: learned fields predict by operator where they can, see `wrf_mi.training.predictor`
+    left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
 
     @cached_property
     def record(self) -> Record:
@@ -110,35 +99,24 @@ class Problem:
 
 @dataclass(frozen=True)
 class Session(FitSession):
-    """A session of a run.
-
-    Attributes:
-        scheduler: scheduler of parts of the work; None: this process.
-        progress: show bars on standard error where the tracer takes time.
-    """
+    """A session of a run."""
 
     folder: Path
     run: Path
-    scheduler: Scheduler | None = None
-    progress: bool = False
+    scheduler: Scheduler | None = None  #: scheduler of parts of the work; None: this process
+    progress: bool = False  #: show bars on standard error where the tracer takes time
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """A prediction for m transmitters and what it is made of.
+    """A prediction for m transmitters and what it is made of."""
 
-    Attributes:
-        whole: the prediction.
-        traced: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as
-            magnitudes in a common unit of both sides; NaN where they are not used. None: the model has one side.
-        learned: what the side without paths predicts, likewise.
-        paths: statistics of the traced paths; None: the model traces none.
-    """
-
-    whole: Prediction
+    whole: Prediction  #: the prediction
+    #: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as magnitudes in a
+    #: common unit of both sides; NaN where they are not used. None: the model has one side
     traced: NDArray[Any] | None = None
-    learned: NDArray[Any] | None = None
-    paths: PathStatistics | None = None
+    learned: NDArray[Any] | None = None  #: what the side without paths predicts, likewise
+    paths: PathStatistics | None = None  #: statistics of the traced paths; None: the model traces none
 
 
 PredictAll = Callable[[Inputs], NDArray[Any]]
@@ -146,18 +124,14 @@ PredictAll = Callable[[Inputs], NDArray[Any]]
 
 
 class Fitted(ABC):
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes:
-        train_seconds: duration of the fit over all sittings; None: that of the last call of `Model.fit`.
-        receivers: receivers whose observations it predicts; None: those of the record.
-        uses_heading: whether `predict` takes headings; None: as `Model.headings`.
-        carriers_hz: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record.
-    """
-
+    #: duration of the fit over all sittings; None: that of the last call of `Model.fit`
     train_seconds: float | None = None
+    #: receivers whose observations it predicts; None: those of the record
     receivers: tuple[Receiver, ...] | None = None
-    uses_heading: bool | None = None
+    uses_heading: bool | None = None  #: whether `predict` takes headings; None: as `Model.headings`
+    #: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record
     carriers_hz: FloatArray | None = None
 
     @abstractmethod
@@ -203,47 +177,30 @@ class Model(ABC):
 
     One line in `wrf_mi.models` registers it; a model of another package is an instance that an entry point of the group
     ``wrf_mi.models`` names.
-
-    Attributes:
-        name: name as in ``wrf-mi train --model``.
-        source: publication.
-        settings: frozen dataclass of its settings, all with defaults.
-        tasks: tasks that it serves; None: all.
-        summary: the model in a few words for readers of a page; "": its source.
-        scene_summary: the same with a scene, after ``summary``.
-        scene: whether it takes a scene.
-        uses_antennas: whether patterns and polarisations of antennas count in that scene.
-        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
-        uplink: whether it predicts from the uplink.
-        headings: whether it may predict from the transmitter's heading.
-        new_receivers: whether it predicts what receivers observe that it was not trained on, in a split that holds out
-            receivers.
-        complete: whether it needs every receiver's observation of every training row.
-        gaps: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a
-            run with such values in another array is refused.
-        train_arguments: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``,
-            ``deterministic``, ``receiver`` or ``evaluation``.
-        defaults: ``key=value`` that differ from the defaults of ``settings``.
-        presets: named settings, ``key=value``.
     """
 
-    name: str
-    source: str
-    settings: type
-    tasks: tuple[str, ...] | None = None
-    summary: str = ""
-    scene_summary: str = ", trained jointly with the paths of the scene"
-    scene: Literal["none", "optional", "required"] = "none"
-    uses_antennas: bool = True
-    several_carriers: bool = False
-    uplink: Literal["none", "optional", "required"] = "none"
-    headings: bool = False
+    name: str  #: name as in ``wrf-mi train --model``
+    source: str  #: publication
+    settings: type  #: frozen dataclass of its settings, all with defaults
+    tasks: tuple[str, ...] | None = None  #: tasks that it serves; None: all
+    summary: str = ""  #: the model in a few words for readers of a page; "": its source
+    scene_summary: str = ", trained jointly with the paths of the scene"  #: the same with a scene, after ``summary``
+    scene: Literal["none", "optional", "required"] = "none"  #: whether it takes a scene
+    uses_antennas: bool = True  #: whether patterns and polarisations of antennas count in that scene
+    several_carriers: bool = False  #: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`)
+    uplink: Literal["none", "optional", "required"] = "none"  #: whether it predicts from the uplink
+    headings: bool = False  #: whether it may predict from the transmitter's heading
+    #: whether it predicts what receivers observe that it was not trained on, in a split that holds out receivers
     new_receivers: bool = False
-    complete: bool = False
+    complete: bool = False  #: whether it needs every receiver's observation of every training row
+    #: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a run with
+    #: such values in another array is refused
     gaps: tuple[str, ...] = ()
+    #: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
+    #: ``receiver`` or ``evaluation``
     train_arguments: tuple[str, ...] = ()
-    defaults: tuple[str, ...] = ()
-    presets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    defaults: tuple[str, ...] = ()  #: ``key=value`` that differ from the defaults of ``settings``
+    presets: Mapping[str, tuple[str, ...]] = MappingProxyType({})  #: named settings, ``key=value``
 
     @abstractmethod
     def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:

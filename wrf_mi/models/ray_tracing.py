@@ -60,21 +60,17 @@ alone, a part of any size costs as much as a few hundred positions."""
 
 @dataclass(frozen=True)
 class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its fields are made from others
-    """Settings of tracing and calibration, and with ``calibration`` of the training loop.
+    """Settings of tracing and calibration, and with ``calibration`` of the training loop."""
 
-    Attributes:
-        calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
-            receiver), ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and
-            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none.
-        target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
-            further kinds of path are chosen by convergence on a sample of the transmitters
-            (`wrf_mi.tracing.convergence`); null: none are chosen.
-        target_kinds: kinds of path that may then be switched on, separated by commas.
-    """
-
+    #: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
+    #: ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and ``surface`` (Gaussians
+    #: on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none
     calibration: str | None = None
+    #: error of received power, and of spectra where they are the task, dB, for which depth, rays and further kinds of
+    #: path are chosen by convergence on a sample of the transmitters (`wrf_mi.tracing.convergence`); null: none are
+    #: chosen
     target_error_db: float | None = None
-    target_kinds: str = ",".join(CHOSEN_KINDS)
+    target_kinds: str = ",".join(CHOSEN_KINDS)  #: kinds of path that may then be switched on, separated by commas
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -48,14 +48,4 @@ def require(record: Record, *names: str, why: str) -> None:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = [
-    "CARRIER",
-    "ENTRY_POINTS",
-    "LAW",
-    "TASKS",
-    "UPLINK",
-    "Task",
-    "instrument_of",
-    "require",
-    "task_of",
-]
+__all__ = ["CARRIER", "ENTRY_POINTS", "LAW", "TASKS", "UPLINK", "Task", "instrument_of", "require", "task_of"]

@@ -47,17 +47,11 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
 
 @dataclass(frozen=True)
 class Outputs:
-    """Complex numbers of a ray.
+    """Complex numbers of a ray."""
 
-    Attributes:
-        by_uplink: whether the uplink channel is the condition instead of the position.
-        antennas: antennas of the base station; each is a condition with the uplink, else an output.
-        frequencies_hz: frequency of each output, [outputs]; 0 where unknown.
-    """
-
-    by_uplink: bool
-    antennas: int
-    frequencies_hz: FloatArray
+    by_uplink: bool  # whether the uplink channel is the condition instead of the position
+    antennas: int  # antennas of the base station; each is a condition with the uplink, else an output
+    frequencies_hz: FloatArray  # frequency of each output, [outputs]; 0 where unknown
 
     @property
     def count(self) -> int:

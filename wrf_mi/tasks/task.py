@@ -27,56 +27,37 @@ class Task(ABC):
     """A kind of observation with its score, loss and instrument.
 
     A task of another package is an instance of a subclass, which an entry point of the group ``wrf_mi.tasks`` names.
-
-    Attributes:
-        name: name in `wrf_mi.core.Record.task`.
-        block: key of the score in ``metrics.json``.
-        label: label of the score, for tables and axes.
-        digits: digits of the score after the decimal point.
-        higher_is_better: whether the score is an accuracy or an error.
-        limits: scores beyond which models are not compared any more where a mean over rows chooses among them.
-        axes: number of axes of one observation, at one receiver and row.
-        more_axes: number of optional further axes (antennas) of an observation.
-        image: whether an observation is shown as an image; else its level is drawn over positions.
-        level_kind: what `level` states: ``"power"`` received, dBm; ``"gain"`` of the channel, dB; or ``"relative"``,
-            dB without a common unit.
-        level_note: what `level` states, in words.
-        is_complex: whether observations are complex.
-        receiver: name of the default receiver model (`wrf_mi.graph.receivers`).
-        receiver_with_scene: name of the default receiver model beside the paths of a scene.
-        in_decibel: whether observations are powers in decibels with an offset of each receiver: a propagation law
-            describes them, and offsets are fitted to training rows.
-        neighbours: training rows of the reference, inverse-distance weighting.
-        softening_m: addend of the distances in the reference, metres.
-        from_uplink: words for the second reference, of data with an uplink; "" where the task has none.
-        constant_words: what `constant` predicts, in words.
-        heading: heading of the task.
-        quantity: quantity that is drawn over positions, with its unit.
-        note: sentence for readers of a table.
     """
 
-    name: ClassVar[str]
-    block: ClassVar[str]
-    label: ClassVar[str]
-    digits: ClassVar[int] = 2
-    higher_is_better: ClassVar[bool]
+    name: ClassVar[str]  #: name in `wrf_mi.core.Record.task`
+    block: ClassVar[str]  #: key of the score in ``metrics.json``
+    label: ClassVar[str]  #: label of the score, for tables and axes
+    digits: ClassVar[int] = 2  #: digits of the score after the decimal point
+    higher_is_better: ClassVar[bool]  #: whether the score is an accuracy or an error
+    #: scores beyond which models are not compared any more where a mean over rows chooses among them
     limits: ClassVar[tuple[float, float]] = (-np.inf, np.inf)
-    axes: ClassVar[int]
-    more_axes: ClassVar[int] = 0
+    axes: ClassVar[int]  #: number of axes of one observation, at one receiver and row
+    more_axes: ClassVar[int] = 0  #: number of optional further axes (antennas) of an observation
+    #: whether an observation is shown as an image; else its level is drawn over positions
     image: ClassVar[bool] = False
+    #: what `level` states: ``"power"`` received, dBm; ``"gain"`` of the channel, dB; or ``"relative"``, dB without a
+    #: common unit
     level_kind: ClassVar[Literal["power", "gain", "relative"]] = "relative"
-    level_note: ClassVar[str] = ""
-    is_complex: ClassVar[bool] = False
-    receiver: ClassVar[str] = ""
-    receiver_with_scene: ClassVar[str] = ""
+    level_note: ClassVar[str] = ""  #: what `level` states, in words
+    is_complex: ClassVar[bool] = False  #: whether observations are complex
+    receiver: ClassVar[str] = ""  #: name of the default receiver model (`wrf_mi.graph.receivers`)
+    receiver_with_scene: ClassVar[str] = ""  #: name of the default receiver model beside the paths of a scene
+    #: whether observations are powers in decibels with an offset of each receiver: a propagation law describes them,
+    #: and offsets are fitted to training rows
     in_decibel: ClassVar[bool] = False
-    neighbours: ClassVar[int] = 4
-    softening_m: ClassVar[float] = 0.0
+    neighbours: ClassVar[int] = 4  #: training rows of the reference, inverse-distance weighting
+    softening_m: ClassVar[float] = 0.0  #: addend of the distances in the reference, metres
+    #: words for the second reference, of data with an uplink; "" where the task has none
     from_uplink: ClassVar[str] = ""
-    constant_words: ClassVar[str] = "the mean of each receiver's training rows"
-    heading: ClassVar[str]
-    quantity: ClassVar[str]
-    note: ClassVar[str] = ""
+    constant_words: ClassVar[str] = "the mean of each receiver's training rows"  #: what `constant` predicts, in words
+    heading: ClassVar[str]  #: heading of the task
+    quantity: ClassVar[str]  #: quantity that is drawn over positions, with its unit
+    note: ClassVar[str] = ""  #: sentence for readers of a table
 
     @abstractmethod
     def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:

@@ -26,15 +26,10 @@ class NumericsError(RuntimeError):
 
 @dataclass
 class NonFiniteReport:
-    """First step whose loss, parameters, gradient or squared gradient were not finite; no step is taken after it.
+    """First step whose loss, parameters, gradient or squared gradient were not finite; no step is taken after it."""
 
-    Attributes:
-        step: number of the step from 1; 0: all finite so far.
-        groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
-    """
-
-    step: Any
-    groups: Any
+    step: Any  # number of the step from 1; 0: all finite so far
+    groups: Any  # 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0
 
     @classmethod
     def none(cls, names: Iterable[str]) -> NonFiniteReport:
@@ -67,19 +62,12 @@ def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
 
 @dataclass
 class ScheduledStep:
-    """Numbers of one step, opaque to a recording: as Python numbers they would be recorded as constants.
+    """Numbers of one step, opaque to a recording: as Python numbers they would be recorded as constants."""
 
-    Attributes:
-        factor: factor of the learning rates.
-        decay: decay of the running mean of the parameters.
-        number: number of the step, from 1.
-        trouble: report of the steps before.
-    """
-
-    factor: Any
-    decay: Any
-    number: Any
-    trouble: NonFiniteReport
+    factor: Any  # factor of the learning rates
+    decay: Any  # decay of the running mean of the parameters
+    number: Any  # number of the step, from 1
+    trouble: NonFiniteReport  # report of the steps before
 
     @classmethod
     def of(cls, schedule: Schedule, t: int, trouble: NonFiniteReport) -> ScheduledStep:

@@ -47,25 +47,15 @@ MOST_BYTES = 1 << 30  # largest size of one receiver's weights; larger fields ar
 
 @dataclass(frozen=True)
 class Request:
-    """Transmitters whose reports of one port are evaluated.
+    """Transmitters whose reports of one port are evaluated."""
 
-    Attributes:
-        condition: positions [m, 3], metres, or features [m, features].
-        port: number of the port.
-        side: its traced side, or None.
-        slots: rows of the traced side [m].
-        weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
-        alone: component reported alone (`Graph.report`); None: both together.
-        phase_error: see `Graph.report`.
-    """
-
-    condition: FloatArray
-    port: int
-    side: TracedField | None
-    slots: IntArray
-    weight: NDArray[Any] | None = None
-    alone: Alone | None = None
-    phase_error: float = 0.0
+    condition: FloatArray  # positions [m, 3], metres, or features [m, features]
+    port: int  # number of the port
+    side: TracedField | None  # its traced side, or None
+    slots: IntArray  # rows of the traced side [m]
+    weight: NDArray[Any] | None = None  # weight of the Gaussians' signal [m], 0 to 1; None: 1
+    alone: Alone | None = None  # component reported alone (`Graph.report`); None: both together
+    phase_error: float = 0.0  # see `Graph.report`
 
     def rows(self, chosen: slice) -> Request:
         """The request for some of the transmitters."""

@@ -20,47 +20,27 @@ from .state import FitState
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress at a log line.
+    """Progress at a log line."""
 
-    Attributes:
-        step: steps taken.
-        seconds: training time so far, resumed runs included.
-        loss: mean over the steps since the last line.
-        validation_score: median on the validation rows, where it was just computed.
-        held_out: whether the validation rows are still kept out of training.
-        gaussians: number of Gaussians; 0 without a field.
-        left_s: estimated seconds to the end.
-        label: name of the score.
-    """
-
-    step: int
-    seconds: float
-    loss: float
-    validation_score: float | None
-    held_out: bool
-    gaussians: int
-    left_s: float
-    label: str = "SSIM"
+    step: int  # steps taken
+    seconds: float  # training time so far, resumed runs included
+    loss: float  # mean over the steps since the last line
+    validation_score: float | None  # median on the validation rows, where it was just computed
+    held_out: bool  # whether the validation rows are still kept out of training
+    gaussians: int  # number of Gaussians; 0 without a field
+    left_s: float  # estimated seconds to the end
+    label: str = "SSIM"  # name of the score
 
 
 class TrainingLoop(ABC):
-    """Steps of Adam, with validation, early stopping, progress and checkpoints.
+    """Steps of Adam, with validation, early stopping, progress and checkpoints."""
 
-    Attributes:
-        config: settings of the loop.
-        schedule: rows and learning rates of each step.
-        state: state between two steps.
-        seconds: training time so far, resumed runs included.
-        label: name of the validation score.
-        higher_is_better: direction of the validation score.
-    """
-
-    config: LoopConfig
-    schedule: Schedule
-    state: FitState
-    seconds: float = 0.0
-    label: str
-    higher_is_better: bool
+    config: LoopConfig  # settings of the loop
+    schedule: Schedule  # rows and learning rates of each step
+    state: FitState  # state between two steps
+    seconds: float = 0.0  # training time so far, resumed runs included
+    label: str  # name of the validation score
+    higher_is_better: bool  # direction of the validation score
 
     @abstractmethod
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:

@@ -15,25 +15,16 @@ from .config import AdamConfig, DensityConfig, LoopConfig
 
 @dataclass(frozen=True)
 class Schedule:
-    """Schedule of a fit.
+    """Schedule of a fit."""
 
-    Attributes:
-        rows: rows of each step's batch, [steps, batch].
-        receiver: receiver of each step, [steps].
-        factor: factor of the learning rates at each step, [steps].
-        decay: decay of the running mean of the parameters at each step, [steps].
-        density: steps after which a round of density control follows.
-        joined: first step that may train on the validation rows; ``steps`` if never.
-        stages: first steps of the stages after the first, in ascending order; learning rates fall anew in each, and no
-            state of the first stage is chosen before its end.
-    """
-
-    rows: IntArray
-    receiver: IntArray
-    factor: NDArray[np.float64]
-    decay: NDArray[np.float64]
-    density: frozenset[int]
-    joined: int
+    rows: IntArray  # rows of each step's batch, [steps, batch]
+    receiver: IntArray  # receiver of each step, [steps]
+    factor: NDArray[np.float64]  # factor of the learning rates at each step, [steps]
+    decay: NDArray[np.float64]  # decay of the running mean of the parameters at each step, [steps]
+    density: frozenset[int]  # steps after which a round of density control follows
+    joined: int  # first step that may train on the validation rows; ``steps`` if never
+    # first steps of the stages after the first, in ascending order; learning rates fall anew in each, and no state of
+    # the first stage is chosen before its end
     stages: tuple[int, ...] = ()
 
     def stage(self, step: int) -> int:

@@ -22,19 +22,12 @@ PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a re
 
 @dataclass(frozen=True)
 class HeldOutReports:
-    """Reports of training rows that a fit had not seen when it chose its state.
+    """Reports of training rows that a fit had not seen when it chose its state."""
 
-    Attributes:
-        receiver: number of the receiver of each [q].
-        row: row of the record [q].
-        report: reports [q, ...] as observations.
-        score: best mean score of these rows by the stages' names.
-    """
-
-    receiver: IntArray
-    row: IntArray
-    report: NDArray[Any]
-    score: Mapping[str, float]
+    receiver: IntArray  # number of the receiver of each [q]
+    row: IntArray  # row of the record [q]
+    report: NDArray[Any]  # reports [q, ...] as observations
+    score: Mapping[str, float]  # best mean score of these rows by the stages' names
 
 
 class StageSelection:

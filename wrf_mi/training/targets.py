@@ -22,25 +22,15 @@ from .config import TrainConfig
 
 @dataclass(frozen=True)
 class Targets:
-    """Conditions and observations of a record.
+    """Conditions and observations of a record."""
 
-    Attributes:
-        condition: positions [3, c] in metres or features [features, c].
-        truth: float32 [n_rx, c, *shape of a report], NaN where nothing was received.
-        unit: unit of each receiver's differences in the loss, [n_rx].
-        per_row: number of consecutive conditions of a row.
-        weight: factor of each observation's difference in the loss [n_rx, c]; None: 1.
-        carriers_hz: carriers of the training rows, ascending; None: rows have a single carrier.
-        carrier: number of each condition's carrier [c], -1 for carriers without training rows.
-    """
-
-    condition: FloatArray
-    truth: NDArray[np.float32]
-    unit: FloatArray
-    per_row: int = 1
-    weight: FloatArray | None = None
-    carriers_hz: FloatArray | None = None
-    carrier: IntArray | None = None
+    condition: FloatArray  # positions [3, c] in metres or features [features, c]
+    truth: NDArray[np.float32]  # float32 [n_rx, c, *shape of a report], NaN where nothing was received
+    unit: FloatArray  # unit of each receiver's differences in the loss, [n_rx]
+    per_row: int = 1  # number of consecutive conditions of a row
+    weight: FloatArray | None = None  # factor of each observation's difference in the loss [n_rx, c]; None: 1
+    carriers_hz: FloatArray | None = None  # carriers of the training rows, ascending; None: rows have a single carrier
+    carrier: IntArray | None = None  # number of each condition's carrier [c], -1 for carriers without training rows
 
     @property
     def ports(self) -> int:

@@ -28,19 +28,15 @@ TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 
 @dataclass(frozen=True)
 class HybridSettings(CheckedSettings):
-    """Settings of the hybrid.
+    """Settings of the hybrid."""
 
-    Attributes:
-        stages: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and
-            residual; null: all that the data allow; without a scene the field, which takes minutes and which
-            interpolation surpasses near measurements, is used where it is named.
-        steps: optimiser steps of the graph of paths and Gaussians; null: the default of `TrainConfig` for the task.
-        deterministic: bit-identical results from run to run, on one thread of the CPU.
-    """
-
+    #: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and residual;
+    #: null: all that the data allow; without a scene the field, which takes minutes and which interpolation surpasses
+    #: near measurements, is used where it is named
     stages: str | None = None
+    #: optimiser steps of the graph of paths and Gaussians; null: the default of `TrainConfig` for the task
     steps: Annotated[int | None, Field(ge=1, description="1 or more")] = None
-    deterministic: bool = False
+    deterministic: bool = False  #: bit-identical results from run to run, on one thread of the CPU
 
     def __post_init__(self) -> None:
         """Refuse unknown stages.

@@ -20,17 +20,7 @@ from ...training.config import TrainConfig, calibration_config, task_settings
 from ...training.selection import HeldOut
 from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..held_out import as_unseen, labelled
-from ..model import (
-    Arrays,
-    Fitted,
-    Inputs,
-    Model,
-    PredictAll,
-    Problem,
-    Session,
-    settings_array,
-    stored_settings,
-)
+from ..model import Arrays, Fitted, Inputs, Model, PredictAll, Problem, Session, settings_array, stored_settings
 from .scene_side import (
     CALIBRATION,
     CORRECTED,

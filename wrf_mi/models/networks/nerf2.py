@@ -78,36 +78,24 @@ PAIRS_PER_CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Nerf2Settings(NetworkSettings):
-    """Settings of NeRF2 and of the training loop.
-
-    Attributes:
-        batch: spectra of a step, at most.
-        networks: sizes of the networks.
-        rays: pixels of a spectrum in a step.
-        sphere_rays: rays over the full sphere, for signal strengths and channels.
-        sphere_batch: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of
-            transmitters.
-        samples: points along a ray.
-        near_m: distance from the receiver at which rays start, metres.
-        far_m: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions
-            are not known.
-        tx_octaves: octaves of the encoding of transmitter positions.
-        shared: whether all receivers share a pair of networks.
-    """
+    """Settings of NeRF2 and of the training loop."""
 
     steps: int = 5000
-    batch: int = 16
+    batch: int = 16  #: spectra of a step, at most
     validate_every: int = 500
     optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
-    networks: Networks = dataclasses.field(default_factory=Networks)
-    rays: Count = 256
-    sphere_rays: Count = 64
+    networks: Networks = dataclasses.field(default_factory=Networks)  #: sizes of the networks
+    rays: Count = 256  #: pixels of a spectrum in a step
+    sphere_rays: Count = 64  #: rays over the full sphere, for signal strengths and channels
+    #: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of transmitters
     sphere_batch: Count = 128
-    samples: Count = 4
-    near_m: float = 0.0
+    samples: Count = 4  #: points along a ray
+    near_m: float = 0.0  #: distance from the receiver at which rays start, metres
+    #: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions are not
+    #: known
     far_m: float = 0.0
-    tx_octaves: int = 4
-    shared: bool = True
+    tx_octaves: int = 4  #: octaves of the encoding of transmitter positions
+    shared: bool = True  #: whether all receivers share a pair of networks
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -60,23 +60,17 @@ WEAK = 0.3  # share of the root mean square below which a sum over subcarriers h
 
 @dataclass(frozen=True)
 class FireSettings(NetworkSettings):
-    """Settings of FIRE and of the training loop.
-
-    Attributes:
-        batch: antennas of a step, at most, where a sample is an antenna.
-        sample: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows.
-        latent: number of latent variables.
-        width: neurons of the hidden layers.
-        spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
-    """
+    """Settings of FIRE and of the training loop."""
 
     steps: int = 5000
-    batch: int = 256
+    batch: int = 256  #: antennas of a step, at most, where a sample is an antenna
     validate_every: int = 500
+    #: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows
     sample: Sample = "auto"
     FIXED: ClassVar[Mapping[str, float]] = {"row_batch": ROW_BATCH, "beta": BETA}
-    latent: Count = 32
-    width: Count = 256
+    latent: Count = 32  #: number of latent variables
+    width: Count = 256  #: neurons of the hidden layers
+    #: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz
     spacing_hz: Positive = 312.5e3
 
 

@@ -38,12 +38,9 @@ CHUNK_SIZE = 256  # rows whose products are added together: bounds the memory be
 
 @dataclass(frozen=True)
 class LinearSettings(CheckedSettings):
-    """Settings of the linear map.
+    """Settings of the linear map."""
 
-    Attributes:
-        penalty: in units of the mean energy of an uplink coefficient; None: chosen on validation rows.
-    """
-
+    #: in units of the mean energy of an uplink coefficient; None: chosen on validation rows
     penalty: Annotated[float | None, Field(gt=0, description="more than 0")] = None
 
 

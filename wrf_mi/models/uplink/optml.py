@@ -61,19 +61,12 @@ CHUNK_SIZE = 256  # maps that are made together: bounds the memory
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated channels.
+    """Simulated channels."""
 
-    Attributes:
-        channels: number of channels; a tenth validates.
-        paths: most paths of a channel.
-        decay_db: range of path powers below the strongest, dB.
-        noise_db: least and greatest ratio of signal to noise, dB.
-    """
-
-    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  # to learn from and to validate
-    paths: Count = 12
-    decay_db: float = 25.0
-    noise_db: tuple[float, float] = (5.0, 30.0)
+    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  #: number of channels; a tenth validates
+    paths: Count = 12  #: most paths of a channel
+    decay_db: float = 25.0  #: range of path powers below the strongest, dB
+    noise_db: tuple[float, float] = (5.0, 30.0)  #: least and greatest ratio of signal to noise, dB
 
 
 def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
@@ -205,21 +198,15 @@ MAX_VALIDATION = 100  # most maps that validate
 
 @dataclass(frozen=True)
 class OptMLSettings(PathSettings, NetworkSettings):
-    """Settings of OptML, of the training loop, and of the search for paths with fewer steps than R2F2's.
-
-    Attributes:
-        simulation: simulated channels to learn from.
-        width: channels of the network.
-        rounds: maps of the residual.
-    """
+    """Settings of OptML, of the training loop, and of the search for paths with fewer steps than R2F2's."""
 
     steps: int = 1875
     batch: int = 16
     validate_every: int = 300
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    simulation: Simulation = field(default_factory=Simulation)
-    width: Count = 48
-    rounds: Count = 5
+    simulation: Simulation = field(default_factory=Simulation)  #: simulated channels to learn from
+    width: Count = 48  #: channels of the network
+    rounds: Count = 5  #: maps of the residual
     FIXED: ClassVar[Mapping[str, float]] = {"at_once": AT_ONCE, "threshold": THRESHOLD}
     max_paths: Count = 40
     between: int = 3

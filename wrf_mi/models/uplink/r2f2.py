@@ -138,25 +138,17 @@ BOTH_GAPS = (1, 2)  # spacings between the last uplink and the first downlink su
 
 @dataclass(frozen=True)
 class PathSettings(SpecularOptions, CheckedSettings):
-    """Settings of the search for paths.
+    """Settings of the search for paths."""
 
-    Attributes:
-        wavefront: ``spherical``, ``plane``, ``free`` (a gain for each antenna) or ``auto``, chosen on validation rows.
-        max_paths: most paths of a row.
-        max_distance_m: longest path, metres.
-        between: steps of refinement of all paths after each addition.
-        final: steps of refinement after the last addition.
-        spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
-        choice_rows: validation rows that choose the wave model.
-    """
-
+    #: ``spherical``, ``plane``, ``free`` (a gain for each antenna) or ``auto``, chosen on validation rows
     wavefront: Kind = "auto"
-    max_paths: Count = 100
-    max_distance_m: Positive = 100.0
-    between: int = 1
-    final: int = 15
+    max_paths: Count = 100  #: most paths of a row
+    max_distance_m: Positive = 100.0  #: longest path, metres
+    between: int = 1  #: steps of refinement of all paths after each addition
+    final: int = 15  #: steps of refinement after the last addition
+    #: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz
     spacing_hz: Positive = 312.5e3
-    choice_rows: Count = 16
+    choice_rows: Count = 16  #: validation rows that choose the wave model
     depth: Count = 5
     reflections: int = 3
     rays: int = 1 << 17
