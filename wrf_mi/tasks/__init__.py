@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from ..core import InputError, Record
 from ..core.registry import Registry
 from ..receivers.instruments import Instrument
-from .kinds import Csi, Rssi, Spectrum
-from .task import CARRIER, LAW, UPLINK, Task
+from .task import CARRIER, LAW, UPLINK, Csi, Rssi, Spectrum, Task
 
 ENTRY_POINTS = "wrf_mi.tasks"
 """Group of the entry points by which other packages add tasks."""

@@ -1,22 +1,179 @@
-"""Data, graph and schedule of a fit, known before its first step."""
+"""Data, graph and schedule of a fit, known before its first step.
+
+A *condition* is the input of a field: a row's transmitter position, or the uplink channel of one antenna of a row.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
+from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..datasets.observations import check_observations
 from ..graph.graph import Field, Graph
+from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import task_of
-from ..tasks.conditions import placed_receivers
+from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
+from .adam import Schedule, density_rounds, plan
 from .config import TrainConfig
 from .fields import check_memory, field_of
-from .schedule import Schedule, density_rounds, plan
 from .selection import hold_out_groups
-from .targets import form_of, targets_of
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Conditions and observations of a record."""
+
+    condition: FloatArray  # positions [3, c] in metres or features [features, c]
+    truth: NDArray[np.float32]  # float32 [n_rx, c, *shape of a report], NaN where nothing was received
+    unit: FloatArray  # unit of each receiver's differences in the loss, [n_rx]
+    per_row: int = 1  # number of consecutive conditions of a row
+    weight: FloatArray | None = None  # factor of each observation's difference in the loss [n_rx, c]; None: 1
+    carriers_hz: FloatArray | None = None  # carriers of the training rows, ascending; None: rows have a single carrier
+    carrier: IntArray | None = None  # number of each condition's carrier [c], -1 for carriers without training rows
+
+    @property
+    def ports(self) -> int:
+        """Number of receivers times that of carriers."""
+        return len(self.truth) * self.carriers
+
+    @property
+    def carriers(self) -> int:
+        """Number of carriers of the training rows."""
+        return 1 if self.carriers_hz is None else len(self.carriers_hz)
+
+    def at(self, port: int, conditions: IntArray) -> IntArray:
+        """Those of the conditions that have a port's carrier."""
+        return conditions if self.carrier is None else conditions[self.carrier[conditions] == port % self.carriers]
+
+    def conditions(self, rows: IntArray) -> IntArray:
+        """Numbers of the conditions of rows."""
+        return np.asarray((rows[:, None] * self.per_row + np.arange(self.per_row)).ravel())
+
+    def received(self, port: int, rows: IntArray) -> IntArray:
+        """Conditions of those rows that a port's receiver observed at its carrier."""
+        chosen = self.at(port, self.conditions(rows))
+        return np.asarray(chosen[self._complete[port // self.carriers, chosen]])
+
+    @cached_property
+    def _complete(self) -> NDArray[np.bool_]:
+        """Whether each receiver observed each condition [n_rx, c]; of images it takes long, and is asked for often."""
+        return np.stack(
+            [np.isfinite(of_receiver).all(axis=tuple(range(1, of_receiver.ndim))) for of_receiver in self.truth]
+        )
+
+
+def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
+    """Conditions and observations of a record; units are measured on training rows.
+
+    An uplink is the condition where there is one, except beside paths of a scene, which are traced from positions.
+
+    Raises:
+        InputError: an unknown position, or an uplink without a signal or with a different number of antennas.
+    """
+    task, observed = task_of(record), np.asarray(record.observation)
+    if record.uplink is None or with_scene:
+        if not np.isfinite(record.tx_pos_m[rows]).all():
+            row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
+            raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
+        units = np.array([task.unit(values[rows]) for values in observed])
+        weight = _weights(record, rows)
+        targets = Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(observed), units, weight=weight)
+        if record.carriers_hz is None:
+            return targets
+        carriers = np.unique(record.carriers_hz[rows])
+        number = np.where(np.isin(record.carriers_hz, carriers), np.searchsorted(carriers, record.carriers_hz), -1)
+        return replace(targets, carriers_hz=carriers, carrier=number)
+    outputs = outputs_of(record)
+    features, divisor = normalised_uplink(record.uplink)
+    # Divided as the uplink is: path loss and the radios' phases are equal in both links and need not be learned.
+    channels = observed[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
+    truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
+    received = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
+    # Root mean square of the complex numbers, whose two parts have half of the mean square each.
+    unit = float(np.sqrt(2 * np.mean(np.square(truth[0, received], dtype=float)))) or 1.0
+    return Targets(np.asarray(features.T, float), truth, np.array([unit]), outputs.antennas)
+
+
+def _weights(record: Record, rows: IntArray) -> FloatArray | None:
+    """Inverse standard deviation of the noise, with a mean of 1 over the training rows' observations; 1 in other rows.
+
+    Differences become standardised residuals: an absolute error is weighted by 1 / std, a squared one by 1 / variance.
+    """
+    precision = record.precision(rows)
+    if precision is None:
+        return None
+    weight = np.ones(record.observation.shape[:2])
+    inverse = np.sqrt(precision)
+    # A mean of 1, so that learning rates and losses compare with those of unweighted rows.
+    weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
+    return weight
+
+
+def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Complex values with a last axis of real and imaginary part."""
+    if not np.iscomplexobj(values):
+        return np.ascontiguousarray(values, np.float32)
+    single = np.ascontiguousarray(values, np.complex64)
+    return single.view(np.float32).reshape(*single.shape, 2)
+
+
+def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
+    """Form of a record's observations by the settings; its basis is computed from the training ``rows``.
+
+    Raises:
+        InputError: a receiver model of another task, or antennas of unknown positions beside a scene.
+    """
+    task = task_of(record)
+    default = task.receiver_with_scene if with_scene else task.receiver
+    if not default:
+        raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
+    name = default if config.receiver == AUTO else config.receiver
+    receiver_kind(name, task.name)
+    view = config.view.height, config.view.columns
+    size = tuple(map(int, record.observation.shape[-2:])) if task.image else view
+    basis = _basis(targets, rows, config.view.components) if task.is_complex else None
+    outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
+    features = 0 if record.uplink is None or with_scene else len(targets.condition)
+    headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
+    if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
+        raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
+    # The tracer finds no path through many walls; what was measured there is the weakest of all.
+    floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
+    return Form(
+        name,
+        (size[0], size[1]),
+        record.frequencies_hz,
+        outputs,
+        basis,
+        features,
+        headings,
+        floor_db,
+        targets.carriers_hz,
+    )
+
+
+def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
+    """Principal components [components, outputs] of the training rows' channels, without subtraction of the mean.
+
+    Receivers have equal weight, as scores are relative.
+    """
+    power: NDArray[np.complex128] | float = 0.0
+    for receiver in range(len(targets.truth)):
+        pairs = targets.truth[receiver, targets.received(receiver, rows)].astype(float)
+        channels = (pairs[..., 0] + 1j * pairs[..., 1]).reshape(len(pairs), -1)
+        power = power + channels.conj().T @ channels / (np.square(np.abs(channels)).sum() or 1.0)
+    _, vectors = np.linalg.eigh(power)
+    # Rows v^H: a channel h has coefficients h v and is their sum with v^H.
+    return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
+
 
 CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
 """Stages of a training: parameters of paths; Gaussians on surfaces with them; and the field's Gaussians, too."""

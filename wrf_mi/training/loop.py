@@ -12,9 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .adam import NonFiniteReport, NumericsError, watched_groups
+from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
-from .schedule import Schedule
 from .state import FitState
 
 

@@ -26,11 +26,9 @@ from ..gaussians.tiles import Plane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
 from ..tracing.paths.traced_field import TracedField
-from .adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
-from .fit_plan import FIELD, FitPlan
-from .schedule import Schedule
+from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
+from .fit_plan import FIELD, FitPlan, Targets
 from .state import FitState
-from .targets import Targets
 
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
@@ -73,7 +71,7 @@ def places_of(graph: Graph) -> list[Place]:
 
 @dataclass
 class TrainingData:
-    """Conditions and observations on the device (`wrf_mi.training.targets.Targets`)."""
+    """Conditions and observations on the device (`Targets`)."""
 
     condition: Any  # conditions of all rows, tensor [3, c] in metres or [features, c]
     truth: Any  # observations of all receivers and conditions, flat

@@ -31,9 +31,8 @@ from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
 from ...training.loop import Progress
 from ...training.predictor import Predictor
-from ...training.stage_selection import HeldOutReports
 from ...training.state import FitState
-from ...training.trainer import Trainer
+from ...training.trainer import HeldOutReports, Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 Params = dict[str, NDArray[np.float32]]

@@ -4,24 +4,87 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Split
+from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
-from ...training.selection import RowDistance
+from ...training.selection import RowDistance, rows_at_receiver
 from ..held_out import predicted_rows
-from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed
-from .parts import PATHS, TRACED, UPLINK_PARTS
+from ..interpolation.kriging import Kriged, Kriging
+from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed, under
 from .paths import by_stage
-from .residuals import Residuals
 from .scene_side import SceneSide
 
+LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
+LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]
+"""Rows [n] by receiver, and what a model's mean leaves of their observations, [n, ...]."""
+
+
+def left_over(fitted: Fitted, record: Record, split: Split) -> LeftOver:
+    """What a fitted model leaves of the observations of its training rows."""
+    left: dict[int, tuple[IntArray, NDArray[Any]]] = {}
+    for receiver in range(len(record.receivers)):
+        rows = _training_rows(record, split, receiver)
+        if len(rows):
+            observed = record.observation[receiver, rows]
+            left[receiver] = rows, observed - predicted_rows(fitted, record, rows, receiver).mean
+    return left
+
+
+def _training_rows(record: Record, split: Split, receiver: int) -> IntArray:
+    rows = rows_at_receiver(record, split.all_train, receiver)
+    if receiver in split.held_receivers:
+        rows = np.intersect1d(rows, split.left[split.left[:, 0] == receiver, 1])
+    return rows
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Kriging of what the scene's side leaves at the training rows."""
+
+    by_receiver: Mapping[int, Kriged]  # interpolation of each receiver that has enough rows, by its number
+
+    @classmethod
+    def of(cls, left: LeftOver, record: Record, split: Split, seed: int) -> Residuals:
+        """Residuals that a model left, at the training rows of a split that is the model's or holds out more."""
+        by_receiver: dict[int, Kriged] = {}
+        for receiver, (rows, residual) in left.items():
+            known = np.isin(rows, _training_rows(record, split, receiver))
+            if known.sum() >= LEAST_RESIDUALS:
+                residual = residual if known.all() else residual[known]
+                by_receiver[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[rows[known]], residual)
+        return cls(by_receiver)
+
+    def __call__(self, tx_pos_m: FloatArray, receiver: int, shape: tuple[int, ...]) -> NDArray[Any] | float:
+        """Expected residuals of a receiver at positions [m, 3], [m, *shape]; 0 without any rows."""
+        kriged = self.by_receiver.get(receiver)
+        return 0.0 if kriged is None else kriged.predict(tx_pos_m).reshape(len(tx_pos_m), *shape)
+
+    def arrays(self) -> Arrays:
+        """Arrays of a run file."""
+        arrays: Arrays = {}
+        for receiver, kriged in self.by_receiver.items():
+            arrays |= keyed(f"{receiver}/", kriged.arrays())
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, record: Record) -> Residuals:
+        """The residuals that `arrays` described."""
+        numbers = sorted({int(name.partition("/")[0]) for name in arrays})
+        return cls({k: Kriged.from_arrays(under(f"{k}/", arrays), record.receivers[k]) for k in numbers})
+
+
+PATHS, KRIGING = "paths", "kriging"
+UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
+"""Models of a downlink, the first of which is the mean that others have to improve on."""
+TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
 STATED, PREDICTED = "stated", "predicted"
 """Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
@@ -60,53 +123,41 @@ class FittedHybrid(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
-        self._check(inputs)
-
-        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
-            if self._states_sizes:
-                return Decomposition(part.predict(inputs.rows(rows), receiver))
-            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
-
-        return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
+        return self._of_inputs(inputs, receiver, Fitted.decompose).whole
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`, by parts that save time without standard deviations."""
-        self._check(inputs)
-
-        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
-            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
-
-        return self._mixed(inputs.tx_pos_m, receiver, predicted, std=False).whole.mean
+        return self._of_inputs(inputs, receiver, Fitted.decompose, std=False).whole.mean
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; parts use what they have stored."""
         record = self._problem.record
-
-        def stored(part: Fitted, places: IntArray) -> Decomposition:
-            return Decomposition(predicted_rows(part, record, rows[places], receiver))
-
-        return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
+        return self._mixed(
+            record.tx_pos_m[rows],
+            receiver,
+            lambda part, places: Decomposition(predicted_rows(part, record, rows[places], receiver)),
+        ).whole
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """The prediction; what the scene's side and the others predict by themselves, NaN where they have no weight;
-        and the traced paths.
-        """
-        self._check(inputs)
-
-        def decomposed(part: Fitted, rows: IntArray) -> Decomposition:
-            return part.decompose(inputs.rows(rows), receiver, std and self._states_sizes)
-
-        return self._mixed(inputs.tx_pos_m, receiver, decomposed, std)
+        """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths."""
+        return self._of_inputs(inputs, receiver, lambda part, *of_part: part.decompose(*of_part), std)
 
     @property
     def depends_on_heading(self) -> bool:
         """Whether the predictions of a part depend on the heading of the transmitter."""
         return any(part.depends_on_heading for part in self.parts.values())
 
-    def _check(self, inputs: Inputs) -> None:
+    def _of_inputs(
+        self, inputs: Inputs, receiver: int, decompose: Callable[..., Decomposition], std: bool = True
+    ) -> Decomposition:
+        """Mixed results of ``decompose(part, inputs, receiver, std)``; that of `Fitted` computes no sides."""
         needed = [name for name in self.parts if name.partition("-")[0] in UPLINK_PARTS]
         if needed and inputs.uplink is None:
             raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
+        of_parts = std and self._states_sizes
+        return self._mixed(
+            inputs.tx_pos_m, receiver, lambda part, rows: decompose(part, inputs.rows(rows), receiver, of_parts), std
+        )
 
     def _mixed(
         self,
@@ -191,5 +242,4 @@ class FittedHybrid(Fitted):
 
 
 def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Values [m] with an axis of length one for each of an observation."""
     return values.reshape(-1, *[1] * len(shape))

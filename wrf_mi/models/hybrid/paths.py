@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,22 +22,8 @@ from ...training.selection import HeldOut
 from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..held_out import as_unseen, labelled
 from ..model import Arrays, Fitted, Inputs, Model, PredictAll, Problem, Session, settings_array, stored_settings
-from .scene_side import (
-    CALIBRATION,
-    CORRECTED,
-    FIELD,
-    MEAN,
-    SCENE,
-    STAGES,
-    SURFACES,
-    SceneSide,
-    StageReport,
-    corrected,
-    in_scene,
-    inside,
-    too_few,
-    write_reports,
-)
+from . import scene_side
+from .scene_side import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, SceneSide, StageReport, too_few
 
 STATED = "stated"  # folder of the fit in the scene as it is stated, inside the session's
 FEW_ROWS = 40
@@ -103,16 +90,14 @@ class InScene(Model):
         scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
         used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
         reports = [StageReport(CALIBRATION, True, scores[CALIBRATION])] if CALIBRATION in scores else []
-        reports += [
-            StageReport(stage, used[stage], scores.get(stage)) for stage in used if stage in scores or used[stage]
-        ]
+        reports += [StageReport(name, used[name], scores.get(name)) for name in used if name in scores or used[name]]
         if reports:
             reports[-1] = replace(reports[-1], seconds=graph.train_seconds)
         return FittedPaths(graph, problem, reports)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
         """The scene's side that was fitted in a folder."""
-        config, inner = stored_settings(TrainConfig, arrays, str(folder)), in_scene(problem, folder)
+        config, inner = stored_settings(TrainConfig, arrays, str(folder)), scene_side.in_scene(problem, folder)
         return FittedPaths(FittedField(arrays, config, replace(inner, settings=config), folder), inner)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
@@ -134,8 +119,8 @@ class Paths(InScene):
         Raises:
             Interrupted: stopped; the correction is kept, training goes on from its checkpoint.
         """
-        inner, reports = corrected(problem, split, session)
-        place = inside(session, STATED)
+        inner, reports = scene_side.corrected(problem, split, session)
+        place = scene_side.inside(session, STATED)
         if inner.scene == problem.scene:
             # A stopped fit that had preferred the scene as it is stated finds it trained.
             paths = super().fit(inner, split, place if place.folder.exists() else session)
@@ -147,8 +132,8 @@ class Paths(InScene):
                 if _held_out_score(stated) > _held_out_score(paths):
                     paths = stated
                     reports = [replace(report, kept=report.kept and report.stage == MEAN) for report in reports]
-                    write_reports(session.folder, reports)
-                    shutil.rmtree(session.folder / SCENE)
+                    scene_side.write_reports(session.folder, reports)
+                    shutil.rmtree(session.folder / scene_side.SCENE)
         # A correction contains the calibration; parameters of paths are the graph's where it is not kept.
         is_corrected = any(report.kept and report.stage != MEAN for report in reports)
         reports = [report for report in reports if is_corrected or report.stage != CALIBRATION]
@@ -158,7 +143,7 @@ class Paths(InScene):
 
 
 def _held_out_score(paths: FittedPaths) -> float:
-    """Mean score of the rows that chose the stages, as if the scene had not seen them; the higher the better."""
+    # Of the rows that chose the stages, as if the scene had not seen them; the higher the better.
     reports, problem = paths.fitted.held_out, paths.problem
     assert reports is not None
     task, no_distance = task_of(problem.record), np.zeros(len(reports.row))
@@ -180,18 +165,16 @@ def by_stage(problem: Problem, split: Split, side: SceneSide, used: Collection[s
         predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
     if isinstance(side, FittedPaths):
         if SURFACES in earlier:
-            predictions[SURFACES] = _of_all(side.fitted.without_gaussians() if FIELD in used else side)
+            fitted = side.fitted.without_gaussians() if FIELD in used else side
+            predictions[SURFACES] = partial(_at_all_receivers, fitted)
         if FIELD in earlier:
-            predictions[FIELD] = _of_all(side)
+            predictions[FIELD] = partial(_at_all_receivers, side)
     return predictions
 
 
-def _of_all(fitted: Fitted) -> PredictAll:
-    def predict(inputs: Inputs) -> NDArray[np.generic]:
-        assert fitted.receivers is not None
-        return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(len(fitted.receivers))])
-
-    return predict
+def _at_all_receivers(fitted: Fitted, inputs: Inputs) -> NDArray[np.generic]:
+    assert fitted.receivers is not None
+    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(len(fitted.receivers))])
 
 
 def _traced(problem: Problem, split: Split) -> PredictAll:

@@ -28,18 +28,10 @@ from ..model import Arrays, Decomposition, Fitted, Inputs, Problem, Session
 logger = logging.getLogger(__name__)
 
 SCENE, STAGES_FILE = "scene", "stages.json"
-MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = (
-    "mean",
-    "calibration",
-    "correction",
-    "surfaces",
-    "field",
-    "residual",
-)
+STAGES = ("mean", "calibration", "correction", "surfaces", "field", "residual")  # stages in their order
+MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = STAGES
 OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parts of a correction beyond materials and gains
-STAGES = (MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL)  # stages in their order
-FAST = tuple(stage for stage in STAGES if stage != FIELD)
-"""Stages without the one whose training takes most of the time."""
+FAST = tuple(stage for stage in STAGES if stage != FIELD)  # without the stage whose training takes most of the time
 
 
 @dataclass(frozen=True)
@@ -80,9 +72,7 @@ class SceneSide(Fitted):
         return self.fitted.arrays()
 
     def held_out_at(self, held_out: HeldOut) -> Prediction | None:
-        """Predictions of held-out rows, as large in error as if the scene had not seen them; None: a further fit has to
-        make them.
-        """
+        """Predictions of held-out rows, with errors as of rows that the scene has not seen; None: not available."""
         return None
 
 
@@ -95,11 +85,6 @@ def inside(session: Session, *names: str) -> Session:
 def too_few(record: Record, split: Split) -> bool:
     """Whether the training rows are too few to hold groups of them out for a choice of stages."""
     return hold_out_groups(split, record.tx_pos_m) is split
-
-
-def needs_scene(wanted: Collection[str]) -> bool:
-    """Whether one of the stages needs the scene."""
-    return not {MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD}.isdisjoint(wanted)
 
 
 def in_scene(problem: Problem, folder: Path) -> Problem:

@@ -19,11 +19,10 @@ from drjit.opt import Adam
 from ...backend.recorded import Recorded
 from ...core import InputError
 from ...core.types import IntArray
-from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
+from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, plan, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.config import AdamConfig, LoopConfig
 from ...training.loop import Progress, TrainingLoop
-from ...training.schedule import plan
 from ...training.session import FitSession
 from ...training.state import FitState
 from ..model import keyed, under
