@@ -19,6 +19,12 @@ from ..core.types import IntArray
 from . import instrument_of, task_of
 
 
+def real_parts(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Real parts, then imaginary ones, of complex numbers [m, ...], [m, 2 k]."""
+    flat = values.reshape(len(values), -1)
+    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
+
+
 def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
     """Uplink channels [m, antennas, subcarriers] as features, and the complex divisor of each.
 
@@ -41,8 +47,7 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
     size = np.abs(mean)
     turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)  # no phase to remove where the mean is zero
     divisor = rms * turn
-    flat = (h / divisor[..., None]).reshape(-1, h.shape[-1])
-    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32), divisor
+    return real_parts((h / divisor[..., None]).reshape(-1, h.shape[-1])), divisor
 
 
 @dataclass(frozen=True)
@@ -171,8 +176,7 @@ def truth_of(
         channel = observed.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
     else:
         channel = observed / scales[receiver]
-    flat = channel.reshape(-1, outputs.count)
-    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
+    return real_parts(channel.reshape(-1, outputs.count))
 
 
 def channels_from(parts: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]) -> NDArray[np.complex64]:

@@ -81,7 +81,7 @@ class Residuals:
         return cls({k: Kriged.from_arrays(under(f"{k}/", arrays), record.receivers[k]) for k in numbers})
 
 
-PATHS, KRIGING = "paths", "kriging"
+PATHS = "paths"
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
 TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene

@@ -32,18 +32,7 @@ from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions, under
-from .fitted import (
-    KRIGING,
-    NEGLIGIBLE,
-    PATHS,
-    PREDICTED,
-    STATED,
-    TRACED,
-    UPLINK_PARTS,
-    FittedHybrid,
-    Residuals,
-    left_over,
-)
+from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
 from .paths import InScene, Paths
 from .scene_side import FIELD, RESIDUAL, STAGES, SceneSide, StageReport, inside, stated_reports
 from .strengths import StrengthsInScene, TracedStrengths
@@ -131,7 +120,7 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
         parts[name] = entry, inner
 
 
-FOLDER = "parts"
+FOLDER, KRIGING = "parts", "kriging"
 
 
 class _Fit:
@@ -248,16 +237,14 @@ class _Fit:
         weights, observed = mixture(held_out.distance_m), held_out.observed(self.record)
         mean = np.einsum("qk,kq...->q...", weights, np.stack([each.mean for each in self.predictions.values()]))
         stds = [each.std for each in self.predictions.values() if each.std is not None]
+        sizes, size, unit = PREDICTED, by_distance.expected_size(self.task, Prediction(mean)), np.ones((), np.float32)
         if len(stds) == len(self.predictions):
             std = np.einsum("qk,kq...->q...", weights, np.stack(stds))
             if (std > 0).all():  # kriging of two or three rows may pass through all of them
                 # Few rows tell a factor of stated deviations, not how errors depend on them.
-                size = np.ones(mean.shape)
-                return STATED, by_distance.fit_intervals(
-                    mean / std, observed / std, size, held_out.distance_m, held_out.row
-                )
-        size = by_distance.expected_size(self.task, Prediction(mean))
-        return PREDICTED, by_distance.fit_intervals(mean, observed, size, held_out.distance_m, held_out.row)
+                sizes, size, unit = STATED, np.ones(mean.shape), std
+        of_rows = held_out.distance_m, held_out.row
+        return sizes, by_distance.fit_intervals(mean / unit, observed / unit, size, *of_rows)
 
 
 def _used(names: Sequence[str], mixture: Mixture) -> list[str]:

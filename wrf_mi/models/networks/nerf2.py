@@ -36,36 +36,11 @@ from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import IntArray
 from ...receivers.reports import SQUARED_MAGNITUDE_EPS
-from ...tasks import Task, task_of
-from ...tasks.conditions import (
-    channel_scales,
-    channels_from,
-    conditions_of,
-    known_uplink,
-    normalised_uplink,
-    outputs_of,
-    placed_receivers,
-    truth_of,
-)
+from ...tasks import Task, conditions, task_of
 from ...training.config import AdamConfig
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Fitted,
-    Inputs,
-    Model,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    inputs_of,
-    keyed,
-    known_positions,
-    received_rows,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
 from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
 from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
@@ -148,10 +123,14 @@ class Field(Fitted):
         self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
     ) -> None:
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
-        self.outputs, self.task, self._shape = outputs_of(record), task_of(record), record.observation.shape[2:]
+        self.outputs, self.task, self._shape = (
+            conditions.outputs_of(record),
+            task_of(record),
+            record.observation.shape[2:],
+        )
         self.networks: list[Nerf2Network] = []
         self._points: tuple[int, list[RayPoints]] | None = None
-        receivers = placed_receivers(record, self.outputs.by_uplink)
+        receivers = conditions.placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
         self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
         if self.task.image:
@@ -203,18 +182,16 @@ class Field(Fitted):
             self._points = receiver, self.look(network, receiver)
         condition, divisor = self.condition_of(inputs, receiver)
         values, shape = self.march(network, self._points[1], condition, receiver), (len(inputs), *self._shape)
-        return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
+        return Prediction(
+            conditions.channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape)
+        )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
-        arrays = {
-            "settings": settings_array(self.settings),
-            "far_m": np.asarray(self.far_m),
-            "scales": self.scales,
-            **field_arrays(self.coordinates, "frame/"),
-        }
+        arrays = {"settings": model.settings_array(self.settings), "far_m": np.asarray(self.far_m)}
+        arrays |= {"scales": self.scales, **model.field_arrays(self.coordinates, "frame/")}
         for g, network in enumerate(self.networks):
-            arrays |= keyed(f"group{g}/", network.arrays())
+            arrays |= network.arrays(f"group{g}/")
         return arrays
 
     def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[RayPoints]:
@@ -246,7 +223,7 @@ class Field(Fitted):
             InputError: no uplink, where one is needed.
         """
         if self.outputs.by_uplink:
-            features, divisor = normalised_uplink(known_uplink(inputs.uplink))
+            features, divisor = conditions.normalised_uplink(conditions.known_uplink(inputs.uplink))
             return to_tensor(features.T), divisor
         s = self.settings
         where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
@@ -288,12 +265,13 @@ def _fit_group(
     s, outputs = field.settings, field.outputs
     known = split.all_train
     # From here on rows count within the training rows.
-    rows = {
-        r: tuple(np.searchsorted(known, part) for part in received_rows(record, split, r, "nerf2")) for r in members
-    }
+    received = {r: received_rows(record, split, r, "nerf2") for r in members}
+    rows = {r: tuple(np.searchsorted(known, part) for part in parts) for r, parts in received.items()}
     rng = np.random.default_rng([seed, *members])
-    condition, _ = field.condition_of(inputs_of(record, known), members[0])
-    truth = np.concatenate([truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))])
+    condition, _ = field.condition_of(record.inputs(known), members[0])
+    truth = np.concatenate(
+        [conditions.truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))]
+    )
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
     initial = field.initial(rng)
@@ -315,7 +293,7 @@ def _fit_group(
     def score(network: Nerf2Network) -> float:
         errors = []
         for r in members:
-            validation = conditions_of(rows[r][1], outputs)
+            validation = conditions.conditions_of(rows[r][1], outputs)
             if len(validation):
                 points = field.look(network, r, scored if spectrum else None)
                 predicted = field.march(network, points, columns(condition, opaque_rows(validation)), r)
@@ -323,8 +301,8 @@ def _fit_group(
                 errors.append(np.square(predicted - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
 
-    train = [conditions_of(rows[r][0], outputs) for r in members]
-    everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
+    train = [conditions.conditions_of(rows[r][0], outputs) for r in members]
+    everything = [conditions.conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
     rows_of = draw, train, everything, score if able else None
@@ -349,25 +327,25 @@ class Nerf2Model(Model):
             InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
         """
         record, known = problem.record, split.all_train
-        outputs, settings = outputs_of(record), problem.settings
+        outputs, settings = conditions.outputs_of(record), problem.settings
         where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
         known_rx = np.stack([receiver.position_m for receiver in record.receivers])
-        rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
+        rx = np.stack([receiver.position_m for receiver in conditions.placed_receivers(record, outputs.by_uplink)])
         if np.isfinite(where).all() and np.isfinite(known_rx).all():
             farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
         else:
             where, farthest = rx, FAR_M
-        scales = channel_scales(record, known)
+        scales = conditions.channel_scales(record, known)
         field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
         field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
         return field
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Field:
         """The fields that `Field.arrays` described."""
-        settings = stored_settings(Nerf2Settings, arrays, "nerf2")
-        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        settings = model.stored_settings(Nerf2Settings, arrays, "nerf2")
+        coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
         field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-        field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+        field.networks = [field.network.on_device(arrays, f"group{g}/") for g in range(len(field.groups))]
         return field
 
 

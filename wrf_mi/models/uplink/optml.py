@@ -32,21 +32,10 @@ from ...backend.device import to_tensor, to_uint
 from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
-from ...core.types import IntArray
 from ...training.config import AdamConfig
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Inputs,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    keyed,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Inputs, Problem, slices
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .csi_bands import Bands, UplinkModel
@@ -148,7 +137,8 @@ class PathMap(Module):
     def __call__(self, x: Any, around: Any) -> Any:
         """Maps of paths; ``around`` is `Waves.around` on the device."""
         for layer in self.layers:
-            x = _elu(layer(_patches(x, around, len(self.waves.cosines))))
+            x = layer(_patches(x, around, len(self.waves.cosines)))
+            x = dr.select(x > 0, x, dr.exp(dr.minimum(x, 0)) - 1)  # exponential linear unit
         return self.out(x)
 
     def propose(self, h: Complex, count: int, threshold: float) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -168,10 +158,6 @@ class PathMap(Module):
         at, direction = np.unravel_index(best, (channels, cells))
         theta = np.concatenate([waves.grid[at][..., None], waves.cosines[direction]], axis=2)
         return theta, np.isfinite(np.take_along_axis(peaks, best, axis=1))
-
-
-def _elu(x: Any) -> Any:
-    return dr.select(x > 0, x, dr.exp(dr.minimum(x, 0)) - 1)
 
 
 def _patches(x: Any, around: Any, cells: int) -> Any:
@@ -242,8 +228,8 @@ class OptML(R2F2):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, wave model, bands and weights."""
-        settings = {"settings": settings_array(self.settings), "wavefront": np.array(self.kind)}
-        return settings | field_arrays(self.bands) | keyed("network/", self.network.arrays())
+        settings = {"settings": model.settings_array(self.settings), "wavefront": np.array(self.kind)}
+        return settings | model.field_arrays(self.bands) | self.network.arrays("network/")
 
 
 def prune(
@@ -290,14 +276,9 @@ class OptMLModel(UplinkModel):
         judges = int(np.clip(len(filtered) // 10, 1, MAX_VALIDATION))
         around = to_uint(waves.around)
         # One column a map, so that a batch is a choice of columns.
-        flat = {
-            name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("filtered", filtered), ("truth", truth))
-        }
-        data = flat | {"around": around}
+        columns_of = (to_tensor(maps.reshape(len(maps), -1).T) for maps in (filtered, truth))
+        data = dict(zip(("filtered", "truth", "around"), (*columns_of, around), strict=True))
         dr.make_opaque(data)
-
-        def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-            return opaque_rows(rows)
 
         def chosen(maps: Any, rows: Any) -> Any:
             x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
@@ -314,15 +295,17 @@ class OptMLModel(UplinkModel):
 
         rows = [np.arange(judges, len(filtered))], [np.arange(len(filtered))]
         initial = PathMap(waves, settings.width, rng)
-        maps = Network("paths", initial, loss, data, draw, *rows, score, "mean squared error")
+        maps = Network(
+            "paths", initial, loss, data, lambda rows, *_: opaque_rows(rows), *rows, score, "mean squared error"
+        )
         return OptML(kind, bands, settings, train_network(maps, settings, (problem.seed,), session)[0])
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> OptML:
         """The model that `OptML.arrays` described."""
-        settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
-        bands = from_field_arrays(Bands, arrays)
+        settings, kind = model.stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
+        bands = model.from_field_arrays(Bands, arrays)
         waves = waves_of(kind, bands, settings.max_distance_m)
-        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
+        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(arrays, "network/")
         return OptML(kind, bands, settings, network)
 
 
