@@ -77,11 +77,7 @@ class Problem:
         return None if self.scene is None else self.open_scene(scene_carrier(self.record))
 
     def open_scene(self, frequency_hz: float) -> Any | None:
-        """The scene at another frequency, Hz, or None.
-
-        Raises:
-            InputError: it cannot be opened.
-        """
+        """The scene at another frequency, Hz, or None (InputError: it cannot be opened)."""
         from ..tracing import open_scene  # the tracer is imported where there is a scene
 
         return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
@@ -119,8 +115,7 @@ class Decomposition:
     paths: PathStatistics | None = None  #: statistics of the traced paths; None: the model traces none
 
 
-PredictAll = Callable[[Inputs], NDArray[Any]]
-"""Observations of all receivers [n_rx, m, ...] for inputs [m]."""
+PredictAll = Callable[[Inputs], NDArray[Any]]  # Observations of all receivers [n_rx, m, ...] for inputs [m]
 
 
 class Fitted(ABC):
@@ -272,11 +267,7 @@ def received_rows(record: Record, split: Split, receiver: int, name: str) -> tup
 
 
 def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
-    """Positions of the transmitter in some rows [n, 3], metres.
-
-    Raises:
-        InputError: unknown positions.
-    """
+    """Positions of the transmitter in some rows [n, 3], metres (InputError: unknown positions)."""
     unknown = rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)]
     if len(unknown):
         text = f"no position in row {unknown[0]}: positions are not known, from which {name} predicts"

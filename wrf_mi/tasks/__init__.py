@@ -9,8 +9,7 @@ from ..core.registry import Registry
 from ..receivers.instruments import Instrument
 from .task import CARRIER, LAW, UPLINK, Csi, Rssi, Spectrum, Task
 
-ENTRY_POINTS = "wrf_mi.tasks"
-"""Group of the entry points by which other packages add tasks."""
+ENTRY_POINTS = "wrf_mi.tasks"  # Group of the entry points by which other packages add tasks
 
 
 TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
@@ -18,11 +17,7 @@ TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for 
 
 
 def task_of(record: Record) -> Task:
-    """The task of a record.
-
-    Raises:
-        InputError: an unknown task.
-    """
+    """The task of a record (InputError: an unknown task)."""
     if record.task not in TASKS:
         raise InputError(f"{record.source or record.name}: task {record.task!r}; known are {', '.join(TASKS)}")
     return TASKS[record.task]
@@ -38,11 +33,7 @@ def instrument_of(record: Record) -> Instrument:
 
 
 def require(record: Record, *names: str, why: str) -> None:
-    """Refuse a record of another task than those named.
-
-    Raises:
-        InputError: the message ends with ``why``.
-    """
+    """Refuse a record of another task than those named (InputError: the message ends with ``why``)."""
     if record.task not in names:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 

@@ -20,8 +20,7 @@ from ..backend.device import quads
 from ..core import InputError
 from .scores import SSIM_C1, SSIM_C2, SSIM_SAMPLE, WINDOW
 
-SSIM_WEIGHT = 0.2
-"""Weight of the structural term, eta of the paper."""
+SSIM_WEIGHT = 0.2  # Weight of the structural term, eta of the paper
 BORDER = WINDOW - 1
 
 

@@ -17,14 +17,10 @@ from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 
-EXACT = np.finfo(float).eps ** 2
-"""Smallest relative squared error that float64 resolves."""
-WINDOW = 7
-"""Side of the window of structural similarity in pixels, scikit-image's default."""
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
-"""Stabilising constants of Wang et al. (2004) for a data range of one."""
-SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)
-"""Sample variance of a window over its variance."""
+EXACT = np.finfo(float).eps ** 2  # Smallest relative squared error that float64 resolves
+WINDOW = 7  # Side of the window of structural similarity in pixels, scikit-image's default
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # Stabilising constants of Wang et al. (2004) for a data range of one
+SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)  # Sample variance of a window over its variance
 RESAMPLES = 2000
 """Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
@@ -157,11 +153,7 @@ def ssim_mixtures(predictions: NDArray[Any], truth: NDArray[Any], stride: int = 
 
 
 def summary(values: ArrayLike) -> dict[str, float]:
-    """Median, mean, 10th and 90th percentile of all values that are not NaN.
-
-    Raises:
-        InputError: no values.
-    """
+    """Median, mean, 10th and 90th percentile of all values that are not NaN (InputError: no values)."""
     v = np.asarray(values, float).ravel()
     v = v[~np.isnan(v)]
     if not len(v):
@@ -202,10 +194,8 @@ def bootstrap(*samples: ArrayLike, statistic: Callable[..., Any] = np.median, se
     return Interval(float(statistic(*sets, axis=-1)), float(low), float(high))
 
 
-DB = 10 / np.log(10)
-"""Decibels of a factor e."""
-CERTAIN = 1e8
-"""Largest parameter of the distribution: a standard deviation of 4e-4 dB, below any that is stated."""
+DB = 10 / np.log(10)  # Decibels of a factor e
+CERTAIN = 1e8  # Largest parameter of the distribution: a standard deviation of 4e-4 dB, below any that is stated
 
 
 def decibels(power: NDArray[Any]) -> FloatArray:

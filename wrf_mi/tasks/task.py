@@ -15,10 +15,8 @@ from ..core.types import IntArray
 from ..receivers.instruments import ChannelInstrument, Instrument, PowerInstrument, SpectrumInstrument
 from .scores import MixtureScores, abs_error_db, cea_db, level_of_amplitudes, ssim, ssim_mixtures
 
-UPLINK = "uplink"
-"""Key of the reference that copies the uplink."""
-LAW = "law"
-"""Key of the reference at receivers that were held out."""
+UPLINK = "uplink"  # Key of the reference that copies the uplink
+LAW = "law"  # Key of the reference at receivers that were held out
 CARRIER = "carrier"
 """Key of the reference at carriers without training rows: that of `Task.reference` at the nearest carrier with some."""
 
@@ -88,11 +86,7 @@ class Task(ABC):
         raise InputError(f"task {self.name}: defines no level of an observation, so there is nothing to map")
 
     def check(self, record: Record) -> None:  # noqa: B027 - most tasks have nothing to check
-        """Refuse a record with inconsistent parts.
-
-        Raises:
-            InputError: naming what differs.
-        """
+        """Refuse a record with inconsistent parts; raises InputError."""
 
     def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
         """The best constant prediction of a receiver's observations [n, ...], all finite: by default their mean."""

@@ -22,7 +22,7 @@ from .config import AdamConfig, DensityConfig, LoopConfig
 
 @dataclass(frozen=True)
 class Schedule:
-    """Schedule of a fit."""
+    """Rows and learning rates of each step of a fit."""
 
     rows: IntArray  # rows of each step's batch, [steps, batch]
     receiver: IntArray  # receiver of each step, [steps]
@@ -39,10 +39,7 @@ class Schedule:
         return sum(step >= start for start in self.stages)
 
     def after(self, best: int) -> tuple[Schedule, int]:
-        """The schedule that continues from the best state before the validation rows join.
-
-        Args:
-            best: step of that state.
+        """The schedule that continues from the best state, of step ``best``, before the validation rows join.
 
         Returns:
             Schedule whose learning rates fall in fewer steps, in proportion to ``best``, and the first of these steps.
@@ -68,15 +65,9 @@ def plan(
     """The schedule of a fit, a function of settings, rows and seed only: a resumed run gets the same.
 
     Each epoch visits every row once at every receiver that observed it, in random order; a batch belongs to one
-    receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch.
-
-    Args:
-        config: settings.
-        train: rows (conditions) of each receiver that train while validation rows are held out.
-        everything: rows of each receiver with the validation rows.
-        rng: generator of the order of rows.
-        density: steps after which a round of density control follows.
-        stages: first steps of the stages after the first.
+    receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch. ``train`` are
+    rows (conditions) of each receiver that train while validation rows are held out, ``everything`` all of them;
+    ``density`` and ``stages`` as in `Schedule`.
 
     Raises:
         InputError: a receiver without rows that train.
@@ -103,8 +94,8 @@ def plan(
 
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
-    """Factor of the learning rates: a linear warm-up, and half a cosine."""
-    # Adam's moments are sums of few gradients at first, and full rates would follow their noise: hence the warm-up.
+    # A linear warm-up, and half a cosine. Adam's moments are sums of few gradients at first, and full rates would
+    # follow their noise: hence the warm-up.
     t, final = np.arange(steps), optimiser.final
     flat = round(optimiser.cosine_start * steps)
     cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
@@ -123,12 +114,10 @@ def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Gen
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
     counts = [len(of_receiver) // batch for of_receiver in rows]
-    epochs = -(-steps // sum(counts))
     batches, owners = [], []
-    for _ in range(epochs):
-        chosen = np.concatenate(
-            [rng.permutation(r)[: n * batch].reshape(n, batch) for r, n in zip(rows, counts, strict=True)]
-        )
+    for _ in range(-(-steps // sum(counts))):
+        drawn = [rng.permutation(r)[: n * batch].reshape(n, batch) for r, n in zip(rows, counts, strict=True)]
+        chosen = np.concatenate(drawn)
         # Batches of all receivers in turn: a receiver at a time would be forgotten while the others train.
         order = rng.permutation(len(chosen))
         batches.append(chosen[order])
@@ -161,11 +150,8 @@ class NonFiniteReport:
 
 
 def watched_groups(names: Iterable[str]) -> list[str]:
-    """Names of the parameters that `NonFiniteReport` watches, in its order, after the loss.
-
-    Parameters of Gaussians and of the traced side are watched directly, a layer through its bias, whose gradient is the
-    sum of all gradients that reach the layer.
-    """
+    """Names of the parameters that `NonFiniteReport` watches, in its order, after the loss."""
+    # A layer is watched through its bias, whose gradient is the sum of all gradients that reach the layer.
     return [n for n in names if "." not in n or n.endswith(".bias") or n.startswith(TRACED_NAMES)]
 
 
@@ -200,15 +186,7 @@ class ScheduledStep:
 def guarded_step(
     adam: Adam, params: Params, loss: Any, mean: Params, step: ScheduledStep
 ) -> tuple[Params, NonFiniteReport, Any]:
-    """Differentiate a loss of ``params`` (`rated_params`) and take a step of Adam in place, unless a value is or was
-    not finite.
-
-    Args:
-        adam: optimiser that owns the parameters.
-        params: parameters, which hold gradients afterwards.
-        loss: loss, one value.
-        mean: running mean of the parameters.
-        step: numbers of the step, and the report so far.
+    """Differentiate a loss of ``params`` (`rated_params`) and step in place, unless a value is or was not finite.
 
     Returns:
         Running mean, report, and whether the step was taken; all unevaluated.

@@ -39,11 +39,7 @@ def write_checkpoint(folder: Path, loop: TrainingLoop, beside: Mapping[str, NDAr
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of ``checkpoint.npz``.
-
-    Raises:
-        InputError: missing, damaged, or of another format version.
-    """
+    """Arrays of ``checkpoint.npz`` (InputError: missing, damaged, or of another format version)."""
     path = folder / CHECKPOINT
     missing = f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume"
     with readable(path, missing, "restore it or train anew"):
@@ -108,7 +104,6 @@ def cut_log(folder: Path, step: int) -> None:
 
 
 def _step_of(line: bytes) -> int | None:
-    """Step of a line of the log; None if it is damaged."""
     try:
         at = json.loads(line)["step"]
     except (ValueError, TypeError, KeyError, RecursionError):

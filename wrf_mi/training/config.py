@@ -53,8 +53,7 @@ class LoopConfig(CheckedSettings):
 _OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}
 
 
-def _chosen(options: Any) -> list[str]:
-    """Settings that are not null, as ``--set`` takes them."""
+def _chosen(options: Any) -> list[str]:  # settings that are not null, as ``--set`` takes them
     values = {name: getattr(options, name) for name in _OPTIONAL}
     return [f"{name}={value}" for name, value in values.items() if value is not None]
 
@@ -207,11 +206,6 @@ class TrainConfig(LoopConfig):
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
-        """Refuse values that no fit can use.
-
-        Raises:
-            InputError: naming the setting.
-        """
         super().__post_init__()
         sources = [name for name in ("points", "mesh", "paths") if getattr(self.initial, name)]
         if len(sources) > 1:
@@ -280,9 +274,7 @@ JOINT: Mapping[str, tuple[str, ...]] = {"rssi": JOINT_STRENGTHS, "csi": JOINT_ON
 
 
 def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
-    """Settings of a task that differ from `TrainConfig`, as ``--set`` takes them; ``image``: whether observations are
-    images.
-    """
+    """Settings of a task that differ from `TrainConfig`; ``image``: whether observations are images."""
     # Images are the papers' task: `TrainConfig` has their settings.
     if image:
         return JOINT_IMAGES if with_scene else ()
@@ -295,11 +287,7 @@ def default_config(task: str, with_scene: bool = False) -> TrainConfig:
 
 
 def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:
-    """The settings of a fit of paths alone.
-
-    Args:
-        parts: names in `CALIBRATED` of what is fitted; the other parts are held.
-        images: whether observations are images.
+    """The settings of a fit of paths alone, of the parts of `CALIBRATED`; ``images``: whether observations are images.
 
     Raises:
         InputError: no part, or an unknown one.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -64,14 +65,7 @@ class Request:
 
 
 class Evaluator(ABC):
-    """Evaluates reports of a graph with one set of parameters.
-
-    Args:
-        graph: Gaussians, paths and receivers.
-
-    Attributes:
-        params: parameters, Dr.Jit tensors.
-    """
+    """Evaluates reports of a graph with one set of parameters, Dr.Jit tensors."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -87,16 +81,12 @@ class Evaluator(ABC):
 
 
 class _InBatches(Evaluator):
-    """Evaluates batches of transmitters by functions of Dr.Jit, recorded where it can record them.
-
-    Attributes:
-        recordings: recorded functions by their names and numbers of transmitters.
-    """
+    """Evaluates batches of transmitters by functions of Dr.Jit, recorded where it can record them."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__(graph)
         self._places, self._count = places_of(graph), 0
-        self.recordings: dict[tuple[Hashable, int], Recorded] = {}
+        self.recordings: dict[tuple[Hashable, int], Recorded] = {}  # by names and numbers of transmitters
 
     def update(self, params: Params) -> None:
         """Replace the parameters (Dr.Jit tensors)."""
@@ -125,17 +115,13 @@ class _InBatches(Evaluator):
     def _evaluated(self, request: Request) -> Any:
         """Flat report of a batch, a Dr.Jit array."""
 
-    def _plain(self, report: Report, request: Request, **signal: Any) -> Any:
-        """A report that is not recorded."""
+    def _not_recorded(self, report: Report, request: Request, **signal: Any) -> Any:
         place = self._places[request.port]
         return evaluated(report, self.params, request.condition.T, place, request.slots, request.weight, **signal)
 
     def _may_record(self, size: int) -> bool:
-        """Whether functions of Gaussians are recorded for batches of a size.
-
-        Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
-        room for all: neither is for very many Gaussians.
-        """
+        # Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
+        # room for all: neither is for very many Gaussians.
         return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
 
     def _recorded(
@@ -178,23 +164,17 @@ class _InBatches(Evaluator):
 class SplattedReports(_InBatches):
     """Reports of Gaussians alone, splatted."""
 
-    @property
-    def _pixels(self) -> bool:
-        return self.graph.form.receiver == PIXEL
-
     def _batch_size(self, numbers: int) -> int:
         # An image of thousands of pixels fills the processors, and one recording serves any number of transmitters.
-        return 1 if self._pixels else TOGETHER
+        return 1 if self.graph.form.receiver == PIXEL else TOGETHER
 
     def _evaluated(self, request: Request) -> Any:
         size, port = self._batch_size(1), request.port
         if not self._may_record(size):
-            return self._plain(self.graph.report(port, None, chunked=True), request)
+            return self._not_recorded(self.graph.report(port, None, chunked=True), request)
         # One recording serves the pixels of all ports, whose poses are arguments.
-        name = "report", None if self._pixels else port
-        return self._recorded(
-            name, size, self.graph.report(port, None), request, partial(self.graph.arrays, port, None)
-        )
+        name, read = ("report", None if size == 1 else port), partial(self.graph.arrays, port, None)
+        return self._recorded(name, size, self.graph.report(port, None), request, read)
 
 
 class TracedReports(_InBatches):
@@ -223,7 +203,7 @@ class TracedReports(_InBatches):
             name = "signal", port if self.graph.moves else None
             signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
         report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
-        return self._plain(report, request, signal=signal)
+        return self._not_recorded(report, request, signal=signal)
 
     def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
         """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""
@@ -243,11 +223,8 @@ class OperatorReports(Evaluator):
 
         operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
 
-    The file is a cache: its key is a digest of all that the weights depend on, including the package's version.
-
-    Args:
-        graph: Gaussians whose geometry and attenuation do not depend on the transmitter.
-        store: folder of the files; None: in memory only.
+    The file, in the folder ``store`` unless that is None, is a cache: its key is a digest of all that weights depend
+    on, including the package's version. Geometry and attenuation of Gaussians must not depend on the transmitter.
     """
 
     def __init__(self, graph: Graph, store: Path | None) -> None:
@@ -271,11 +248,7 @@ class OperatorReports(Evaluator):
             vars(self).pop(derived, None)
 
     def __call__(self, request: Request) -> NDArray[np.float32]:
-        """Magnitudes [m, height, width].
-
-        Raises:
-            MemoryError: weights of more than `MOST_BYTES`.
-        """
+        """Magnitudes [m, height, width] (MemoryError: weights of more than `MOST_BYTES`)."""
         receiver, (factors, coefficients) = request.port, self._signals
         if receiver not in self._ready:
             operator = PixelOperator(self._weights(receiver), *self.graph.form.size)
@@ -307,17 +280,10 @@ class OperatorReports(Evaluator):
             pose, plane = device_pose(self.graph.receivers[receiver]), perception_plane(*size, mi.Float)
             weights = pixel_weights(gaussians, pose, plane, MOST_BYTES)
         if path is not None:
-            write_weights(path, key, weights)
+            parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+            with suppress(OSError):  # a run in a folder of someone else is predicted all the same
+                write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
         return weights
-
-
-def write_weights(path: Path, key: str, weights: csr_array) -> None:
-    """Store weights if the folder can be written."""
-    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
-    try:
-        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
-    except OSError:  # a run in a folder of someone else is predicted all the same
-        return
 
 
 def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:

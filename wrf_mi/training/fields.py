@@ -35,13 +35,10 @@ def field_of(config: TrainConfig, form: Form) -> Field | None:
 
 
 def make_field(config: TrainConfig, components: int = 1, features: int = 0, carrier: bool = False) -> Field:
-    """The field of a configuration.
+    """The field of a configuration, of ``components`` complex signals of a Gaussian.
 
-    Args:
-        config: settings.
-        components: complex signals of a Gaussian.
-        features: number of features that describe a transmitter instead of its position; 0: its position.
-        carrier: whether networks see the carrier.
+    ``features`` is the number of those that describe a transmitter instead of its position; 0: its position.
+    ``carrier``: whether networks see the carrier.
 
     Raises:
         InputError: no trainable model of that name, unsuitable settings, or an unresolved scale of transmitters.
@@ -52,12 +49,10 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
     if not e.tx_scale_m:
         raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
     plus = model == "wrf-gs+"
-    for wrong, text in (
-        (n.static_geometry and not plus, f"static_geometry: {model} always moves signals alone"),
-        (n.terms and model != "factorised", f"terms: {model} has none"),
-    ):
-        if wrong:
-            raise InputError(f"setting network.{text}; omit it")
+    if n.static_geometry and not plus:
+        raise InputError(f"setting network.static_geometry: {model} always moves signals alone; omit it")
+    if n.terms and model != "factorised":
+        raise InputError(f"setting network.terms: {model} has none; omit it")
     sizes: dict[str, Any] = {name: getattr(n, name) for name in ("width", "layers", "terms") if getattr(n, name)}
     if model == "wrf-gs" and n.width:
         sizes["signal_widths"] = (n.width, max(1, n.width // 2))
@@ -76,12 +71,7 @@ def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
 
 
 def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
-    """Refuse parameters of a file that are not those of a field: the backend ends the process on other shapes.
-
-    Args:
-        field: the field; None: paths alone.
-        params: parameters by name, those of paths included.
-        source: file, for messages.
+    """Refuse parameters of a file ``source`` that are not those of a field and of paths, or of paths alone.
 
     Raises:
         InputError: a parameter that is missing, of another shape, or not finite.
@@ -91,6 +81,7 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
             raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
     if field is None:
         return
+    # The backend ends the process on other shapes.
     count = params["position"].shape[1] if "position" in params else 0
     for name, shape in _shapes(field).items():
         wanted = (shape[0], count) if name in field.per_gaussian else shape
@@ -101,11 +92,7 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
 
 
 def check_memory(config: TrainConfig, field: Field) -> None:
-    """Refuse a training step that does not fit into memory.
-
-    Raises:
-        InputError: naming the settings to lower.
-    """
+    """Refuse a training step that does not fit into memory; raises InputError."""
     density = config.density
     # Of the largest field that density control may grow, so that no fit ends in its middle.
     count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)

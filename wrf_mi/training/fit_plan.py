@@ -50,7 +50,7 @@ class Targets:
         return 1 if self.carriers_hz is None else len(self.carriers_hz)
 
     def at(self, port: int, conditions: IntArray) -> IntArray:
-        """Those of the conditions that have a port's carrier."""
+        """Those of some conditions that have a port's carrier."""
         return conditions if self.carrier is None else conditions[self.carrier[conditions] == port % self.carriers]
 
     def conditions(self, rows: IntArray) -> IntArray:
@@ -65,9 +65,7 @@ class Targets:
     @cached_property
     def _complete(self) -> NDArray[np.bool_]:
         """Whether each receiver observed each condition [n_rx, c]; of images it takes long, and is asked for often."""
-        return np.stack(
-            [np.isfinite(of_receiver).all(axis=tuple(range(1, of_receiver.ndim))) for of_receiver in self.truth]
-        )
+        return np.asarray(np.isfinite(self.truth).all(axis=tuple(range(2, self.truth.ndim))))
 
 
 def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
@@ -103,15 +101,12 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
 
 
 def _weights(record: Record, rows: IntArray) -> FloatArray | None:
-    """Inverse standard deviation of the noise, with a mean of 1 over the training rows' observations; 1 in other rows.
-
-    Differences become standardised residuals: an absolute error is weighted by 1 / std, a squared one by 1 / variance.
-    """
+    # Inverse standard deviation of the noise, 1 in other rows: differences become standardised residuals, an absolute
+    # error is weighted by 1 / std, a squared one by 1 / variance.
     precision = record.precision(rows)
     if precision is None:
         return None
-    weight = np.ones(record.observation.shape[:2])
-    inverse = np.sqrt(precision)
+    weight, inverse = np.ones(record.observation.shape[:2]), np.sqrt(precision)
     # A mean of 1, so that learning rates and losses compare with those of unweighted rows.
     weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
     return weight
@@ -137,8 +132,7 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
         raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
     name = default if config.receiver == AUTO else config.receiver
     receiver_kind(name, task.name)
-    view = config.view.height, config.view.columns
-    size = tuple(map(int, record.observation.shape[-2:])) if task.image else view
+    height, width = map(int, record.observation.shape[-2:] if task.image else (config.view.height, config.view.columns))
     basis = _basis(targets, rows, config.view.components) if task.is_complex else None
     outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
     features = 0 if record.uplink is None or with_scene else len(targets.condition)
@@ -147,24 +141,13 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
     # The tracer finds no path through many walls; what was measured there is the weakest of all.
     floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
-    return Form(
-        name,
-        (size[0], size[1]),
-        record.frequencies_hz,
-        outputs,
-        basis,
-        features,
-        headings,
-        floor_db,
-        targets.carriers_hz,
-    )
+    size, carriers_hz = (height, width), targets.carriers_hz
+    return Form(name, size, record.frequencies_hz, outputs, basis, features, headings, floor_db, carriers_hz)
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
-    """Principal components [components, outputs] of the training rows' channels, without subtraction of the mean.
-
-    Receivers have equal weight, as scores are relative.
-    """
+    """Principal components [components, outputs] of the training rows' channels, without subtraction of the mean."""
+    # Receivers have equal weight, as scores are relative.
     power: NDArray[np.complex128] | float = 0.0
     for receiver in range(len(targets.truth)):
         pairs = targets.truth[receiver, targets.received(receiver, rows)].astype(float)
@@ -180,11 +163,7 @@ CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
 
 
 def check_rows(split: Split, record: Record, source: str) -> None:
-    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message.
-
-    Raises:
-        InputError: such a row.
-    """
+    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message; raises InputError."""
     rows = np.concatenate([split.train, split.validation, split.test])
     bad = rows[(rows < 0) | (rows >= len(record))]
     if len(bad):
@@ -195,16 +174,11 @@ class FitPlan:
     """Data, graph and schedule of a fit, a function of its arguments, those of `wrf_mi.training.trainer.Trainer`.
 
     Attributes:
-        record, split: data.
-        task: task of the record.
         config: settings with number of steps and scale of transmitters.
-        targets: conditions and observations.
-        graph: Gaussians, paths and receivers.
         stages: names of the stages in their order.
         in_groups: whether the state is chosen on rows held out in groups, far from the training rows too.
         choosing: split of these rows; ``split`` itself where there are none.
         unjudged: whether the training rows do not suffice for such groups.
-        schedule: rows and learning rates of each step.
         known: slots of the traced sides by port: conditions that train or choose at its carrier.
 
     Raises:
@@ -260,7 +234,6 @@ class FitPlan:
         return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, heading, carrier)]
 
     def _stage_names(self) -> tuple[str, ...]:
-        """Stages in their order: paths, Gaussians on surfaces, those of the field if there is one."""
         if self.graph.scene is None:
             return (FIELD,)
         traced = self.config.traced
@@ -270,10 +243,8 @@ class FitPlan:
     def _planned(self) -> Schedule:
         """The schedule, in which each port learns from its receiver's observations."""
         config, targets = self.config, self.targets
-        everything, train = (
-            [targets.received(port, rows) for port in range(targets.ports)]
-            for rows in (self.choosing.all_train, self.choosing.train)
-        )
+        parts, ports = (self.choosing.all_train, self.choosing.train), range(targets.ports)
+        everything, train = ([targets.received(port, rows) for port in ports] for rows in parts)
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
         alone, end = config.traced.alone, config.holdout_steps_fraction

@@ -41,9 +41,6 @@ class Predictor:
         store: folder in which operators are stored; None: in memory only.
         reach: region in which the Gaussians are used; None: everywhere.
         phase_error: see `wrf_mi.graph.graph.Graph.report`.
-
-    Attributes:
-        evaluate: evaluates transmitters whose paths are known.
     """
 
     def __init__(
@@ -88,8 +85,7 @@ class Predictor:
     def gaussians(self, tx_pos_m: ArrayLike, log_carrier: float = 0.0) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame.
 
-        ``log_carrier`` is the logarithm of the carrier over the middle one of training (`Graph.log_carrier`), for
-        fields that were trained on several carriers; others ignore it.
+        ``log_carrier`` is that of `Graph.log_carrier`, for fields that were trained on several carriers.
         """
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
         # Fields of several carriers have the carrier as a last input.
@@ -125,9 +121,12 @@ class Predictor:
                 used, or no such receiver.
         """
         index, form = receiver_index(self.receivers, receiver), self.graph.form
-        # Antennas of an uplink are independent inputs, without positions and paths.
         if form.features:
-            return self._by_uplink(uplink, index)
+            # Antennas of an uplink are independent inputs, without positions and paths.
+            features, divisor = normalised_uplink(known_uplink(uplink))
+            reports = self._reported(np.asarray(features, float), index).reshape(*divisor.shape, -1)
+            channels = reports * divisor[..., None]
+            return (channels if len(form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
         positions = np.asarray(tx_pos_m, float)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
@@ -156,13 +155,6 @@ class Predictor:
         parts = (None if part is None else part[rows] for part in (record.uplink, headings, record.carriers_hz))
         return self(record.tx_pos_m[rows], receiver, *parts)
 
-    def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
-        """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
-        features, divisor = normalised_uplink(known_uplink(uplink))
-        reports = self._reported(np.asarray(features, float), receiver)
-        channels = reports.reshape(*divisor.shape, -1) * divisor[..., None]
-        return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
-
     def decompose(
         self,
         tx_pos_m: FloatArray,
@@ -170,9 +162,7 @@ class Predictor:
         tx_heading_rad: FloatArray | None = None,
         carriers_hz: FloatArray | None = None,
     ) -> tuple[dict[str, NDArray[Any]], PathStatistics]:
-        """Reports with a scene's paths, by sides, and statistics of the paths, from one search.
-
-        Arguments as those of a call with finite positions.
+        """Reports with a scene's paths, by sides, and statistics of the paths, from one search; arguments as of a call.
 
         Returns:
             ``whole`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.report`), [m, ...], NaN where Gaussians
@@ -196,10 +186,7 @@ class Predictor:
     def _sides(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
     ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
-        """Groups of positions: their numbers, predictor and port, and traced side.
-
-        Positions at several carriers are in the same group, as are all without a scene.
-        """
+        """Groups of positions: their numbers, predictor and port, and traced side; without a scene one group."""
         order = np.arange(len(tx_pos_m))
         size = SEARCHED if self.graph.scene is not None else max(len(order), 1)
         if self.graph.scene is not None and carriers_hz is not None:
@@ -230,10 +217,7 @@ class Predictor:
     def _reported(
         self, conditions: FloatArray, port: int, side: TracedField | None = None, slots: IntArray | None = None
     ) -> NDArray[Any]:
-        """Reports for positions [m, 3] or features [m, features], complex numbers as such.
-
-        ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
-        """
+        """Reports for positions [m, 3] or features [m, features], with paths of ``side`` in its rows ``slots`` [m]."""
         slots = np.arange(len(conditions)) if slots is None else slots
         weight = None if self.reach is None else self.reach.weight(conditions, port // self.graph.carriers)
         if weight is not None and not weight.all():

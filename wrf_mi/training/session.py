@@ -49,11 +49,7 @@ class FitSession:
         self.on_progress(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
 
     def report(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
-        """Report progress of a fit without checkpoints.
-
-        Raises:
-            Interrupted: the stop condition holds.
-        """
+        """Report progress of a fit without checkpoints (Interrupted: the stop condition holds)."""
         self.tell(stage, share, progress)
         if self.stop():
             raise self.interrupted(f"in {stage}")

@@ -28,7 +28,7 @@ from ..graph.settings import TRACED_NAMES
 from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
 from .fit_plan import FIELD, FitPlan, Targets
-from .state import FitState
+from .loop import FitState
 
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
@@ -104,13 +104,9 @@ class TrainingData:
 class Steps:
     """Optimiser steps of a fit, recorded by port where the evaluation of the Gaussians allows it.
 
-    Args:
-        plan: data and graph of the fit.
-        sides: traced side of each port; None without a scene.
-        loss: loss of a batch.
+    ``sides`` are the traced sides of the ports, None without a scene; ``loss`` is that of a batch.
 
     Attributes:
-        loss: loss of a batch.
         places: places of the ports.
         recorded: functions that take a step, by what they depend on beside their arguments.
     """

@@ -24,10 +24,9 @@ from .config import TrainConfig
 from .fields import check_params
 from .fit_plan import SURFACES, FitPlan
 from .initial import starting_values
-from .loop import TrainingLoop
+from .loop import FitState, TrainingLoop
 from .predictor import Predictor
 from .selection import improves
-from .state import FitState
 from .step import Loss, Steps
 
 PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a reflection knows nothing of its phase
@@ -44,11 +43,7 @@ class HeldOutReports:
 
 
 class StageSelection:
-    """Scores and reports of a fit's held-out rows.
-
-    Args:
-        plan: data, graph and schedule of the fit.
-        sides: traced side of each port; None without a scene.
+    """Scores and reports of a fit's held-out rows; ``sides`` are the traced sides of the ports, None without a scene.
 
     Attributes:
         scores: scores of the held-out rows at the last validation, port by port.
@@ -77,18 +72,15 @@ class StageSelection:
         """
         plan, rows = self.plan, self._held_out(bool(state.chosen))
         if plan.graph.corrects:
-            self.scores = self._corrected_scores(predict, state, rows)
+            each = [self._corrected_scores(predict, state, rows)]
         elif plan.graph.scene is not None:
             each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
-            self.scores = np.concatenate([np.zeros(0), *each])
         else:
             record, validation, score = plan.record, plan.split.validation, plan.task.training_score
             receivers = range(len(record.receivers)) if len(validation) else ()
-            each = [
-                np.ravel(score(predict.of_rows(record, validation, r), record.observation[r, validation]))
-                for r in receivers
-            ]
-            self.scores = np.concatenate([np.zeros(0), *each])
+            reports = [predict.of_rows(record, validation, r) for r in receivers]
+            each = [np.ravel(score(reports[r], record.observation[r, validation])) for r in receivers]
+        self.scores = np.concatenate([np.zeros(0), *each])
         return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
 
     def _held_out(self, chosen: bool) -> list[IntArray]:
@@ -106,7 +98,6 @@ class StageSelection:
         return np.asarray(self.plan.record.observation[port // self.plan.graph.carriers, rows])
 
     def _scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
-        """Scores of `_reports`."""
         reports = self._reports(predict, port, rows, weight)
         return np.ravel(self.plan.task.training_score(reports, self._observed(port, rows)))
 
@@ -121,12 +112,10 @@ class StageSelection:
             # Before the last stage the field has not been trained.
             trained = plan.schedule.stage(state.step - 1) == len(plan.schedule.stages)
             lengths = reach.lengths(positions_m) if trained else [0.0]
-
-        def score(port: int, weight: NDArray[np.float32]) -> NDArray[np.float64]:
-            return self._scores(predict, port, rows[port], weight)
-
         # The state keeps the reach with which it is scored, so that the best state has the best reach.
-        state.reach_m, scores = choose_reach(reach, lengths, positions_m, score, self._higher)
+        state.reach_m, scores = choose_reach(
+            reach, lengths, positions_m, lambda port, w: self._scores(predict, port, rows[port], w), self._higher
+        )
         return scores
 
     def keep_stated(self, state: FitState) -> None:
@@ -279,11 +268,7 @@ class Trainer(TrainingLoop):
 
     @property
     def field(self) -> Field:
-        """The Gaussians of the graph.
-
-        Raises:
-            ValueError: it has none.
-        """
+        """The Gaussians of the graph (ValueError: it has none)."""
         if self.graph.field is None:
             raise ValueError("paths are trained alone: there are no Gaussians")
         return self.graph.field
@@ -294,9 +279,7 @@ class Trainer(TrainingLoop):
         self._predictor = None
 
     def _restore_paths(self) -> None:
-        """Restore the paths of the state: a receiver that training moves is searched from its position at the last
-        search.
-        """
+        # A receiver that training moves is searched from its position at the last search.
         sides = [side for side in self.sides if side is not None]
         if sides and not len(self.state.searched_m):
             self.state.searched_m = np.stack([side.searched_at_m for side in sides])
@@ -328,9 +311,7 @@ class Trainer(TrainingLoop):
         return self.selection.score(self.predictor(), self.state)
 
     def choose(self, score: float) -> bool:
-        """Early stopping (`TrainingLoop`); beside paths by `StageSelection.stage_score`, and only the last stage ends
-        early.
-        """
+        """Early stopping (`TrainingLoop`), beside paths by `StageSelection.stage_score` and in the last stage alone."""
         if self.plan.in_groups and len(self.selection.scores):
             score = self.selection.stage_score(self.state)
         # A stage may end without a gain and the next one still have some: patience counts in the last stage alone.
@@ -363,8 +344,7 @@ class Trainer(TrainingLoop):
 
     def adapt(self) -> None:
         """One round of density control."""
-        density, state = self.config.density, self.state
-        names = self.field.per_gaussian
+        density, state, names = self.config.density, self.state, self.field.per_gaussian
         params = {name: values for name, values in state.params().items() if name in names}
         receivers = np.stack([r.position_m for r in self.plan.record.receivers])
         # Of the nearest receiver, which sees the Gaussian largest.
@@ -377,7 +357,6 @@ class Trainer(TrainingLoop):
         change = adapt(params, gradient, distance, rng, density.growth_fraction, most)
         state.change_density(change)
         self.record_functions()
-        rounds = sorted(self.schedule.density)
-        every = density.reset_every
+        rounds, every = sorted(self.schedule.density), density.reset_every
         if every and "opacity" in names and (rounds.index(state.step) + 1) % every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"]))

@@ -29,9 +29,8 @@ from ...training.config import PRESETS, TrainConfig, task_settings
 from ...training.fields import check_params, field_of
 from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians
-from ...training.loop import Progress
+from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
-from ...training.state import FitState
 from ...training.trainer import HeldOutReports, Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 

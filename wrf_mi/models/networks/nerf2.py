@@ -41,9 +41,17 @@ from ...training.config import AdamConfig
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
-from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
-from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
+from .training import (
+    Coordinates,
+    Network,
+    NetworkSettings,
+    columns,
+    feature_count,
+    network_adam,
+    opaque_rows,
+    train_network,
+)
 
 DB_UNIT = 10.0  # unit of the loss of signal strengths, dB
 POINTS_PER_CHUNK = 1 << 15  # points whose attenuation is evaluated together in predictions

@@ -35,10 +35,9 @@ from ...tasks.conditions import real_parts
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Problem, slices
-from ..networks.layers import Linear, Mlp, Module, columns
-from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
+from ..networks.training import Linear, Mlp, Module, Network, NetworkSettings, columns, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, UplinkModel, bands_of, relative_error
+from .uplink_waves import Bands, UplinkModel, bands_of, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory

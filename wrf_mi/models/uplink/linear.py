@@ -28,7 +28,7 @@ from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
-from .csi_bands import UplinkModel, relative_error
+from .uplink_waves import UplinkModel, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -71,11 +71,7 @@ class Normal:
 
     @classmethod
     def of(cls, record: Record, rows: IntArray) -> Normal:
-        """The normal equations of some rows.
-
-        Raises:
-            InputError: rows without any downlink energy.
-        """
+        """The normal equations of some rows (InputError: rows without any downlink energy)."""
         assert record.uplink is not None
         up, down = record.uplink.shape[2], record.observation.shape[3]
         left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)

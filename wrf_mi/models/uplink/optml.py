@@ -36,12 +36,19 @@ from ...training.config import AdamConfig
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Inputs, Problem, slices
-from ..networks.layers import Linear, Module, columns
-from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
-from .csi_bands import Bands, UplinkModel
+from ..networks.training import (
+    Linear,
+    Module,
+    Network,
+    NetworkSettings,
+    columns,
+    network_adam,
+    opaque_rows,
+    train_network,
+)
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
-from .uplink_waves import ArrayWaves, Complex, Mask, Waves, waves_of
+from .uplink_waves import ArrayWaves, Bands, Complex, Mask, UplinkModel, Waves, waves_of
 
 FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
 BLUR = 1.0  # width of a path in the map to be learned, in cells

@@ -39,9 +39,8 @@ from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
-from .csi_bands import Bands, UplinkModel, bands_of, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
-from .uplink_waves import Complex, Waves, waves_of
+from .uplink_waves import Bands, Complex, UplinkModel, Waves, bands_of, principal_axes, relative_error, waves_of
 
 CHUNK_SIZE = 256  # positions that are traced together
 LENGTH_SD_M, COSINE_SD = 0.3, 0.03
