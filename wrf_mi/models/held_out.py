@@ -15,18 +15,16 @@ from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
-from ..training.loop import Progress
 from ..training.selection import HeldOut
 from .model import Fitted, Model, Problem, Session, inputs_of
 
 
 def labelled(session: Session, label: str) -> Session:
-    """A session that reports progress under a label."""
-
-    def on_progress(stage: str, share: float, progress: Progress | None = None, /) -> None:
-        session.on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
-
-    return replace(session, on_progress=on_progress)
+    """A session that reports progress under a label, without that of optimiser steps."""
+    on_progress = session.on_progress
+    return replace(
+        session, on_progress=lambda stage, share, *_: on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
+    )
 
 
 def fit_model(entry: Model, problem: Problem, split: Split, session: Session) -> tuple[Fitted, Problem]:
@@ -38,11 +36,7 @@ def fit_model(entry: Model, problem: Problem, split: Split, session: Session) ->
 
 
 def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:
-    """A model fitted to a fold of the training rows, at the receivers that have enough of them in the fold.
-
-    Returns:
-        The fitted model, and the numbers of its receivers among those of the problem, ascending.
-    """
+    """A model fitted to a fold of the training rows, and the numbers of the receivers with enough, ascending."""
     numbers, left_out = fitted_receivers(problem.record, [fold])
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
@@ -71,20 +65,9 @@ def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[An
 def held_out_predictions(
     entry: Model, problem: Problem, fold: Split, held: HeldOut, session: Session, name: str
 ) -> Prediction:
-    """Predictions of held-out observations by a model that is fitted to the rest.
+    """Predictions [q, ...] of held-out observations of a fold by a model that is fitted to the other rows.
 
-    They are kept in the session's folder; a stopped fit goes on with them.
-
-    Args:
-        entry: model.
-        problem: data, scene and settings.
-        fold: split of `wrf_mi.training.selection.hold_out`.
-        held: its held-out observations, or some of them.
-        session: folder for files, progress callback and stop condition.
-        name: name of the model for the progress callback.
-
-    Returns:
-        Mean and, where the model states it, standard deviation, [q, ...].
+    They are kept in the session's folder; a stopped fit goes on with them. ``name`` is for the progress callback.
 
     Raises:
         InputError: rows that the model cannot be fitted to.

@@ -59,15 +59,13 @@ class Problem:
 
         record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         if self.left_out:
-            record = record.at_receivers(
-                [k for k, each in enumerate(record.receivers) if each.name not in self.left_out]
-            )
+            names = [receiver.name for receiver in record.receivers]
+            record = record.at_receivers([k for k, name in enumerate(names) if name not in self.left_out])
         return record.with_antennas(self.antennas)
 
     @cached_property
     def opened_scene(self) -> Any | None:
-        """The scene (``sionna.rt.Scene``) at the record's carrier, or the middle one of its rows, opened on first
-        access, or None.
+        """The scene (``sionna.rt.Scene``) at the record's carrier, or the middle one of its rows, or None.
 
         Raises:
             InputError: it cannot be opened, or the carrier is unknown.
@@ -238,21 +236,16 @@ class Model(ABC):
 
 
 def default_settings(model: Model, settings: Iterable[str], arguments: Mapping[str, Any]) -> Any:
-    """Settings of a model with ``key=value`` applied after its defaults.
+    """Settings of a model, as `Model.serving` gives it, with ``key=value`` applied after its defaults.
 
-    Args:
-        model: model, as `Model.serving` gives it.
-        settings: ``key=value``.
-        arguments: arguments of `wrf_mi.train` that may be settings, too (`Model.train_arguments`).
+    ``arguments`` are those of `wrf_mi.train`, some of which are settings, too (`Model.train_arguments`).
     """
     stated = {key: arguments[key] for key in model.train_arguments if arguments.get(key) is not None}
     return with_settings(model.settings(**stated), [*model.defaults, *settings])
 
 
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
-    """Rows that a receiver received: those that train at first, and those that choose settings.
-
-    Without the former, the latter train.
+    """Rows that a receiver received: those that train, and those that choose settings; without the former these train.
 
     Raises:
         InputError: fewer than two rows.

@@ -154,11 +154,7 @@ class Task(ABC):
 
 
 def carrier_hz(record: Record, stated_in: str) -> FloatArray:
-    """Frequencies of a record with known positions, as ray tracing needs; ``stated_in`` names key and file of them.
-
-    Raises:
-        InputError: an unknown position or frequency.
-    """
+    """Frequencies of a record, `InputError` if these or positions are unknown; ``stated_in`` names key and file."""
     positions = [record.tx_pos_m, *(receiver.position_m for receiver in record.receivers)]
     if not all(np.isfinite(position_m).all() for position_m in positions):
         raise InputError(f"{record.name}: positions unknown, so there is nothing to trace between; use another method")
@@ -175,6 +171,7 @@ class Spectrum(Task):
     axes, image = 2, True
     receiver, receiver_with_scene = "pixel", "array"
     heading, quantity = "spatial spectra", "grey"
+    score, mixtures = staticmethod(ssim), staticmethod(ssim_mixtures)
     level_kind = "relative"
     level_note = (
         "mean of the squared grey values over the solid angle of the upper hemisphere, relative to a spectrum of ones; "
@@ -185,10 +182,6 @@ class Spectrum(Task):
         "SSIM is scikit-image's structural similarity with a data range of one; IDW averages the four nearest "
         "training spectra by inverse squared distance."
     )
-
-    def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """Structural similarity (`wrf_mi.tasks.scores.ssim`)."""
-        return ssim(prediction, truth)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """Loss of the papers (`wrf_mi.tasks.losses.spectrum_loss`)."""
@@ -202,17 +195,12 @@ class Spectrum(Task):
         weight = solid_angles(height, width)
         return level_of_amplitudes(prediction, weight / weight.sum())
 
-    def mixtures(self, predictions: NDArray[Any], truth: NDArray[Any]) -> MixtureScores:
-        """Structural similarity on windows that do not overlap (`wrf_mi.tasks.scores.ssim_mixtures`)."""
-        return ssim_mixtures(predictions, truth)
-
     def training_score(self, prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
         """Structural similarity on the device, equal to scikit-image's."""
         from ..backend.device import to_float
         from .losses import ssim as on_device
 
-        shape = np.shape(truth)
-        scores = on_device(to_float(prediction), to_float(truth), shape[0], shape[1], shape[2])
+        scores = on_device(to_float(prediction), to_float(truth), *np.shape(truth))
         return np.asarray(scores.numpy(), float)
 
     def instrument(self, record: Record) -> SpectrumInstrument:
@@ -229,6 +217,7 @@ class Rssi(Task):
 
     name = "rssi"
     block, label, higher_is_better = "abs_error_db", "absolute error (dB)", False
+    score = staticmethod(abs_error_db)
     axes, in_decibel = 0, True
     receiver = receiver_with_scene = "power"
     # Best of 0 to 1.6 m in a tenfold cross-validation, in the order of time, on flat-ble's training run.
@@ -239,14 +228,6 @@ class Rssi(Task):
         "The absolute error in dB counts rows that were received; IDW averages the 100 nearest training rows "
         "that the same receiver received by inverse squared distance, 0.4 m added."
     )
-
-    def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """Absolute error (`wrf_mi.tasks.scores.abs_error_db`)."""
-        return abs_error_db(prediction, truth)
-
-    def level(self, prediction: Prediction) -> Prediction:
-        """The received power in dBm itself."""
-        return prediction
 
     def unit(self, observed: NDArray[Any]) -> float:
         """Ten decibels: errors are then of the size that the learning rates expect."""
@@ -263,6 +244,7 @@ class Csi(Task):
 
     name = "csi"
     block, label, higher_is_better = "cea_db", "CEA (dB)", True
+    score = staticmethod(cea_db)
     limits = -10.0, 40.0
     axes, more_axes, is_complex = 1, 1, True
     receiver = receiver_with_scene = "csi"
@@ -276,14 +258,9 @@ class Csi(Task):
         "uplink takes each antenna's uplink coefficients for the downlink's."
     )
 
-    def score(self, prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
-        """Channel estimation accuracy (`wrf_mi.tasks.scores.cea_db`)."""
-        return cea_db(prediction, truth)
-
     def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
-        """Zero, whose accuracy is 0 dB: over some wavelengths of positions the phase takes every value, and the mean of
-        few training rows is what chance has left.
-        """
+        """Zero, whose accuracy is 0 dB."""
+        # Over some wavelengths of positions the phase takes every value: the mean of few training rows is chance.
         return np.zeros(observed.shape[1:], observed.dtype)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
@@ -318,20 +295,14 @@ class Csi(Task):
         if len(shape) not in (3, 4):
             text = "expected [receivers, rows, subcarriers] or [receivers, rows, antennas, subcarriers]"
             raise InputError(f"{source}: channel coefficients {list(shape)}; {text}")
-        frequencies = record.frequencies_hz
-        if frequencies is not None and len(frequencies) not in (1, shape[-1]):
-            raise InputError(_differ(source, "", shape[-1], len(frequencies)))
-        if record.uplink is None:
-            return
-        antennas = shape[2] if len(shape) == 4 else 1
-        if record.uplink.ndim != 3 or record.uplink.shape[:2] != (shape[1], antennas):
-            raise InputError(
-                f"{source}: uplink {list(record.uplink.shape)} beside a downlink of {shape[1]} rows and {antennas} "
-                "antennas; give both for the same ones"
-            )
-        if record.uplink_hz is not None and len(record.uplink_hz) != record.uplink.shape[2]:
-            raise InputError(_differ(source, "uplink ", record.uplink.shape[2], len(record.uplink_hz)))
-
-
-def _differ(source: str, what: str, subcarriers: int, frequencies: int) -> str:
-    return f"{source}: {subcarriers} {what}subcarriers and {frequencies} frequencies; give one for each"
+        counts = [("", shape[-1], record.frequencies_hz, {1, shape[-1]})]
+        if record.uplink is not None:
+            uplink, antennas = record.uplink.shape, shape[2] if len(shape) == 4 else 1
+            if len(uplink) != 3 or uplink[:2] != (shape[1], antennas):
+                text = f"a downlink of {shape[1]} rows and {antennas} antennas; give both for the same ones"
+                raise InputError(f"{source}: uplink {list(uplink)} beside {text}")
+            counts.append(("uplink ", uplink[2], record.uplink_hz, {uplink[2]}))
+        for link, subcarriers, stated_hz, allowed in counts:
+            if stated_hz is not None and len(stated_hz) not in allowed:
+                text = f"{subcarriers} {link}subcarriers and {len(stated_hz)} frequencies; give one for each"
+                raise InputError(f"{source}: {text}")

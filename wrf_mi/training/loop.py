@@ -20,59 +20,33 @@ from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
 
 Arrays = dict[str, NDArray[Any]]
-KEPT = (
-    "step",
-    "chosen",
-    "view_gradient_norm",
-    "view_gradient_steps",
-    "reach_m",
-    "searched_m",
-    "surface",
-    "phase_error",
-)
+VIEW_GRADIENT = ("view_gradient_norm", "view_gradient_steps")
+OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")  # belong to a fit, not to one of its states
+KEPT = ("step", "chosen", *VIEW_GRADIENT, "reach_m", "searched_m", "surface", "phase_error", *OF_FIT)
 """Attributes that a checkpoint stores under their names."""
-OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")
-"""Further ones that belong to a fit, not to one of its states."""
 
 
 class FitState:
-    """Parameters under optimisation.
-
-    Args:
-        params: starting values.
-        momentum: Adam's decay of the first moment.
-
-    Attributes:
-        adam: Dr.Jit's optimiser, which owns the current parameters.
-        mean: running mean of the parameters, used for evaluation.
-        step: steps taken.
-        view_gradient_norm: sum since the last round of density control of each Gaussian's directional gradient, [n].
-        view_gradient_steps: steps in that sum.
-        reach_m: reach of the Gaussians around training transmitters, metres (`Reach`); may be infinite.
-        searched_m: position of each receiver at the last search for paths, [n_rx, 3], metres; empty without a scene.
-        surface: whether Gaussians on surfaces are trained.
-        phase_error: standard deviation of a reflection's phase in predictions, rad (`Graph.report`), once chosen.
-        baseline: scores of the held-out rows by the best state before the present stage, [rows]; empty where there is
-            none.
-        best_scores: those by the best state.
-        stage_scores: best mean score of the held-out rows in each stage so far; empty where none is chosen.
-        held_out: reports of the held-out rows by the chosen state; empty where none is chosen.
-        chosen: step from which the fit went on (`LoopConfig.patience`); 0: none was chosen.
-        best: arrays of the state with the best validation score, or None.
-        best_score: its score, the higher the better; kept once the fit went on from it.
-        waited: number of scores since then.
-    """
+    """Parameters under optimisation, from starting values; ``momentum``: Adam's decay of the first moment."""
 
     def __init__(self, params: Mapping[str, NDArray[np.float32]], momentum: float = 0.9) -> None:
-        self.adam = Adam(lr=0.0, beta_1=momentum)
+        self.adam = Adam(lr=0.0, beta_1=momentum)  # owns the current parameters
         self.adam.update({name: to_tensor(values) for name, values in params.items()})
+        # Running mean of the parameters, used for evaluation.
         self.mean = {name: to_tensor(values) for name, values in params.items()}
-        self.step = self.chosen = 0
-        self.reach_m, self.searched_m = float(np.inf), np.zeros((0, 3))
-        self.surface, self.phase_error, self.baseline = False, 0.0, np.zeros(0)
-        self.best_scores, self.stage_scores, self.held_out = np.zeros(0), np.zeros(0), np.zeros(0)
-        self.best: Arrays | None = None
-        self.best_score, self.waited = -np.inf, 0
+        self.step = 0  # steps taken
+        self.chosen = 0  # step from which the fit went on (`LoopConfig.patience`); 0: none was chosen
+        self.reach_m = float(np.inf)  # reach of the Gaussians around training transmitters (`Reach`)
+        self.searched_m = np.zeros((0, 3))  # position of each receiver at the last search for paths; empty: no scene
+        self.surface = False  # whether Gaussians on surfaces are trained
+        self.phase_error = 0.0  # standard deviation of a reflection's phase in predictions, rad, once chosen
+        # Scores of the held-out rows by the best state before the present stage, and by the best state.
+        self.baseline, self.best_scores = np.zeros(0), np.zeros(0)
+        self.stage_scores = np.zeros(0)  # best mean score of the held-out rows in each stage so far
+        self.held_out = np.zeros(0)  # reports of the held-out rows by the chosen state
+        self.best: Arrays | None = None  # arrays of the state with the best validation score
+        self.best_score = -np.inf  # its score, the higher the better; kept once the fit went on from it
+        self.waited = 0  # number of scores since then
         self._reset_view_gradient()
 
     @property
@@ -81,6 +55,7 @@ class FitState:
         return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
 
     def _reset_view_gradient(self) -> None:
+        # Sum since the last round of density control of each Gaussian's directional gradient, [n], and its steps.
         self.view_gradient_norm, self.view_gradient_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
         dr.make_opaque(self.view_gradient_norm)  # a literal would be recorded as a constant
 
@@ -162,7 +137,7 @@ class FitState:
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
         flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
-        attributes = {name: np.array(getattr(self, name)) for name in (*KEPT, *OF_FIT)}
+        attributes = {name: np.array(getattr(self, name)) for name in KEPT}
         return flat | attributes | {"adam_step": np.asarray(count)}
 
     @classmethod
@@ -175,7 +150,7 @@ class FitState:
         state = cls(group("param/"), momentum)
         state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
         state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
-        for name in (*KEPT, *OF_FIT):
+        for name in KEPT:
             setattr(state, name, np.array(arrays[name]) if np.ndim(arrays[name]) else arrays[name].item())
         state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
         state.best = group("best/") or None

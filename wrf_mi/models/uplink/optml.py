@@ -79,18 +79,15 @@ def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
 def simulate(
     waves: Waves, simulation: Simulation, bands: Bands, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Maps of simulated channels and of their paths, each [n, distances, cells].
-
-    The number of paths, their directions, phases and powers in decibels are uniform; so are distances, or with
-    spherical waves their logarithms.
-    """
+    """Maps of simulated channels and of their paths, each [n, distances, cells]."""
+    # The number of paths, their directions, phases and powers in decibels are uniform; so are distances, or with
+    # spherical waves their logarithms.
     filtered, truth = [], []
-    axes = waves.cosines.shape[1]
-    near = max(float(waves.grid[0]), 0.0)
+    axes, k = waves.cosines.shape[1], simulation.paths
+    near, far = max(float(waves.grid[0]), 0.0), float(waves.grid[-1])
     for chunk in slices(simulation.channels, CHUNK_SIZE):
-        n, k = chunk.stop - chunk.start, simulation.paths
+        n = chunk.stop - chunk.start
         present = np.arange(k) < rng.integers(1, k + 1, (n, 1))
-        far = float(waves.grid[-1])
         d = near * (far / near) ** rng.random((n, k)) if waves.spherical else rng.uniform(near, far, (n, k))
         cosines = rng.standard_normal((n, k, axes))
         if axes:
@@ -99,9 +96,8 @@ def simulate(
         theta = np.concatenate([d[..., None], cosines], axis=2)
         level = -simulation.decay_db * rng.random((n, k))
         level[:, 0] = 0
-        gains = 10 ** (level / 20) * np.exp(2j * np.pi * rng.random((n, k))) * present
+        gains = (10 ** (level / 20) * np.exp(2j * np.pi * rng.random((n, k))) * present)[..., None]
         h = np.empty((n, bands.antennas, len(bands.uplink_hz)), complex)
-        gains = gains[..., None]
         if not isinstance(waves, ArrayWaves):
             gains = gains * (rng.standard_normal((n, k, bands.antennas, 2)) @ np.array([1, 1j]) / np.sqrt(2))
         for row in range(n):
@@ -216,10 +212,9 @@ class OptML(R2F2):
 
     def paths(self, h: Complex, inputs: Inputs) -> Paths:
         """Paths of uplinks [m, antennas, f]."""
-        s, waves = self.settings, self.waves
+        s, waves, residual = self.settings, self.waves, h
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))
         present: Mask = np.zeros((len(h), 0), bool)
-        residual = h
 
         def pruned(rows: slice) -> tuple[FloatArray, Mask, Complex]:
             return prune(waves, h[rows], theta[rows], present[rows], s.between, s.max_paths)

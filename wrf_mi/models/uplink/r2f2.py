@@ -160,10 +160,10 @@ def choose(
     on_progress: OnProgress,
     directions: bool = False,
 ) -> tuple[str, Bands]:
-    """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
+    """The wave model and the bands whose extrapolation fits the downlink of validation rows best in the median.
 
-    The criterion is the median over rows and antennas. Of ``rows`` that train and that validate, the latter decide
-    where there are any. ``directions``: among the wave models whose paths have a direction.
+    Of ``rows`` that train and that validate, the latter decide where there are any. ``directions``: among the wave
+    models whose paths have a direction.
 
     Raises:
         InputError: as `bands_of`, or a wave front that needs elements where there are none.
@@ -173,21 +173,13 @@ def choose(
     if directions and (first.elements_m is None or settings.wavefront == "free"):
         text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
         raise InputError(f"{record.name}: {text}; give them or omit the scene")
-    if first.elements_m is None:
-        if settings.wavefront in ("spherical", "plane"):
-            raise InputError(
-                f"{record.name}: {settings.wavefront} waves need the array's elements and the frequencies; "
-                "give both or choose wavefront=free"
-            )
-        kinds: tuple[str, ...] = ("free",)
-    else:
-        kinds = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
-    kinds = tuple(kind for kind in kinds if not directions or kind != "free")
-    options = [
-        (kind, bands)
-        for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
-        for kind in kinds
-    ]
+    if first.elements_m is None and settings.wavefront in ("spherical", "plane"):
+        text = "waves need the array's elements and the frequencies; give both or choose wavefront=free"
+        raise InputError(f"{record.name}: {settings.wavefront} {text}")
+    every = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
+    kinds = [kind for kind in every if not directions or kind != "free"] if first.elements_m is not None else ["free"]
+    known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
+    options = [(kind, bands) for bands in known for kind in kinds]
     if len(options) == 1:  # nothing to choose, and no row needs a downlink
         return options[0]
     judges = validation if len(validation) else train

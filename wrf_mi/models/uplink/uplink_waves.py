@@ -26,9 +26,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..model import Model, received_rows
 
+# Share of an array's largest extent along an axis below which phases of a few degrees do not resolve the direction.
 FLAT = 0.01
-"""Share of an array's largest extent along a principal axis below which phases of a few degrees do not resolve the
-wave's direction along that axis."""
 
 
 @dataclass(frozen=True)
@@ -162,8 +161,7 @@ def _solve(gram: Complex, right: Complex, size: float) -> Complex:
     return np.asarray(np.linalg.solve(loaded, right))
 
 
-def _turn(angle: FloatArray) -> Complex:
-    """exp(-j angle): twice as fast as the exponential of complex numbers."""
+def _turn(angle: FloatArray) -> Complex:  # exp(-j angle), twice as fast as the exponential of complex numbers
     turned = np.empty(angle.shape, complex)
     np.cos(angle, out=turned.real)
     np.sin(-angle, out=turned.imag)
@@ -174,16 +172,9 @@ class Waves:
     """Paths with a delay that all antennas share and a gain for each antenna; base of waves at known elements.
 
     Parameters of paths are [n, paths, p], present paths marked in [n, paths].
-
-    Attributes:
-        freedom: real numbers that describe a path, gains included.
-        grid: distances of the grid, ascending, metres.
-        cosines: directions of the grid [cells, p - 1].
-        lattice: indices of these on the lattice of directions, [cells, p - 1].
-        spherical: whether waves are spherical.
     """
 
-    spherical = False
+    spherical = False  # whether waves are spherical
 
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
         self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
@@ -193,9 +184,10 @@ class Waves:
         reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
         count = max(int(np.ceil(reach / (speed_of_light / width / FINE))), 1)
         self.grid = np.linspace(-reach, reach, 2 * count + 1)
+        # Directions of the grid [cells, p - 1], and their indices on the lattice of directions.
         self.cosines, self.lattice = np.zeros((1, 0)), np.zeros((1, 0), np.int64)
         self.steering = np.exp(self.grid[:, None] * self.slope)
-        self.freedom = 1 + 2 * bands.antennas
+        self.freedom = 1 + 2 * bands.antennas  # real numbers that describe a path, gains included
 
     @cached_property
     def around(self) -> NDArray[np.int64]:
@@ -257,10 +249,8 @@ class ArrayWaves(Waves):
         # An image source inside the array would make the distance's slope infinite.
         self.near = 0.6 * 2 * float(np.sqrt(self.square.max(initial=0.0)))
         wavelength = speed_of_light / self.reference_hz
-        points = []
-        for axis in range(axes):
-            half_cells = 2 * float(np.ptp(self.elements[:, axis])) / wavelength
-            points.append(np.linspace(-1, 1, int(min(2 * np.ceil(half_cells) + 1, AXIS_POINTS))))
+        half_cells = 2 * np.ptp(self.elements, axis=0) / wavelength
+        points = [np.linspace(-1, 1, int(min(2 * np.ceil(half) + 1, AXIS_POINTS))) for half in half_cells]
         where = np.array(list(np.ndindex(*(len(p) for p in points))), np.int64).reshape(-1, axes)
         cosines = np.stack([p[where[:, axis]] for axis, p in enumerate(points)], axis=-1) if axes else np.zeros((1, 0))
         visible = np.square(cosines).sum(axis=1) <= 1.01  # directions of real angles, those of the grid's rim included
@@ -269,13 +259,11 @@ class ArrayWaves(Waves):
             # Curvature changes with 1 / d near the array, delay with d far from it.
             bends = 1 / np.linspace(1 / max_distance_m, 1 / max(self.near, 1e-3), 9)[1:]
             self.grid = np.sort(np.concatenate([self.grid[self.grid > max(self.near, 1e-3)], bends]))
-        self._steering = [self._towards(d) for d in (self.grid if spherical else self.grid[:1])]
-
-    def _towards(self, distance_m: float) -> Complex:
-        """Matched filters at one distance in all directions, [antennas, directions], of unit length."""
-        theta = np.concatenate([np.full((1, len(self.cosines), 1), distance_m), self.cosines[None]], axis=-1)
-        steering = self.atoms(theta, np.array([self.reference_hz]))[0, :, :, 0].conj().T
-        return np.asarray(steering / np.linalg.norm(steering, axis=0))
+        self._steering = []  # matched filters at each distance in all directions, [antennas, directions], of length 1
+        for distance_m in self.grid if spherical else self.grid[:1]:
+            theta = np.concatenate([np.full((1, len(self.cosines), 1), distance_m), self.cosines[None]], axis=-1)
+            steering = self.atoms(theta, np.array([self.reference_hz]))[0, :, :, 0].conj().T
+            self._steering.append(np.asarray(steering / np.linalg.norm(steering, axis=0)))
 
     def _phase(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Distance, projections p . psi [n, k, a] and, of spherical waves, distances s from the elements."""
@@ -330,10 +318,8 @@ class ArrayWaves(Waves):
         return constant, factor
 
     def power(self, residual: Complex) -> FloatArray:
-        """Power of a residual in each cell of the grid, [n, distances, cells].
-
-        Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
-        """
+        """Power of a residual in each cell of the grid, [n, distances, cells]."""
+        # Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
         k = 2 * np.pi / speed_of_light
         beat = np.exp(-1j * k * self.grid[:, None] * (self.frequencies - self.reference_hz))
         combined = residual @ beat.conj().T
