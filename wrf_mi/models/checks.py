@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
-    """Refuse a record that a model does not serve, naming ``others`` that do, or whose parts do not fit together.
-
-    Raises:
-        InputError: another task, no uplink, several carriers where the model serves one; or as `check_parts`.
-    """
+    """Refuse a record that a model does not serve, naming ``others`` that do; or as `check_parts`."""
     place, able = place_of(record), [other for other in others if other.serves(record.task)]
     if not method.serves(record.task):
         *most, last = method.tasks or ("nothing",)

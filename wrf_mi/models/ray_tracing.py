@@ -117,11 +117,7 @@ class FittedTracing(Fitted):
         return Prediction(self._of_rows[1][receiver])
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Predictions of a receiver; positions are traced for all receivers together.
-
-        Raises:
-            InputError: a position inside a solid object.
-        """
+        """Predictions of a receiver (InputError: inside a solid); all receivers are traced together."""
         return self.decompose(inputs, receiver).whole
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
@@ -260,11 +256,7 @@ class RayTracing(Model):
     gaps = GAPS
 
     def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
-        """Train the calibrated parameters; or trace all rows, unless a fold has, and fit offsets of signal strengths.
-
-        Raises:
-            InputError: a receiver without a training row that a path reaches.
-        """
+        """Train the calibrated parameters; or trace all rows, unless a fold has, and fit offsets of strengths."""
         if problem.settings.calibration is not None:
             graph = WRF_GS_PLUS.fit(_graph_problem(problem), split, session)
             if _changes_scene(problem):

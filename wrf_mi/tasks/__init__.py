@@ -24,11 +24,7 @@ def task_of(record: Record) -> Task:
 
 
 def instrument_of(record: Record) -> Instrument:
-    """The instrument of a record, for ray tracing.
-
-    Raises:
-        InputError: an unknown task, or data without positions, carrier or array.
-    """
+    """The instrument of a record (InputError: an unknown task, position, carrier or array)."""
     return task_of(record).instrument(record)
 
 

@@ -71,11 +71,7 @@ def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
 
 
 def outputs_of(record: Record) -> Outputs:
-    """The outputs for a record.
-
-    Raises:
-        InputError: different numbers of antennas in uplink and downlink, or an uplink beside several receivers.
-    """
+    """The outputs for a record (InputError: other antennas than the uplink's, or several receivers beside one)."""
     if not task_of(record).is_complex:
         known = record.frequencies_hz
         return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
@@ -128,11 +124,7 @@ def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
 
 
 def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> FloatArray | None:
-    """Headings [count] of transmitters, radians; None where a model does not use them.
-
-    Raises:
-        InputError: headings that are missing, not used, of another shape or not finite.
-    """
+    """Headings [count] of transmitters, radians, None for models that use none (InputError: unsuitable ones)."""
     if (heading_rad is not None) != used:
         unused = "does not know how the transmitter is turned; omit heading_rad"
         raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")

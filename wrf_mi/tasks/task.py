@@ -63,11 +63,7 @@ class Task(ABC):
 
     @abstractmethod
     def instrument(self, record: Record) -> Instrument:
-        """The instrument of a record of this task, for ray tracing.
-
-        Raises:
-            InputError: the data lack positions, carrier or array.
-        """
+        """The instrument of a record, for ray tracing (InputError: no positions, carrier or array)."""
 
     def level(self, prediction: Prediction) -> Prediction:
         """Level of predictions or observations of one receiver, for maps (`level_kind`); a single number is its own.

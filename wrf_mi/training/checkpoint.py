@@ -72,11 +72,7 @@ def _check_state(path: Path, arrays: Mapping[str, NDArray[Any]], lead: str) -> N
 
 
 def checkpoint_seconds(folder: Path) -> float:
-    """Training time up to the checkpoint in a folder; 0 without a checkpoint.
-
-    Raises:
-        InputError: damaged, or of another format version.
-    """
+    """Training time up to the checkpoint in a folder, 0 without one; errors as `read_checkpoint`."""
     return float(read_checkpoint(folder)["seconds"]) if (folder / CHECKPOINT).exists() else 0.0
 
 

@@ -24,11 +24,7 @@ MOST_NUMBERS = (1 << 32) - 1  # most numbers of an array of Dr.Jit
 
 
 def field_of(config: TrainConfig, form: Form) -> Field | None:
-    """The field of a configuration for observations of a form; None: paths are trained alone.
-
-    Raises:
-        InputError: as `make_field`.
-    """
+    """The field for observations of a form (`make_field`); None: paths are trained alone."""
     if config.model == PATHS_ALONE:
         return None
     return make_field(config, form.components, form.features, form.carriers_hz is not None)
@@ -71,11 +67,7 @@ def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
 
 
 def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
-    """Refuse parameters of a file ``source`` that are not those of a field and of paths, or of paths alone.
-
-    Raises:
-        InputError: a parameter that is missing, of another shape, or not finite.
-    """
+    """Refuse parameters of a file ``source`` that are missing, not finite, or of other shapes than the field's."""
     for name, values in params.items():
         if values.dtype.kind != "f" or not np.isfinite(values).all():
             raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")

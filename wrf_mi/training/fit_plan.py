@@ -121,11 +121,7 @@ def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
-    """Form of a record's observations by the settings; its basis is computed from the training ``rows``.
-
-    Raises:
-        InputError: a receiver model of another task, or antennas of unknown positions beside a scene.
-    """
+    """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
     task = task_of(record)
     default = task.receiver_with_scene if with_scene else task.receiver
     if not default:
@@ -220,11 +216,7 @@ class FitPlan:
         return self.in_groups and self.graph.scene is not None
 
     def traced(self) -> list[TracedField | None]:
-        """Traced side of the training rows at each port; None without a scene.
-
-        Raises:
-            InputError: a transmitter or receiver inside a solid.
-        """
+        """Traced side of the training rows at each port, None without a scene (InputError: positions in a solid)."""
         record, rows, form = self.record, self.split.all_train, self.graph.form
         self.graph.check(record.tx_pos_m)
         headings = record.tx_heading_rad if form.headings else None

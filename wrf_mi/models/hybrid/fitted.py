@@ -90,36 +90,24 @@ STATED, PREDICTED = "stated", "predicted"
 """Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
 
 
+@dataclass(eq=False)
 class FittedHybrid(Fitted):
-    """A fitted hybrid.
+    """A fitted hybrid."""
 
-    Args:
-        problem: problem of the hybrid.
-        known: training rows that determine distances [n].
-        parts: fitted parts with a weight, by name.
-        mixture: weights of these parts, and, if there are ``residuals``, of the scene's side with them as the last.
-        residuals: what the scene's side leaves; None: it has no weight.
-        intervals: standard deviations; None: none are stated.
-        facts: further entries of ``metrics.json``.
-    """
+    problem: Problem  # problem of the hybrid
+    known: IntArray  # training rows that determine distances [n]
+    parts: dict[str, Fitted]  # fitted parts with a weight, by name
+    mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene's side with them as the last
+    residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
+    intervals: Intervals | None  # standard deviations; None: none are stated
+    stated: dict[str, Any]  # further entries of ``metrics.json``
 
-    def __init__(
-        self,
-        problem: Problem,
-        known: IntArray,
-        parts: Mapping[str, Fitted],
-        mixture: Mixture,
-        residuals: Residuals | None,
-        intervals: Intervals | None,
-        facts: dict[str, Any],
-    ) -> None:
-        self._problem, self._known, self._facts = problem, known, facts
-        self._distance = RowDistance.of_rows(problem.record, known)
-        self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
+    def __post_init__(self) -> None:
+        self._distance = RowDistance.of_rows(self.problem.record, self.known)
 
     @property
     def _states_sizes(self) -> bool:
-        return bool(self._facts["sizes"] == STATED)
+        return bool(self.stated["sizes"] == STATED)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
@@ -131,7 +119,7 @@ class FittedHybrid(Fitted):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; parts use what they have stored."""
-        record = self._problem.record
+        record = self.problem.record
         return self._mixed(
             record.tx_pos_m[rows],
             receiver,
@@ -169,7 +157,7 @@ class FittedHybrid(Fitted):
         """Weighted mean of the parts' ``predict(part, rows)`` and of the residuals, and both sides of it."""
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
-        distance_m, observed = self._distance(tx_pos_m, receiver), self._problem.record.observation
+        distance_m, observed = self._distance(tx_pos_m, receiver), self.problem.record.observation
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self._weights(distance_m)
         residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
@@ -194,7 +182,7 @@ class FittedHybrid(Fitted):
         if len(rows) and self.residuals is not None:
             residual = self.residuals(tx_pos_m[rows], receiver, shape)
             mean[rows] += _spread(residual_weight[rows], shape) * residual
-        if task_of(self._problem.record).image:
+        if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
         if not (totals[0].any() and totals[1].any()):
@@ -216,12 +204,12 @@ class FittedHybrid(Fitted):
         if self._states_sizes:
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
             return Prediction(mean, np.maximum(size * factor, LEAST))
-        return self.intervals(mean, expected_size(task_of(self._problem.record), Prediction(mean)), distance_m)
+        return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
 
     def arrays(self) -> Arrays:
         """Weights, residuals, intervals, training rows, and the arrays of the parts."""
-        arrays: Arrays = {"known": self._known, "names": np.asarray(list(self.parts))}
-        arrays["facts"] = np.asarray(json.dumps(self._facts))
+        arrays: Arrays = {"known": self.known, "names": np.asarray(list(self.parts))}
+        arrays["facts"] = np.asarray(json.dumps(self.stated))
         arrays |= field_arrays(self.mixture, "mixture/")
         if self.intervals is not None:
             arrays |= field_arrays(self.intervals, "intervals/")
@@ -233,12 +221,12 @@ class FittedHybrid(Fitted):
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
-        side, used = self.parts.get(PATHS), [report["stage"] for report in self._facts["stages"] if report["kept"]]
-        return by_stage(self._problem, split, side, used) if isinstance(side, SceneSide) and used else {}
+        side, used = self.parts.get(PATHS), [report["stage"] for report in self.stated["stages"] if report["kept"]]
+        return by_stage(self.problem, split, side, used) if isinstance(side, SceneSide) and used else {}
 
     def facts(self) -> dict[str, Any]:
         """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
-        return self._facts
+        return self.stated
 
 
 def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:

@@ -71,11 +71,7 @@ def scene_side(record: Record) -> tuple[Model, Model]:
 
 
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
-    """Entry and problem of each part that serves the data, the trusted one first.
-
-    Raises:
-        InputError: no part serves the data, or a scene that cannot be used.
-    """
+    """Entry and problem of each part that serves the data, the trusted one first (InputError: none does)."""
     settings: HybridSettings = problem.settings
     record, task, wanted = problem.record, task_of(problem.record), settings.wanted
     parts: dict[str, tuple[Model, Problem]] = {}

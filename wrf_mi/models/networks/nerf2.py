@@ -179,11 +179,7 @@ class Field(Fitted):
         return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
-
-        Raises:
-            InputError: fitted to uplink channels, and there are none.
-        """
+        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers]."""
         network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
         if self._points is None or self._points[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
@@ -225,11 +221,7 @@ class Field(Fitted):
         return np.concatenate(blocks)
 
     def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
-        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
-
-        Raises:
-            InputError: no uplink, where one is needed.
-        """
+        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels."""
         if self.outputs.by_uplink:
             features, divisor = conditions.normalised_uplink(conditions.known_uplink(inputs.uplink))
             return to_tensor(features.T), divisor
@@ -329,11 +321,7 @@ class Nerf2Model(Model):
     uplink, headings = "optional", True
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Field:
-        """Fit the networks.
-
-        Raises:
-            InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
-        """
+        """Fit the networks (InputError: unknown positions or poses, or a receiver without training rows)."""
         record, known = problem.record, split.all_train
         outputs, settings = conditions.outputs_of(record), problem.settings
         where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")

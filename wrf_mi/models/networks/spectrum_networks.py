@@ -63,11 +63,7 @@ class SpectrumNetwork(Model):
         return Network(name, module, loss, data, draw, *samples, SPECTRUM.label, SPECTRUM.higher_is_better)
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
-        """Train the networks of all receivers in turn.
-
-        Raises:
-            InputError: unknown positions, or a receiver with fewer than two rows.
-        """
+        """Train the networks of all receivers in turn (InputError: unknown positions, or fewer than two rows)."""
         record, settings, seed = problem.record, problem.settings, problem.seed
         coordinates = Coordinates.of(known_positions(record, split.all_train, self.name))
         generators = []

@@ -67,11 +67,7 @@ class Module:
         return self.with_state({path: to_tensor(arrays[f"{prefix}{path}"]) for path in self.state()})
 
     def check(self, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> None:
-        """Refuse other weights than those of this network: the backend ends the process on other shapes.
-
-        Raises:
-            InputError: a weight that is missing, of another shape, or not finite.
-        """
+        """Refuse weights that are missing, of another shape, or not finite: the backend would end the process."""
         for path, like in self.state().items():
             weight = arrays.get(f"{prefix}{path}")
             if weight is None or weight.shape != tuple(like.shape) or not np.isfinite(weight).all():
@@ -223,11 +219,7 @@ class Network:
 
 
 class NetworkTrainer(TrainingLoop):
-    """Training loop of a network, from its initial weights or from the ``state`` of an interrupted training.
-
-    Raises:
-        InputError: no sample that trains.
-    """
+    """Training loop of a network, from its initial weights or from the ``state`` of an interrupted training."""
 
     def __init__(
         self, network: Network, config: LoopConfig, seed: Sequence[int], state: FitState | None = None

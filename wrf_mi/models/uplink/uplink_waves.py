@@ -94,11 +94,7 @@ class UplinkModel(Model):
     uplink, headings = "required", True
 
     def known_rows(self, record: Record, split: Split) -> tuple[IntArray, IntArray]:
-        """Rows that train at first, and rows that choose settings, see `wrf_mi.models.model.received_rows`.
-
-        Raises:
-            InputError: several receivers, no axis of antennas, or fewer than two rows.
-        """
+        """Rows that train, and rows that choose settings (`received_rows`); InputError: not one array of antennas."""
         shape = record.observation.shape
         if len(shape) != 4 or shape[0] != 1:
             raise InputError(
