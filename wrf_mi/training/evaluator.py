@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,7 +29,7 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
 from ..core.types import IntArray
 from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
-from ..gaussians.operator import Coefficients, Images, PixelOperator, pixel_weights, static_signals
+from ..gaussians.operator import Images, PixelOperator, pixel_weights, static_signals
 from ..gaussians.parameters import CHUNK_SIZE
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph, Report
@@ -232,20 +232,11 @@ class OperatorReports(Evaluator):
         self._store, self._field = store, cast(Field, graph.field)
         self._ready: dict[int, Images | PixelOperator] = {}
 
-    @cached_property
-    def _arrays(self) -> dict[str, NDArray[np.float32]]:
-        return {name: dr.detach(values).numpy() for name, values in self.params.items()}
-
-    @cached_property
-    def _signals(self) -> tuple[NDArray[np.complex64] | None, Coefficients]:
-        return static_signals(self._field, self._arrays)
-
     def update(self, params: Params) -> None:
         """Replace the parameters; operators are built anew at the next prediction."""
         super().update(params)
-        self._ready = {}
-        for derived in ("_arrays", "_signals"):
-            vars(self).pop(derived, None)
+        self._arrays = {name: dr.detach(values).numpy() for name, values in params.items()}
+        self._signals, self._ready = static_signals(self._field, self._arrays), {}
 
     def __call__(self, request: Request) -> NDArray[np.float32]:
         """Magnitudes [m, height, width] (MemoryError: weights of more than `MOST_BYTES`)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -229,7 +230,7 @@ class Predictor:
             # Channels are zero without Gaussians, and nothing has to be evaluated.
             if self.graph.scene is None:
                 return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
-        return self.of_side(conditions, port, side, slots, weight)
+        return self.of_side(Request(conditions, port, side, slots, weight))
 
     def _of_one_side(self, tx_pos_m: FloatArray, port: int, side: TracedField, alone: Alone) -> NDArray[Any]:
         """Reports of one side alone, NaN where Gaussians are out of reach."""
@@ -238,22 +239,15 @@ class Predictor:
         used = np.arange(len(tx_pos_m))
         if alone == "learned" and weight is not None:
             used = np.flatnonzero(weight)
-        reports = self.of_side(tx_pos_m[used], port, side, used, None if weight is None else weight[used], alone)
+        weight = None if weight is None else weight[used]
+        reports = self.of_side(Request(tx_pos_m[used], port, side, used, weight, alone))
         spread = np.full((len(tx_pos_m), *reports.shape[1:]), np.nan, reports.dtype)
         spread[used] = reports
         return spread
 
-    def of_side(
-        self,
-        conditions: FloatArray,
-        port: int,
-        side: TracedField | None,
-        slots: IntArray,
-        weight: NDArray[Any] | None,
-        alone: Alone | None = None,
-    ) -> NDArray[Any]:
-        """Predictions, as of `__call__`, for transmitters whose paths are known (`Request`)."""
-        request = Request(conditions, port, side, slots, weight, alone, self.phase_error)
+    def of_side(self, request: Request) -> NDArray[Any]:
+        """Predictions, as of `__call__`, for transmitters whose paths are known, with the phase error of the model."""
+        request = replace(request, phase_error=self.phase_error)
         try:
             reports = self.evaluate(request)
         except MemoryError as error:

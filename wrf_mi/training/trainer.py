@@ -21,8 +21,8 @@ from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach, choose_reach
 from .config import TrainConfig
-from .fields import check_params
-from .fit_plan import SURFACES, FitPlan
+from .evaluator import Request
+from .fit_plan import SURFACES, FitPlan, check_params
 from .initial import starting_values
 from .loop import FitState, TrainingLoop
 from .predictor import Predictor
@@ -92,7 +92,7 @@ class StageSelection:
         """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
         # Sides hold all training rows, held-out ones too: scores need no further search for paths.
         slots = np.searchsorted(self.plan.known[port], rows)
-        return predict.of_side(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight)
+        return predict.of_side(Request(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight))
 
     def _observed(self, port: int, rows: IntArray) -> NDArray[Any]:
         return np.asarray(self.plan.record.observation[port // self.plan.graph.carriers, rows])
@@ -119,21 +119,16 @@ class StageSelection:
         return scores
 
     def keep_stated(self, state: FitState) -> None:
-        """Keep the state that a fit starts from, as the best one so far.
-
-        Trained parameters of paths may fit few rows and be wrong elsewhere: the stated ones are kept where they score
-        better.
-        """
+        """Keep the state that a fit starts from, as the best one so far."""
+        # Trained parameters of paths may fit few rows and be wrong elsewhere: stated ones stay where they are better.
         if len(self.scores):
             score = float(np.nanmean(self.scores))
             state.keep_best(score if self._higher else -score)
             state.best_scores = self.scores
 
     def stage_score(self, state: FitState) -> float:
-        """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before.
-
-        A mean has less variance than a median. The best mean score of the present stage is noted in the state.
-        """
+        """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before."""
+        # A mean has less variance than a median. The best mean score of the present stage is noted in the state.
         plan, score = self.plan, float(np.nanmean(self.scores))
         if not len(state.stage_scores):
             state.stage_scores = np.full(len(plan.stages), np.nan)

@@ -26,8 +26,7 @@ from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
-from ...training.fields import check_params, field_of
-from ...training.fit_plan import FitPlan
+from ...training.fit_plan import FitPlan, check_params, field_of
 from ...training.initial import initial_gaussians
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor

@@ -19,8 +19,7 @@ from ...training.selection import RowDistance, rows_at_receiver
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed, under
-from .paths import by_stage
-from .scene_side import SceneSide
+from .scene_side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
 LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]

@@ -1,7 +1,7 @@
 """The model ``hybrid``: one fit in stages, from a scene's paths to interpolation of what they leave.
 
-Stages 1 to 5 (`wrf_mi.models.hybrid.paths`) predict from the scene, the last one interpolates: their residuals and the
-observations themselves, weighted by the distance to the nearest training row. One hold-out
+Stages 1 to 5 (`wrf_mi.models.hybrid.scene_side`) predict from the scene, the last one interpolates: their residuals and
+the observations themselves, weighted by the distance to the nearest training row. One hold-out
 (`wrf_mi.training.selection.hold_out`) chooses stages, weights and standard deviations.
 
 parts/  in the run folder: files of the parts
@@ -33,8 +33,7 @@ from ..checks import check_held_receivers, check_record
 from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions, under
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
-from .paths import InScene, Paths
-from .scene_side import FIELD, RESIDUAL, STAGES, SceneSide, StageReport, inside, stated_reports
+from .scene_side import FIELD, RESIDUAL, STAGES, InScene, Paths, SceneSide, StageReport, inside, stated_reports
 from .strengths import StrengthsInScene, TracedStrengths
 
 logger = logging.getLogger(__name__)
