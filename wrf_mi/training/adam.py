@@ -79,18 +79,13 @@ def plan(
     if not batch:
         beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
         raise InputError(f"no training row at one receiver{beside}: use more rows")
-    plans = [_epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)]
+    plans = _epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)
+    chosen, receiver = (np.concatenate(parts) for parts in zip(*plans, strict=True))
     t, o = np.arange(steps), config.optimiser
-    return Schedule(
-        rows=np.concatenate([rows for rows, _ in plans]),
-        receiver=np.concatenate([receiver for _, receiver in plans]),
-        factor=np.concatenate([_falling(int(part), o) for part in np.diff([0, *stages, steps])]),
-        # A young mean forgets faster, or it would be mostly the starting values.
-        decay=np.minimum(o.ema_decay, (t + 1) / (t + 10)),
-        density=density,
-        joined=joined,
-        stages=stages,
-    )
+    factor = np.concatenate([_falling(int(part), o) for part in np.diff([0, *stages, steps])])
+    # Shorten the window of the running mean early in training, or it would be mostly the starting values.
+    decay = np.minimum(o.ema_decay, (t + 1) / (t + 10))
+    return Schedule(chosen, receiver, factor, decay, density, joined, stages)
 
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:

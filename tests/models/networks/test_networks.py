@@ -27,8 +27,9 @@ from wrf_mi.models.networks.dcgan import (
     resized,
     softplus,
 )
+from wrf_mi.models.networks.layers import Coordinates, Module, columns
 from wrf_mi.models.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
-from wrf_mi.models.networks.training import Coordinates, Module, Network, NetworkSettings, NetworkTrainer, columns
+from wrf_mi.models.networks.training import Network, NetworkSettings, NetworkTrainer
 from wrf_mi.models.networks.vae import Vae, VaeSettings, elbo_loss, normal_divergence, pooled
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink
 from wrf_mi.training.adam import NumericsError

@@ -36,19 +36,9 @@ from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...gaussians.parameters import logistic
 from ...training.config import AdamConfig
+from .layers import GAIN, Linear, Module, columns, feature_count, relu
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
-from .training import (
-    GAIN,
-    Linear,
-    Module,
-    Network,
-    NetworkSettings,
-    columns,
-    feature_count,
-    network_adam,
-    opaque_rows,
-    relu,
-)
+from .training import Network, NetworkSettings, network_adam, opaque_rows
 
 NORM_FLOOR = 1e-5  # added to variances: an image may be flat
 LEVELS = 3  # convolutions of stride two in either network

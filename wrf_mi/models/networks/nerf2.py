@@ -41,17 +41,9 @@ from ...training.config import AdamConfig
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
+from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
-from .training import (
-    Coordinates,
-    Network,
-    NetworkSettings,
-    columns,
-    feature_count,
-    network_adam,
-    opaque_rows,
-    train_network,
-)
+from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 
 DB_UNIT = 10.0  # unit of the loss of signal strengths, dB
 POINTS_PER_CHUNK = 1 << 15  # points whose attenuation is evaluated together in predictions
@@ -131,11 +123,8 @@ class Field(Fitted):
         self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
     ) -> None:
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
-        self.outputs, self.task, self._shape = (
-            conditions.outputs_of(record),
-            task_of(record),
-            record.observation.shape[2:],
-        )
+        self.outputs, self.task = conditions.outputs_of(record), task_of(record)
+        self._shape = record.observation.shape[2:]
         self.networks: list[Nerf2Network] = []
         self._points: tuple[int, list[RayPoints]] | None = None
         receivers = conditions.placed_receivers(record, self.outputs.by_uplink)
@@ -149,11 +138,9 @@ class Field(Fitted):
         self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
         origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
         extent_m, frequencies_hz = float(np.abs(origins).max()) + far_m, self.outputs.frequencies_hz
-        parts = {
-            **constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz),
-            "origin": origins.T,
-            "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
-        }
+        parts = dict(constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz))
+        parts["origin"] = origins.T
+        parts["direction"] = np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T
         self.data = {name: to_tensor(values) for name, values in parts.items()}
         dr.make_opaque(self.data)  # literals would be compiled into the kernels of each receiver anew
         self.network = self.initial(np.random.default_rng(0))

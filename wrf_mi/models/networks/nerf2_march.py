@@ -32,7 +32,7 @@ from scipy.constants import speed_of_light
 
 from ...core.settings import Count, Positive
 from ...gaussians.parameters import logistic
-from .training import Linear, Mlp, Module, feature_count, relu, with_encoding
+from .layers import Linear, Mlp, Module, feature_count, relu, with_encoding
 
 LEAK = 0.01  # slope of the leaky ReLU below zero, PyTorch's default
 

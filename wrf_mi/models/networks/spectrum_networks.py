@@ -18,7 +18,8 @@ from ...tasks.losses import ssim
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
-from .training import Coordinates, Network, train_network
+from .layers import Coordinates
+from .training import Network, train_network
 
 SPECTRUM = TASKS["spectrum"]
 

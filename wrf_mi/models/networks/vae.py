@@ -26,8 +26,9 @@ from ...backend.device import to_tensor
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...gaussians.parameters import logistic
+from .layers import Linear, Mlp, Module, columns, feature_count
 from .spectrum_networks import ReceiverRows, SpectrumNetwork
-from .training import Linear, Mlp, Module, Network, NetworkSettings, columns, feature_count, opaque_rows
+from .training import Network, NetworkSettings, opaque_rows
 
 POOL = 6  # largest side of the blocks of pixels whose means the encoder sees
 NOISE = 0.1  # standard deviation of the likelihood, in grey levels from 0 to 1

@@ -35,7 +35,8 @@ from ...tasks.conditions import real_parts
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Problem, slices
-from ..networks.training import Linear, Mlp, Module, Network, NetworkSettings, columns, opaque_rows, train_network
+from ..networks.layers import Linear, Mlp, Module, columns
+from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
 from .uplink_waves import Bands, UplinkModel, bands_of, relative_error
 

@@ -36,16 +36,8 @@ from ...training.config import AdamConfig
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Inputs, Problem, slices
-from ..networks.training import (
-    Linear,
-    Module,
-    Network,
-    NetworkSettings,
-    columns,
-    network_adam,
-    opaque_rows,
-    train_network,
-)
+from ..networks.layers import Linear, Module, columns
+from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
 from .uplink_waves import ArrayWaves, Bands, Complex, Mask, UplinkModel, Waves, waves_of
