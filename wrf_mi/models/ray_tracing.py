@@ -95,7 +95,6 @@ class FittedTracing(Fitted):
 
     @cached_property
     def _tracer(self) -> RayTracer:
-        """Tracer with the number of rays of the run."""
         problem = self._problem
         assert problem.scene is not None
         options = replace(problem.settings.options, rays=int(self._arrays["rays"]))

@@ -324,7 +324,6 @@ class FitPlan:
         return (CALIBRATION, *more) if traced.alone else (more or (CALIBRATION,))[-1:]
 
     def _planned(self) -> Schedule:
-        """The schedule, in which each port learns from its receiver's observations."""
         config, targets = self.config, self.targets
         parts, ports = (self.choosing.all_train, self.choosing.train), range(targets.ports)
         everything, train = ([targets.received(port, rows) for port in ports] for rows in parts)

@@ -163,7 +163,6 @@ class _Fit:
         return FittedHybrid(self.problem, self.problem.rows(self.split), parts, mixture, residuals, intervals, stated)
 
     def _part(self, name: str) -> Fitted:
-        """A part that is fitted to all training rows."""
         if name not in self.fitted:
             place = inside(self.session, FOLDER, name)
             place.folder.mkdir(parents=True, exist_ok=True)

@@ -94,7 +94,6 @@ class Linear(Module):
         self.bias = np.zeros((outputs, 1), np.float32)
 
     def __getattr__(self, name: str) -> Any:
-        """The matrix of a named input."""
         raise AttributeError(f"layer without an input {name}")
 
     def __call__(self, *hidden: Any, **parts: Any) -> Any:

@@ -57,7 +57,6 @@ class Start:
         return cls(np.zeros((rows, 0, parameters)), np.zeros((rows, 0), bool), np.zeros((rows, 0, parameters)))
 
     def __getitem__(self, rows: slice | IntArray) -> Start:
-        """The paths of some rows."""
         return Start(self.theta[rows], self.present[rows], self.precision[rows])
 
     def joined(self, theta: FloatArray) -> Start:
