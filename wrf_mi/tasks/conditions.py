@@ -25,7 +25,7 @@ def real_parts(values: NDArray[Any]) -> NDArray[np.float32]:
     return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
 
 
-def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
+def normalised_uplink(uplink: NDArray[Any] | None) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
     """Uplink channels [m, antennas, subcarriers] as features, and the complex divisor of each.
 
     Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, which
@@ -36,8 +36,10 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
         the divisors [m, antennas].
 
     Raises:
-        InputError: an antenna without any signal in some row.
+        InputError: no uplink, or an antenna without any signal in some row.
     """
+    if uplink is None:
+        raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
     h = np.asarray(uplink, np.complex128)
     rms = np.sqrt(np.square(np.abs(h)).mean(axis=-1))
     if not (np.isfinite(rms) & (rms > 0)).all():
@@ -134,13 +136,6 @@ def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> Flo
     if heading.shape != (count,) or not np.isfinite(heading).all():
         raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
     return heading
-
-
-def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
-    """The uplink of rows to predict; an `InputError` if it is None."""
-    if uplink is None:
-        raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
-    return uplink
 
 
 def channel_scales(record: Record, rows: IntArray) -> FloatArray:

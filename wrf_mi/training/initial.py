@@ -59,7 +59,13 @@ def gaussians_from_paths(
     """
     if not len(paths):
         raise InputError("start from paths: no path arrives; trace more kinds of path, or start at random")
-    last, features = _last_points(paths, tx_pos_m, receivers)
+    bounces = paths.bounces
+    last = paths.vertices_m[np.arange(len(paths)), np.maximum(bounces - 1, 0)]
+    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
+    away = last - np.stack([receiver.position_m for receiver in receivers])[paths.rx]
+    distance = np.linalg.norm(away, axis=1)
+    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
+    features = np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
     power = np.abs(paths.gain) ** 2
     # Centres are found on a sample, as paths may be millions; every path then joins the nearest.
     drawn = rng.choice(len(paths), min(len(paths), 40 * count), replace=False)
@@ -87,17 +93,6 @@ def gaussians_from_paths(
     opacities = np.clip(opacity * (0.1 + 0.9 * relative), 1e-3, 1 - 1e-3)
     jitter = rng.standard_normal((count, 3)) * scale[:, None] * (repeated > 1)[:, None]
     return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase))
-
-
-def _last_points(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, FloatArray]:
-    """Last point of interaction of each path [n, 3], and features [n, 4] in units of a receiver's resolution."""
-    bounces = paths.bounces
-    last = paths.vertices_m[np.arange(len(paths)), np.maximum(bounces - 1, 0)]
-    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
-    away = last - np.stack([receiver.position_m for receiver in receivers])[paths.rx]
-    distance = np.linalg.norm(away, axis=1)
-    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
-    return last, np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
 
 
 def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Generator) -> InitialGaussians:

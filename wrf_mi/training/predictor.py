@@ -22,7 +22,7 @@ from ..gaussians.parameters import Gaussians
 from ..graph.graph import Alone, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
-from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
+from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
 from .adam import Params
 from .by_distance import Reach
@@ -124,7 +124,7 @@ class Predictor:
         index, form = receiver_index(self.receivers, receiver), self.graph.form
         if form.features:
             # Antennas of an uplink are independent inputs, without positions and paths.
-            features, divisor = normalised_uplink(known_uplink(uplink))
+            features, divisor = normalised_uplink(uplink)
             reports = self._reported(np.asarray(features, float), index).reshape(*divisor.shape, -1)
             channels = reports * divisor[..., None]
             return (channels if len(form.outputs) > 1 else channels[:, 0]).astype(np.complex64)

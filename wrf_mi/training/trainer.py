@@ -118,14 +118,6 @@ class StageSelection:
         )
         return scores
 
-    def keep_stated(self, state: FitState) -> None:
-        """Keep the state that a fit starts from, as the best one so far."""
-        # Trained parameters of paths may fit few rows and be wrong elsewhere: stated ones stay where they are better.
-        if len(self.scores):
-            score = float(np.nanmean(self.scores))
-            state.keep_best(score if self._higher else -score)
-            state.best_scores = self.scores
-
     def stage_score(self, state: FitState) -> float:
         """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before."""
         # A mean has less variance than a median. The best mean score of the present stage is noted in the state.
@@ -299,7 +291,10 @@ class Trainer(TrainingLoop):
         """Score the state that a fit beside paths starts from."""
         if self.plan.chooses_stages and not self.state.step and self.state.best is None:
             self.validate()
-            self.selection.keep_stated(self.state)
+            # Trained parameters of paths may fit few rows and be wrong elsewhere: better stated ones stay.
+            if len(scores := self.selection.scores):
+                self.state.keep_best(float(np.nanmean(scores)) * (1 if self.higher_is_better else -1))
+                self.state.best_scores = scores
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
@@ -325,17 +320,14 @@ class Trainer(TrainingLoop):
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""
         if self.state.step in self.schedule.stages and not self.state.chosen:
-            self._begin_stage()
+            # Go on from the best state so far; Gaussians on surfaces are trained from the second stage on.
+            self.state = self.state.next_stage()
+            begun = self.plan.stages[self.schedule.stage(self.state.step)]
+            if begun == SURFACES and self.graph.surface and not self.plan.unjudged:
+                self.state.surface = True
+            self._restore_paths()
+            self.record_functions()
         return self.steps.take(self.state, self.schedule, trouble)
-
-    def _begin_stage(self) -> None:
-        """Go on from the best state so far; Gaussians on surfaces are trained from the second stage on."""
-        self.state = self.state.next_stage()
-        begun = self.plan.stages[self.schedule.stage(self.state.step)]
-        if begun == SURFACES and self.graph.surface and not self.plan.unjudged:
-            self.state.surface = True
-        self._restore_paths()
-        self.record_functions()
 
     def adapt(self) -> None:
         """One round of density control."""

@@ -210,7 +210,7 @@ class Field(Fitted):
     def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
         """Features of transmitters for the radiance network [features, m], and the factor of predicted channels."""
         if self.outputs.by_uplink:
-            features, divisor = conditions.normalised_uplink(conditions.known_uplink(inputs.uplink))
+            features, divisor = conditions.normalised_uplink(inputs.uplink)
             return to_tensor(features.T), divisor
         s = self.settings
         where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
