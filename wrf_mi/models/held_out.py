@@ -49,12 +49,12 @@ def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int
     return fitted.predict_rows(rows, receiver) or fitted.predict(inputs_of(record, rows), receiver)
 
 
-def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[Any]:
+def as_unseen(mean: NDArray[Any], problem: Problem, held_out: HeldOut) -> NDArray[Any]:
     """Predictions [q, ...] whose errors are as large as if the scene did not know the held-out rows."""
     record, data = problem.record, read_correction_data(problem.scene)
     if data is None:
         return mean
-    observed, known = held.observed(record), data.knows(record.name, held.row)
+    observed, known = held_out.observed(record), data.knows(record.name, held_out.row)
     # The scene was corrected by these rows, too: their errors are smaller than those of rows to be predicted.
     enlarged = observed + data.error_ratio * (mean - observed)
     if task_of(record).image:
@@ -63,7 +63,7 @@ def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[An
 
 
 def held_out_predictions(
-    entry: Model, problem: Problem, fold: Split, held: HeldOut, session: Session, name: str
+    entry: Model, problem: Problem, fold: Split, held_out: HeldOut, session: Session, name: str
 ) -> Prediction:
     """Predictions [q, ...] of held-out observations of a fold by a model that is fitted to the other rows.
 
@@ -77,15 +77,15 @@ def held_out_predictions(
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
         predictions = [
-            predicted_rows(fitted, record, held.row[held.receiver == receiver], place)
+            predicted_rows(fitted, record, held_out.row[held_out.receiver == receiver], place)
             for place, receiver in enumerate(numbers)
-            if (held.receiver == receiver).any()
+            if (held_out.receiver == receiver).any()
         ]
         # Predicted receiver by receiver, while a fold may hold receivers out in any order.
-        order = np.argsort(np.argsort(held.receiver, kind="stable"), kind="stable")
+        order = np.argsort(np.argsort(held_out.receiver, kind="stable"), kind="stable")
         arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
         if predictions[0].std is not None:
             arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
         write_arrays(path, arrays)
     arrays = stored_arrays(path)
-    return Prediction(as_unseen(arrays["mean"], problem, held), arrays.get("std"))
+    return Prediction(as_unseen(arrays["mean"], problem, held_out), arrays.get("std"))

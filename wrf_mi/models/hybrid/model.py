@@ -125,7 +125,7 @@ class _Fit:
         self.problem, self.split, self.session = problem, split, session
         self.record, self.task, self.begun = problem.record, task_of(problem.record), time.perf_counter()
         self.fold = hold_out(self.record, split)
-        self.held = None if self.fold is None else HeldOut.of(self.record, self.fold, problem.seed)
+        self.held_out = None if self.fold is None else HeldOut.of(self.record, self.fold, problem.seed)
         self.parts = parts_of(problem, split)
         self.fitted: dict[str, Fitted] = {}
         self.predictions: dict[str, Prediction] = {}
@@ -140,9 +140,9 @@ class _Fit:
         names = [*self.predictions] or [*self.parts]
         form, sizes, intervals, scores = "alone", PREDICTED, None, dict[str, float]()
         mixture = by_distance.constant(np.eye(len(names))[0])
-        if self.held is not None and len(self.held) and self.predictions:
-            form, mixture, scores = self._weights(self.held)
-            sizes, intervals = self._intervals(self.held, mixture)
+        if self.held_out is not None and len(self.held_out) and self.predictions:
+            form, mixture, scores = self._weights(self.held_out)
+            sizes, intervals = self._intervals(self.held_out, mixture)
         used = _used(names, mixture)
         for name in set(self.parts) - set(used):
             shutil.rmtree(self.session.folder / FOLDER / name, ignore_errors=True)
@@ -180,17 +180,17 @@ class _Fit:
             assert isinstance(side, SceneSide)
             self.reports += side.stages
             model, problem = scene_side(self.record)[1], side.problem  # the scene is corrected once
-            unseen = None if self.held is None else side.held_out_at(self.held)
-        if self.fold is None or self.held is None:
+            unseen = None if self.held_out is None else side.held_out_at(self.held_out)
+        if self.fold is None or self.held_out is None:
             return
         if unseen is None:
             place = inside(self.session, FOLDER, name, "held")
-            unseen = held_out_predictions(model, problem, self.fold, self.held, place, name)
+            unseen = held_out_predictions(model, problem, self.fold, self.held_out, place, name)
         self.predictions[name] = unseen
         # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
         one_carrier = self.record.carriers_hz is None
         if name == PATHS and RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier:
-            self._krige_residuals(self.fold, self.held)
+            self._krige_residuals(self.fold, self.held_out)
 
     def _krige_residuals(self, fold: Split, held_out: HeldOut) -> None:
         """Residuals of the training rows, and predictions of held-out rows with those of the others.
