@@ -237,9 +237,8 @@ def prune(
     theta, solved = refine(waves, h, theta, present, steps)
     count = h.shape[1] * h.shape[2]
     diagonal = np.arange(present.shape[1])
-    loaded = solved.gram.copy()
-    loaded[:, diagonal, diagonal] += 1e-9 * count  # two equal paths: either is worth nothing beside the other
-    inverse = np.linalg.inv(loaded)[:, diagonal, diagonal].real
+    load = 1e-9 * count * np.eye(len(diagonal))  # two equal paths: either is worth nothing beside the other
+    inverse = np.linalg.inv(solved.gram + load)[:, diagonal, diagonal].real
     strength = np.square(np.abs(solved.gains)).reshape(*present.shape, -1).sum(axis=2)
     rise = strength / np.maximum(inverse, np.finfo(float).tiny)
     energy = np.maximum(solved.energy, np.finfo(float).tiny)[:, None]

@@ -165,9 +165,8 @@ def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> t
     power = np.where(present, mean_power[:, None], 0.0)
     for _ in range(PASSES):
         ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
-        loaded = solved.gram.copy()
-        loaded[:, diagonal, diagonal] += ridge + SINGULAR * solved.atoms.shape[2]
-        inverse = np.linalg.inv(loaded)
+        load = (ridge + SINGULAR * solved.atoms.shape[2])[:, :, None] * np.eye(len(diagonal))
+        inverse = np.linalg.inv(solved.gram + load)
         gains = inverse @ right
         # Expectation: the gains' posterior mean and variance; maximisation: a power of their expected square.
         variance = noise[:, None] * inverse[:, diagonal, diagonal].real

@@ -151,10 +151,7 @@ def products(atoms: Complex, h: Complex) -> Complex:
 
 
 def _solve(gram: Complex, right: Complex, size: float) -> Complex:
-    loaded = gram.copy()
-    diagonal = np.arange(gram.shape[-1])
-    loaded[:, diagonal, diagonal] += SINGULAR * size
-    return np.asarray(np.linalg.solve(loaded, right))
+    return np.asarray(np.linalg.solve(gram + SINGULAR * size * np.eye(gram.shape[-1]), right))
 
 
 def _turn(angle: FloatArray) -> Complex:  # exp(-j angle), twice as fast as the exponential of complex numbers
