@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -223,3 +224,15 @@ def test_a_sum_over_paths_does_not_serve_what_it_cannot_follow(strengths: Misfit
     other = Misfit(strengths.record, np.arange(16), Prepared(opened), options)
     assert PathSum.serves(strengths)
     assert not PathSum.serves(other)
+
+
+def test_channels_of_an_array_are_scored_by_row(tmp_path: Path) -> None:
+    """Two antennas at one place have the accuracy of one."""
+    scene = stated_scene(tmp_path / "scene")
+    single, options = channels(scene, 12, snr_db=20), CorrectionOptions(depth=1, rays=4096, faint=0.0)
+    pair = replace(single.with_array(np.zeros((2, 3))), observation=single.observation[:, :, None].repeat(2, axis=2))
+    prepared = Prepared(open_scene(scene, CARRIER_HZ))
+    fits = [Misfit(record, np.arange(len(record)), prepared, options) for record in (single, pair)]
+    scores = [fit.scores(fit.start) for fit in fits]
+    assert np.ptp(scores[0]) > 1
+    np.testing.assert_allclose(scores[1], scores[0], atol=DECIBEL)

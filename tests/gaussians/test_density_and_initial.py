@@ -30,7 +30,7 @@ from wrf_mi.gaussians.initial import (
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.training.config import InitialConfig
 from wrf_mi.training.initial import initial_gaussians
-from wrf_mi.training.state import FitState
+from wrf_mi.training.loop import FitState
 
 FLOAT32_EPS = 1e-6
 """Relative rounding of one or two float32 operations, with room."""

@@ -23,7 +23,7 @@ from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig, calibration_config, default_config
-from wrf_mi.training.state import FitState
+from wrf_mi.training.loop import FitState
 from wrf_mi.training.trainer import Trainer
 
 # isort: split

@@ -25,11 +25,11 @@ from wrf_mi.tasks import TASKS
 from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint
 from wrf_mi.training.config import TrainConfig, default_config
 from wrf_mi.training.evaluator import TOGETHER
+from wrf_mi.training.fit_plan import targets_of
+from wrf_mi.training.loop import FitState
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.session import FitSession
-from wrf_mi.training.state import FitState
 from wrf_mi.training.step import TrainingData, device_pose
-from wrf_mi.training.targets import targets_of
 from wrf_mi.training.trainer import Trainer
 
 MODELS = tuple(FIELDS)

@@ -13,7 +13,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.models.interpolation.idw import InverseDistance
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.state import FitState
+from wrf_mi.training.loop import FitState
 from wrf_mi.training.trainer import Trainer
 
 RECOVERED = 0.97

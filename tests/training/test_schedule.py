@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from wrf_mi.core import InputError, Split
 from wrf_mi.core.settings import with_settings
+from wrf_mi.training.adam import Schedule, density_rounds, plan
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.schedule import Schedule, density_rounds, plan
 
 
 def split_of(train: int, validation: int = 3) -> Split:

@@ -19,9 +19,8 @@ from wrf_mi.gaussians import FIELDS, random_gaussians
 from wrf_mi.tasks.losses import spectrum_loss
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.training.adam import NumericsError
-from wrf_mi.training.loop import Progress
+from wrf_mi.training.loop import FitState, Progress
 from wrf_mi.training.predictor import Predictor
-from wrf_mi.training.state import FitState
 from wrf_mi.training.trainer import Trainer
 
 pytestmark = pytest.mark.all_threads

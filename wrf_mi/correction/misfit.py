@@ -304,7 +304,7 @@ class Misfit:
                 report = port.complete(port.side(params), None).numpy()
             truth, pairs = stored[port.places], np.asarray(report, float)
             values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
-            scores[port.places] = task.score(values.reshape(truth.shape), truth)
+            scores[port.places] = task.of_rows(values.reshape(truth.shape)[None], truth[None])[0]
         return scores
 
     def accept(self, vector: FloatArray) -> None:

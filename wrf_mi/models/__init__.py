@@ -9,8 +9,7 @@ from ..core.registry import Registry
 from ..training.session import Interrupted
 from .model import Fitted, Inputs, Model, Problem, Session
 
-ENTRY_POINTS = "wrf_mi.models"
-"""Group of the entry points by which other packages add models."""
+ENTRY_POINTS = "wrf_mi.models"  # Group of the entry points by which other packages add models
 
 _OWN: Mapping[str, Model | str] = {
     "wrf-gs": "wrf_mi.models.gaussian.model:WRF_GS",
@@ -32,8 +31,7 @@ _OWN: Mapping[str, Model | str] = {
 }
 
 
-MODELS: Registry[Model] = Registry("model", ENTRY_POINTS, _OWN)
-"""All models by name, as in ``wrf-mi train --model``."""
+MODELS: Registry[Model] = Registry("model", ENTRY_POINTS, _OWN)  # All models by name, as in ``wrf-mi train --model``
 
 
 def register(model: Model) -> None:
@@ -46,11 +44,7 @@ def register(model: Model) -> None:
 
 
 def known_model(name: str) -> Model:
-    """The model of a name.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The model of a name (InputError: there is none)."""
     if name not in MODELS:
         raise InputError(f"model {name!r}: no such model; choose from {', '.join(MODELS)}")
     return MODELS[name]

@@ -18,38 +18,27 @@ if TYPE_CHECKING:
 
 
 def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
-    """Refuse a record that a model does not serve, naming ``others`` that do, or whose parts do not fit together.
-
-    Raises:
-        InputError: another task; no uplink for a model that needs it; rows of several carriers for a model that serves
-            a single carrier; or as `check_parts`.
-    """
+    """Refuse a record that a model does not serve, naming ``others`` that do; or as `check_parts`."""
+    place, able = place_of(record), [other for other in others if other.serves(record.task)]
     if not method.serves(record.task):
         *most, last = method.tasks or ("nothing",)
         served = f"{', '.join(most)} and {last}" if most else last
-        able = [other.name for other in others if other.serves(record.task)]
-        named = f": {', '.join(able)}" if able else ""
-        text = f"holds {record.task}; {method.name} serves {served}, so choose another model{named}"
-        raise InputError(f"{place_of(record)}: {text}")
+        named = f": {', '.join(other.name for other in able)}" if able else ""
+        text = f"{method.name} serves {served}, so choose another model{named}"
+        raise InputError(f"{place}: holds {record.task}; {text}")
     if method.uplink == "required" and record.uplink is None:
-        raise InputError(
-            f"{place_of(record)}: has no uplink channels, from which {method.name} predicts; choose data with an uplink"
-        )
+        text = f"has no uplink channels, from which {method.name} predicts; choose data with an uplink"
+        raise InputError(f"{place}: {text}")
     check_parts(record)
     if record.carriers_hz is not None and not method.several_carriers:
-        able = [other.name for other in others if other.several_carriers and other.serves(record.task)]
-        named = f" ({', '.join(able)})" if able else ""
+        names = [other.name for other in able if other.several_carriers]
+        named = f" ({', '.join(names)})" if names else ""
         text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
-        raise InputError(f"{place_of(record)}: {text}, so choose another model{named} or give the rows of each carrier")
+        raise InputError(f"{place}: {text}, so choose another model{named} or give the rows of each carrier")
 
 
 def check_held_receivers(record: Record, split: Split, method: Model, others: Iterable[Model]) -> None:
-    """Refuse a split that holds out receivers, for a model or data that do not serve it.
-
-    Raises:
-        InputError: a model that predicts for trained receivers alone, other data than signal strengths, or a receiver
-            that is not in the data.
-    """
+    """Refuse a split that holds out receivers, for a model or data that do not serve it; raises InputError."""
     if not split.held_receivers:
         return
     if max(split.held_receivers) >= len(record.receivers) or len(split.held_receivers) == len(record.receivers):
@@ -66,12 +55,7 @@ def check_held_receivers(record: Record, split: Split, method: Model, others: It
 
 
 def check_parts(record: Record) -> None:
-    """Refuse a record whose parts do not fit together.
-
-    Raises:
-        InputError: numbers of rows, antennas, subcarriers and frequencies that differ; carriers, runs, numbers of
-            readings or standard deviations that do not fit the observations.
-    """
+    """Refuse a record whose parts do not fit together; raises InputError."""
     task_of(record).check(record)
     _check_noise(record)
     if record.runs is not None and record.runs.shape != (len(record),):
@@ -105,12 +89,7 @@ def _check_noise(record: Record) -> None:
 
 
 def check_inputs(inputs: Inputs, record: Record, method: Model) -> None:
-    """Refuse inputs that a model fitted to a record cannot predict from.
-
-    Raises:
-        InputError: no uplink for a model that needs it, another number of antennas or subcarriers, or values that are
-            not finite.
-    """
+    """Refuse inputs that a model fitted to a record cannot predict from; raises InputError."""
     if record.uplink is None and inputs.uplink is not None:
         raise InputError(f"{method.name}: fitted to {record.name}, which has no uplink; omit uplink")
     if inputs.uplink is None:
@@ -121,10 +100,9 @@ def check_inputs(inputs: Inputs, record: Record, method: Model) -> None:
     assert record.uplink is not None
     antennas, subcarriers = record.uplink.shape[1:]
     if inputs.uplink.shape != (len(inputs), antennas, subcarriers):
-        raise InputError(
-            f"{method.name}: uplink {list(inputs.uplink.shape)}; fitted to {antennas} antennas and {subcarriers} "
-            f"subcarriers, so give [{len(inputs)}, {antennas}, {subcarriers}]"
-        )
+        text = f"fitted to {antennas} antennas and {subcarriers} subcarriers"
+        text += f", so give [{len(inputs)}, {antennas}, {subcarriers}]"
+        raise InputError(f"{method.name}: uplink {list(inputs.uplink.shape)}; {text}")
     bad = np.flatnonzero(~np.isfinite(inputs.uplink.reshape(len(inputs), -1)).all(axis=1))
     if len(bad):
         row = inputs.uplink[bad[0]].ravel()

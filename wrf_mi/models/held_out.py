@@ -15,18 +15,16 @@ from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
-from ..training.loop import Progress
 from ..training.selection import HeldOut
 from .model import Fitted, Model, Problem, Session, inputs_of
 
 
 def labelled(session: Session, label: str) -> Session:
-    """A session that reports progress under a label."""
-
-    def on_progress(stage: str, share: float, progress: Progress | None = None, /) -> None:
-        session.on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
-
-    return replace(session, on_progress=on_progress)
+    """A session that reports progress under a label, without that of optimiser steps."""
+    on_progress = session.on_progress
+    return replace(
+        session, on_progress=lambda stage, share, *_: on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
+    )
 
 
 def fit_model(entry: Model, problem: Problem, split: Split, session: Session) -> tuple[Fitted, Problem]:
@@ -38,11 +36,7 @@ def fit_model(entry: Model, problem: Problem, split: Split, session: Session) ->
 
 
 def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:
-    """A model fitted to a fold of the training rows, at the receivers that have enough of them in the fold.
-
-    Returns:
-        The fitted model, and the numbers of its receivers among those of the problem, ascending.
-    """
+    """A model fitted to a fold of the training rows, and the numbers of the receivers with enough, ascending."""
     numbers, left_out = fitted_receivers(problem.record, [fold])
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
@@ -55,12 +49,12 @@ def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int
     return fitted.predict_rows(rows, receiver) or fitted.predict(inputs_of(record, rows), receiver)
 
 
-def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[Any]:
+def as_unseen(mean: NDArray[Any], problem: Problem, held_out: HeldOut) -> NDArray[Any]:
     """Predictions [q, ...] whose errors are as large as if the scene did not know the held-out rows."""
     record, data = problem.record, read_correction_data(problem.scene)
     if data is None:
         return mean
-    observed, known = held.observed(record), data.knows(record.name, held.row)
+    observed, known = held_out.observed(record), data.knows(record.name, held_out.row)
     # The scene was corrected by these rows, too: their errors are smaller than those of rows to be predicted.
     enlarged = observed + data.error_ratio * (mean - observed)
     if task_of(record).image:
@@ -69,22 +63,11 @@ def as_unseen(mean: NDArray[Any], problem: Problem, held: HeldOut) -> NDArray[An
 
 
 def held_out_predictions(
-    entry: Model, problem: Problem, fold: Split, held: HeldOut, session: Session, name: str
+    entry: Model, problem: Problem, fold: Split, held_out: HeldOut, session: Session, name: str
 ) -> Prediction:
-    """Predictions of held-out observations by a model that is fitted to the rest.
+    """Predictions [q, ...] of held-out observations of a fold by a model that is fitted to the other rows.
 
-    They are kept in the session's folder; a stopped fit goes on with them.
-
-    Args:
-        entry: model.
-        problem: data, scene and settings.
-        fold: split of `wrf_mi.training.selection.hold_out`.
-        held: its held-out observations, or some of them.
-        session: folder for files, progress callback and stop condition.
-        name: name of the model for the progress callback.
-
-    Returns:
-        Mean and, where the model states it, standard deviation, [q, ...].
+    They are kept in the session's folder; a stopped fit goes on with them. ``name`` is for the progress callback.
 
     Raises:
         InputError: rows that the model cannot be fitted to.
@@ -94,15 +77,15 @@ def held_out_predictions(
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
         predictions = [
-            predicted_rows(fitted, record, held.row[held.receiver == receiver], place)
+            predicted_rows(fitted, record, held_out.row[held_out.receiver == receiver], place)
             for place, receiver in enumerate(numbers)
-            if (held.receiver == receiver).any()
+            if (held_out.receiver == receiver).any()
         ]
         # Predicted receiver by receiver, while a fold may hold receivers out in any order.
-        order = np.argsort(np.argsort(held.receiver, kind="stable"), kind="stable")
+        order = np.argsort(np.argsort(held_out.receiver, kind="stable"), kind="stable")
         arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
         if predictions[0].std is not None:
             arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
         write_arrays(path, arrays)
     arrays = stored_arrays(path)
-    return Prediction(as_unseen(arrays["mean"], problem, held), arrays.get("std"))
+    return Prediction(as_unseen(arrays["mean"], problem, held_out), arrays.get("std"))

@@ -37,27 +37,16 @@ def inputs_of(record: Record, rows: IntArray) -> Inputs:
 
 @dataclass
 class Problem:
-    """Data, scene and settings that a model is fitted to, and loaded with.
+    """Data, scene and settings that a model is fitted to, and loaded with."""
 
-    Attributes:
-        dataset: name, folder, or a loaded record.
-        settings: settings of the model's class.
-        seed: seed of split and fit.
-        scene: name, scene folder, Mitsuba XML or mesh, or None.
-        material: material of a bare mesh, or None.
-        antennas: patterns and polarisations in place of those of the data.
-        operator: learned fields predict by operator where they can, see `wrf_mi.training.predictor`.
-        left_out: names of receivers that are left out of the data, as if they had not been there.
-    """
-
-    dataset: str | Path | Record
-    settings: Any
-    seed: int = 0
-    scene: str | None = None
-    material: str | None = None
-    antennas: AntennaOptions = AS_STATED
-    operator: bool = True
-    left_out: tuple[str, ...] = ()
+    dataset: str | Path | Record  #: name, folder, or a loaded record
+    settings: Any  #: settings of the model's class
+    seed: int = 0  #: seed of split and fit
+    scene: str | None = None  #: name, scene folder, Mitsuba XML or mesh, or None
+    material: str | None = None  #: material of a bare mesh, or None
+    antennas: AntennaOptions = AS_STATED  #: patterns and polarisations in place of those of the data
+    operator: bool = True  #: learned fields predict by operator where they can, see `wrf_mi.training.predictor`
+    left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
 
     @cached_property
     def record(self) -> Record:
@@ -70,15 +59,13 @@ class Problem:
 
         record = self.dataset if isinstance(self.dataset, Record) else load_record(self.dataset)
         if self.left_out:
-            record = record.at_receivers(
-                [k for k, each in enumerate(record.receivers) if each.name not in self.left_out]
-            )
+            names = [receiver.name for receiver in record.receivers]
+            record = record.at_receivers([k for k, name in enumerate(names) if name not in self.left_out])
         return record.with_antennas(self.antennas)
 
     @cached_property
     def opened_scene(self) -> Any | None:
-        """The scene (``sionna.rt.Scene``) at the record's carrier, or the middle one of its rows, opened on first
-        access, or None.
+        """The scene (``sionna.rt.Scene``) at the record's carrier, or the middle one of its rows, or None.
 
         Raises:
             InputError: it cannot be opened, or the carrier is unknown.
@@ -88,11 +75,7 @@ class Problem:
         return None if self.scene is None else self.open_scene(scene_carrier(self.record))
 
     def open_scene(self, frequency_hz: float) -> Any | None:
-        """The scene at another frequency, Hz, or None.
-
-        Raises:
-            InputError: it cannot be opened.
-        """
+        """The scene at another frequency, Hz, or None (InputError: it cannot be opened)."""
         from ..tracing import open_scene  # the tracer is imported where there is a scene
 
         return None if self.scene is None else open_scene(self.scene, frequency_hz, material=self.material)
@@ -110,54 +93,38 @@ class Problem:
 
 @dataclass(frozen=True)
 class Session(FitSession):
-    """A session of a run.
-
-    Attributes:
-        scheduler: scheduler of parts of the work; None: this process.
-        progress: show bars on standard error where the tracer takes time.
-    """
+    """A session of a run."""
 
     folder: Path
     run: Path
-    scheduler: Scheduler | None = None
-    progress: bool = False
+    scheduler: Scheduler | None = None  #: scheduler of parts of the work; None: this process
+    progress: bool = False  #: show bars on standard error where the tracer takes time
 
 
 @dataclass(frozen=True)
 class Decomposition:
-    """A prediction for m transmitters and what it is made of.
+    """A prediction for m transmitters and what it is made of."""
 
-    Attributes:
-        whole: the prediction.
-        traced: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as
-            magnitudes in a common unit of both sides; NaN where they are not used. None: the model has one side.
-        learned: what the side without paths predicts, likewise.
-        paths: statistics of the traced paths; None: the model traces none.
-    """
-
-    whole: Prediction
+    whole: Prediction  #: the prediction
+    #: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as magnitudes in a
+    #: common unit of both sides; NaN where they are not used. None: the model has one side
     traced: NDArray[Any] | None = None
-    learned: NDArray[Any] | None = None
-    paths: PathStatistics | None = None
+    learned: NDArray[Any] | None = None  #: what the side without paths predicts, likewise
+    paths: PathStatistics | None = None  #: statistics of the traced paths; None: the model traces none
 
 
-PredictAll = Callable[[Inputs], NDArray[Any]]
-"""Observations of all receivers [n_rx, m, ...] for inputs [m]."""
+PredictAll = Callable[[Inputs], NDArray[Any]]  # Observations of all receivers [n_rx, m, ...] for inputs [m]
 
 
 class Fitted(ABC):
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes:
-        train_seconds: duration of the fit over all sittings; None: that of the last call of `Model.fit`.
-        receivers: receivers whose observations it predicts; None: those of the record.
-        uses_heading: whether `predict` takes headings; None: as `Model.headings`.
-        carriers_hz: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record.
-    """
-
+    #: duration of the fit over all sittings; None: that of the last call of `Model.fit`
     train_seconds: float | None = None
+    #: receivers whose observations it predicts; None: those of the record
     receivers: tuple[Receiver, ...] | None = None
-    uses_heading: bool | None = None
+    uses_heading: bool | None = None  #: whether `predict` takes headings; None: as `Model.headings`
+    #: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record
     carriers_hz: FloatArray | None = None
 
     @abstractmethod
@@ -203,47 +170,30 @@ class Model(ABC):
 
     One line in `wrf_mi.models` registers it; a model of another package is an instance that an entry point of the group
     ``wrf_mi.models`` names.
-
-    Attributes:
-        name: name as in ``wrf-mi train --model``.
-        source: publication.
-        settings: frozen dataclass of its settings, all with defaults.
-        tasks: tasks that it serves; None: all.
-        summary: the model in a few words for readers of a page; "": its source.
-        scene_summary: the same with a scene, after ``summary``.
-        scene: whether it takes a scene.
-        uses_antennas: whether patterns and polarisations of antennas count in that scene.
-        several_carriers: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`).
-        uplink: whether it predicts from the uplink.
-        headings: whether it may predict from the transmitter's heading.
-        new_receivers: whether it predicts what receivers observe that it was not trained on, in a split that holds out
-            receivers.
-        complete: whether it needs every receiver's observation of every training row.
-        gaps: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a
-            run with such values in another array is refused.
-        train_arguments: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``,
-            ``deterministic``, ``receiver`` or ``evaluation``.
-        defaults: ``key=value`` that differ from the defaults of ``settings``.
-        presets: named settings, ``key=value``.
     """
 
-    name: str
-    source: str
-    settings: type
-    tasks: tuple[str, ...] | None = None
-    summary: str = ""
-    scene_summary: str = ", trained jointly with the paths of the scene"
-    scene: Literal["none", "optional", "required"] = "none"
-    uses_antennas: bool = True
-    several_carriers: bool = False
-    uplink: Literal["none", "optional", "required"] = "none"
-    headings: bool = False
+    name: str  #: name as in ``wrf-mi train --model``
+    source: str  #: publication
+    settings: type  #: frozen dataclass of its settings, all with defaults
+    tasks: tuple[str, ...] | None = None  #: tasks that it serves; None: all
+    summary: str = ""  #: the model in a few words for readers of a page; "": its source
+    scene_summary: str = ", trained jointly with the paths of the scene"  #: the same with a scene, after ``summary``
+    scene: Literal["none", "optional", "required"] = "none"  #: whether it takes a scene
+    uses_antennas: bool = True  #: whether patterns and polarisations of antennas count in that scene
+    several_carriers: bool = False  #: whether it serves rows of several carriers (`wrf_mi.core.Record.carriers_hz`)
+    uplink: Literal["none", "optional", "required"] = "none"  #: whether it predicts from the uplink
+    headings: bool = False  #: whether it may predict from the transmitter's heading
+    #: whether it predicts what receivers observe that it was not trained on, in a split that holds out receivers
     new_receivers: bool = False
-    complete: bool = False
+    complete: bool = False  #: whether it needs every receiver's observation of every training row
+    #: names, without prefixes that end in ``/``, of arrays of `Fitted.arrays` that may hold NaN or infinity; a run with
+    #: such values in another array is refused
     gaps: tuple[str, ...] = ()
+    #: arguments of `wrf_mi.train` that are also settings of the model: ``model``, ``seed``, ``deterministic``,
+    #: ``receiver`` or ``evaluation``
     train_arguments: tuple[str, ...] = ()
-    defaults: tuple[str, ...] = ()
-    presets: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    defaults: tuple[str, ...] = ()  #: ``key=value`` that differ from the defaults of ``settings``
+    presets: Mapping[str, tuple[str, ...]] = MappingProxyType({})  #: named settings, ``key=value``
 
     @abstractmethod
     def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
@@ -286,21 +236,16 @@ class Model(ABC):
 
 
 def default_settings(model: Model, settings: Iterable[str], arguments: Mapping[str, Any]) -> Any:
-    """Settings of a model with ``key=value`` applied after its defaults.
+    """Settings of a model, as `Model.serving` gives it, with ``key=value`` applied after its defaults.
 
-    Args:
-        model: model, as `Model.serving` gives it.
-        settings: ``key=value``.
-        arguments: arguments of `wrf_mi.train` that may be settings, too (`Model.train_arguments`).
+    ``arguments`` are those of `wrf_mi.train`, some of which are settings, too (`Model.train_arguments`).
     """
     stated = {key: arguments[key] for key in model.train_arguments if arguments.get(key) is not None}
     return with_settings(model.settings(**stated), [*model.defaults, *settings])
 
 
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:
-    """Rows that a receiver received: those that train at first, and those that choose settings.
-
-    Without the former, the latter train.
+    """Rows that a receiver received: those that train, and those that choose settings; without the former these train.
 
     Raises:
         InputError: fewer than two rows.
@@ -315,11 +260,7 @@ def received_rows(record: Record, split: Split, receiver: int, name: str) -> tup
 
 
 def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
-    """Positions of the transmitter in some rows [n, 3], metres.
-
-    Raises:
-        InputError: unknown positions.
-    """
+    """Positions of the transmitter in some rows [n, 3], metres (InputError: unknown positions)."""
     unknown = rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)]
     if len(unknown):
         text = f"no position in row {unknown[0]}: positions are not known, from which {name} predicts"

@@ -43,9 +43,7 @@ from ..tracing.paths.result import join_traces
 from ..tracing.paths.solve import PAIRS_TOGETHER
 from ..tracing.tracer import Offsets, RayTracer, fit_offsets, warn_of_cross_polarization
 from ..training.config import LoopOptions, calibration_config
-from .gaussian.model import FittedField
-from .gaussian.model import check as check_field
-from .gaussian.model import fit as fit_field
+from .gaussian.model import WRF_GS_PLUS, FittedField
 from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 
 logger = logging.getLogger(__name__)
@@ -60,21 +58,17 @@ alone, a part of any size costs as much as a few hundred positions."""
 
 @dataclass(frozen=True)
 class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its fields are made from others
-    """Settings of tracing and calibration, and with ``calibration`` of the training loop.
+    """Settings of tracing and calibration, and with ``calibration`` of the training loop."""
 
-    Attributes:
-        calibration: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each
-            receiver), ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and
-            ``surface`` (Gaussians on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none.
-        target_error_db: error of received power, and of spectra where they are the task, dB, for which depth, rays and
-            further kinds of path are chosen by convergence on a sample of the transmitters
-            (`wrf_mi.tracing.convergence`); null: none are chosen.
-        target_kinds: kinds of path that may then be switched on, separated by commas.
-    """
-
+    #: parameters that are trained on the training rows, separated by commas: any of ``gain`` (of each receiver),
+    #: ``materials``, ``planes``, ``patterns`` (of the antennas), ``pose`` (of the receivers) and ``surface`` (Gaussians
+    #: on surfaces, `wrf_mi.tracing.paths.surface_gaussians`); null: none
     calibration: str | None = None
+    #: error of received power, and of spectra where they are the task, dB, for which depth, rays and further kinds of
+    #: path are chosen by convergence on a sample of the transmitters (`wrf_mi.tracing.convergence`); null: none are
+    #: chosen
     target_error_db: float | None = None
-    target_kinds: str = ",".join(CHOSEN_KINDS)
+    target_kinds: str = ",".join(CHOSEN_KINDS)  #: kinds of path that may then be switched on, separated by commas
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,19 +95,18 @@ class FittedTracing(Fitted):
 
     @cached_property
     def _tracer(self) -> RayTracer:
-        """Tracer with the number of rays of the run."""
         problem = self._problem
         assert problem.scene is not None
         options = replace(problem.settings.options, rays=int(self._arrays["rays"]))
         return RayTracer(problem.scene, _instrument(problem.record), options, problem.material)
 
-    def _reported(self, traced: TraceResult) -> NDArray[Any]:
-        observed = self._tracer.observe(traced)
-        return observed if self._offsets is None else self._offsets(observed)
-
     @cached_property
     def _stored(self) -> TraceResult:
         return _stored_trace(self._paths, self._problem.record)
+
+    def _reported(self, traced: TraceResult) -> NDArray[Any]:
+        observed = self._tracer.observe(traced)
+        return observed if self._offsets is None else self._offsets(observed)
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions from the stored paths."""
@@ -123,17 +116,15 @@ class FittedTracing(Fitted):
         return Prediction(self._of_rows[1][receiver])
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Predictions of a receiver; positions are traced for all receivers together.
-
-        Raises:
-            InputError: a position inside a solid object.
-        """
+        """Predictions of a receiver (InputError: inside a solid); all receivers are traced together."""
         return self.decompose(inputs, receiver).whole
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Predictions of a receiver with statistics of its paths (`predict`)."""
         # Receivers are predicted in turn; the same receiver again is traced anew, so that predictions can be timed.
-        if self._last is None or receiver in self._last[3] or not _same(self._last[0], inputs):
+        last, compared = self._last, ("tx_pos_m", "carriers_hz")
+        same = last and all(np.array_equal(getattr(last[0], name), getattr(inputs, name)) for name in compared)
+        if self._last is None or not same or receiver in self._last[3]:
             traced = self._tracer.trace(inputs.tx_pos_m, False, inputs.first_row, inputs.carriers_hz)
             statistics = [PathStatistics.of_receiver(traced.paths, index) for index in range(traced.paths.n_rx)]
             self._last = inputs, self._reported(traced), statistics, set()
@@ -147,10 +138,6 @@ class FittedTracing(Fitted):
     def facts(self) -> dict[str, Any]:
         """Duration of tracing, numbers of paths and rays."""
         return {name: self._arrays[name].item() for name in ("trace_seconds", "paths", "rays")}
-
-
-def _same(left: Inputs, right: Inputs) -> bool:
-    return all(np.array_equal(getattr(left, name), getattr(right, name)) for name in ("tx_pos_m", "carriers_hz"))
 
 
 def _instrument(record: Record) -> Instrument:
@@ -180,7 +167,7 @@ def _graph_problem(problem: Problem) -> Problem:
     if options.phase_error:
         raise InputError(f"calibration: phase_error={options.phase_error:g} belongs to a trace; omit it")
     reflections = options.depth if options.reflections is None else options.reflections
-    given = [
+    stated = [
         f"seed={problem.seed}",
         f"traced.depth={options.depth}",
         f"traced.reflections={reflections if options.reflection else 0}",
@@ -188,53 +175,13 @@ def _graph_problem(problem: Problem) -> Problem:
         *([] if options.rays == "auto" else [f"traced.rays={options.rays}"]),
         *settings.chosen(),
     ]
-    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), given)
+    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), stated)
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 
 def _changes_scene(problem: Problem) -> bool:
     parts = set((problem.settings.calibration or "").split(","))
     return bool({"planes", "materials"} & parts) and "surface" not in parts  # a scene's folder holds no Gaussians
-
-
-def fit(problem: Problem, split: Split, session: Session) -> Fitted:
-    """Train the calibrated parameters; or trace all rows, unless another fold has, and fit offsets of signal strengths.
-
-    Raises:
-        InputError: a receiver without a training row that a path reaches.
-    """
-    if problem.settings.calibration is not None:
-        graph = fit_field(_graph_problem(problem), split, session)
-        if _changes_scene(problem):
-            scene = graph.predictor.graph.scene
-            write_corrected_scene(session.folder / CORRECTED, scene, graph.params, replace=True)
-        calibrated = load(graph.arrays(), problem, session.folder)
-        calibrated.train_seconds = graph.train_seconds
-        return calibrated
-    record, path, start = problem.record, session.run / PATHS, time.perf_counter()
-    assert problem.scene is not None
-    settings: TracingSettings = problem.settings
-    tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
-    traced = _stored_trace(path, record) if path.exists() else None
-    if traced is None or len(traced.receivers) < len(record.receivers):  # of a fold that left some out
-        traced = _trace(tracer, problem, session)
-        warn_of_cross_polarization(traced, tracer.scene)
-        save_trace(path, traced)
-        if session.stop():
-            raise session.interrupted("after tracing")
-    seconds = time.perf_counter() - start
-    facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
-    arrays = {name: np.asarray(value) for name, value in facts.items()}
-    if task_of(record).in_decibel:
-        known = split.all_train
-        reported = tracer.observe(traced)[:, known]
-        if not settings.transmission:
-            _warn_of_walls(reported, record.observation[:, known])
-        offsets = fit_offsets(reported, record.observation[:, known])
-        arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
-    fitted = FittedTracing(problem, arrays, path)
-    fitted.train_seconds = 0.0
-    return fitted
 
 
 def _stored_trace(path: Path, record: Record) -> TraceResult:
@@ -247,21 +194,11 @@ def _stored_trace(path: Path, record: Record) -> TraceResult:
 
 def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None:
     """Say that waves pass walls where many measured values have no path without."""
-    measured = np.isfinite(measured_dbm)
-    without = measured & ~np.isfinite(traced_dbm)
-    if without.sum() > WITHOUT_PATH * measured.sum():
-        share = without.sum() / measured.sum()
+    share = (~np.isfinite(traced_dbm))[np.isfinite(measured_dbm)].mean() if np.isfinite(measured_dbm).any() else 0.0
+    if share > WITHOUT_PATH:
         remedy = "waves pass walls with --set transmission=true (wrf-mi trace: --paths with transmission)"
         text = f"no path arrives where %.0f %% of the training values were measured; {remedy}"
         logger.warning(text, 100 * share)
-
-
-def load(arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-    """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
-    if problem.settings.calibration is not None:
-        return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
-    paths = folder / PATHS
-    return FittedTracing(problem, arrays, paths if paths.exists() else folder.parent / PATHS)
 
 
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
@@ -286,31 +223,6 @@ def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | Non
     return tracer.trace(part[0], first_row=part[1], carriers_hz=part[2])
 
 
-def prepare(problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
-    """Settings, with those that are chosen by convergence; ``convergence.json`` lists all tried settings."""
-    settings: TracingSettings = problem.settings
-    path = session.run / CONVERGENCE
-    if settings.target_error_db is None:
-        return settings
-    if not path.exists():
-        record, instrument = problem.record, instrument_of(problem.record)
-        spectra = instrument.observe if task_of(record).image else None
-        choice = choose_options(
-            problem.opened_scene,
-            record.tx_pos_m,
-            record.receivers,
-            settings.target_error_db,
-            settings.options,
-            kinds=settings.target_kinds.split(","),
-            spectra=spectra,
-            tx_antenna=record.tx_antenna,
-        )
-        write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
-    with readable(path, f"{path}: missing; trace anew", "trace anew"):
-        chosen = settings_from(TraceOptions, json.loads(path.read_text())["options"], str(path))
-        return replace(settings, **vars(chosen))
-
-
 def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse a phase error that has no effect, and warn of other settings that have none."""
     settings, record = problem.settings, problem.record
@@ -333,23 +245,6 @@ def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
         logger.warning("%s=%s has no effect: %s", name, getattr(settings, name), reason)
 
 
-def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
-    settings, carriers = problem.settings, problem.record.carriers_hz
-    _check_effects(problem, splits)
-    if carriers is not None:
-        if settings.target_error_db is not None:
-            text = "target_error_db serves one carrier; omit it"
-            raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
-        for carrier_hz in np.unique(carriers):
-            problem.open_scene(float(carrier_hz))
-    if problem.settings.calibration is not None:
-        check_field(_graph_problem(problem), splits)
-        if _changes_scene(problem):
-            check_materials(problem.opened_scene)
-    assert problem.opened_scene is not None
-
-
 class RayTracing(Model):
     """Paths of a scene, optionally calibrated on the training rows."""
 
@@ -360,20 +255,85 @@ class RayTracing(Model):
     gaps = GAPS
 
     def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
-        """Train the calibrated parameters; or trace all rows, and fit offsets of signal strengths, see `fit`."""
-        return fit(problem, split, session)
+        """Train the calibrated parameters; or trace all rows, unless a fold has, and fit offsets of strengths."""
+        if problem.settings.calibration is not None:
+            graph = WRF_GS_PLUS.fit(_graph_problem(problem), split, session)
+            if _changes_scene(problem):
+                scene = graph.predictor.graph.scene
+                write_corrected_scene(session.folder / CORRECTED, scene, graph.params, replace=True)
+            calibrated = self.load(graph.arrays(), problem, session.folder)
+            calibrated.train_seconds = graph.train_seconds
+            return calibrated
+        record, path, start = problem.record, session.run / PATHS, time.perf_counter()
+        assert problem.scene is not None
+        settings: TracingSettings = problem.settings
+        tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
+        traced = _stored_trace(path, record) if path.exists() else None
+        if traced is None or len(traced.receivers) < len(record.receivers):  # of a fold that left some out
+            traced = _trace(tracer, problem, session)
+            warn_of_cross_polarization(traced, tracer.scene)
+            save_trace(path, traced)
+            if session.stop():
+                raise session.interrupted("after tracing")
+        seconds = time.perf_counter() - start
+        facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
+        arrays = {name: np.asarray(value) for name, value in facts.items()}
+        if task_of(record).in_decibel:
+            known = split.all_train
+            reported = tracer.observe(traced)[:, known]
+            if not settings.transmission:
+                _warn_of_walls(reported, record.observation[:, known])
+            offsets = fit_offsets(reported, record.observation[:, known])
+            arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
+        fitted = FittedTracing(problem, arrays, path)
+        fitted.train_seconds = 0.0
+        return fitted
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        """The model that a fit's arrays describe, see `load`."""
-        return load(arrays, problem, folder)
+        """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
+        if problem.settings.calibration is not None:
+            return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
+        paths = folder / PATHS
+        return FittedTracing(problem, arrays, paths if paths.exists() else folder.parent / PATHS)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
-        check(problem, splits)
+        settings, carriers = problem.settings, problem.record.carriers_hz
+        _check_effects(problem, splits)
+        if carriers is not None:
+            if settings.target_error_db is not None:
+                text = "target_error_db serves one carrier; omit it"
+                raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
+            for carrier_hz in np.unique(carriers):
+                problem.open_scene(float(carrier_hz))
+        if problem.settings.calibration is not None:
+            WRF_GS_PLUS.check(_graph_problem(problem), splits)
+            if _changes_scene(problem):
+                check_materials(problem.opened_scene)
+        assert problem.opened_scene is not None
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
-        """Settings, with those that are chosen by convergence, see `prepare`."""
-        return prepare(problem, splits, session)
+        """Settings, with those that are chosen by convergence; ``convergence.json`` lists all tried settings."""
+        settings: TracingSettings = problem.settings
+        path = session.run / CONVERGENCE
+        if settings.target_error_db is None:
+            return settings
+        if not path.exists():
+            record, instrument = problem.record, instrument_of(problem.record)
+            choice = choose_options(
+                problem.opened_scene,
+                record.tx_pos_m,
+                record.receivers,
+                settings.target_error_db,
+                settings.options,
+                kinds=settings.target_kinds.split(","),
+                spectra=instrument.observe if task_of(record).image else None,
+                tx_antenna=record.tx_antenna,
+            )
+            write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")
+        with readable(path, f"{path}: missing; trace anew", "trace anew"):
+            chosen = settings_from(TraceOptions, json.loads(path.read_text())["options"], str(path))
+            return replace(settings, **vars(chosen))
 
 
 MODEL = RayTracing()

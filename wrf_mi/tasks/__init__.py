@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from ..core import InputError, Record
 from ..core.registry import Registry
 from ..receivers.instruments import Instrument
-from .kinds import Csi, Rssi, Spectrum
-from .task import CARRIER, LAW, UPLINK, Task
+from .task import CARRIER, LAW, UPLINK, Csi, Rssi, Spectrum, Task
 
-ENTRY_POINTS = "wrf_mi.tasks"
-"""Group of the entry points by which other packages add tasks."""
+ENTRY_POINTS = "wrf_mi.tasks"  # Group of the entry points by which other packages add tasks
 
 
 TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
@@ -19,43 +17,21 @@ TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for 
 
 
 def task_of(record: Record) -> Task:
-    """The task of a record.
-
-    Raises:
-        InputError: an unknown task.
-    """
+    """The task of a record (InputError: an unknown task)."""
     if record.task not in TASKS:
         raise InputError(f"{record.source or record.name}: task {record.task!r}; known are {', '.join(TASKS)}")
     return TASKS[record.task]
 
 
 def instrument_of(record: Record) -> Instrument:
-    """The instrument of a record, for ray tracing.
-
-    Raises:
-        InputError: an unknown task, or data without positions, carrier or array.
-    """
+    """The instrument of a record (InputError: an unknown task, position, carrier or array)."""
     return task_of(record).instrument(record)
 
 
 def require(record: Record, *names: str, why: str) -> None:
-    """Refuse a record of another task than those named.
-
-    Raises:
-        InputError: the message ends with ``why``.
-    """
+    """Refuse a record of another task than those named (InputError: the message ends with ``why``)."""
     if record.task not in names:
         raise InputError(f"{record.name}: holds {record.task}; {why}")
 
 
-__all__ = [
-    "CARRIER",
-    "ENTRY_POINTS",
-    "LAW",
-    "TASKS",
-    "UPLINK",
-    "Task",
-    "instrument_of",
-    "require",
-    "task_of",
-]
+__all__ = ["CARRIER", "ENTRY_POINTS", "LAW", "TASKS", "UPLINK", "Task", "instrument_of", "require", "task_of"]

@@ -19,7 +19,13 @@ from ..core.types import IntArray
 from . import instrument_of, task_of
 
 
-def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
+def real_parts(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Real parts, then imaginary ones, of complex numbers [m, ...], [m, 2 k]."""
+    flat = values.reshape(len(values), -1)
+    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
+
+
+def normalised_uplink(uplink: NDArray[Any] | None) -> tuple[NDArray[np.float32], NDArray[np.complex128]]:
     """Uplink channels [m, antennas, subcarriers] as features, and the complex divisor of each.
 
     Every antenna's channel is divided by its root mean square and by the phase of its mean over subcarriers, which
@@ -30,8 +36,10 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
         the divisors [m, antennas].
 
     Raises:
-        InputError: an antenna without any signal in some row.
+        InputError: no uplink, or an antenna without any signal in some row.
     """
+    if uplink is None:
+        raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
     h = np.asarray(uplink, np.complex128)
     rms = np.sqrt(np.square(np.abs(h)).mean(axis=-1))
     if not (np.isfinite(rms) & (rms > 0)).all():
@@ -41,23 +49,16 @@ def normalised_uplink(uplink: NDArray[Any]) -> tuple[NDArray[np.float32], NDArra
     size = np.abs(mean)
     turn = np.where(size > 0, mean / np.where(size > 0, size, 1), 1)  # no phase to remove where the mean is zero
     divisor = rms * turn
-    flat = (h / divisor[..., None]).reshape(-1, h.shape[-1])
-    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32), divisor
+    return real_parts((h / divisor[..., None]).reshape(-1, h.shape[-1])), divisor
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Complex numbers of a ray.
+    """Complex numbers of a ray."""
 
-    Attributes:
-        by_uplink: whether the uplink channel is the condition instead of the position.
-        antennas: antennas of the base station; each is a condition with the uplink, else an output.
-        frequencies_hz: frequency of each output, [outputs]; 0 where unknown.
-    """
-
-    by_uplink: bool
-    antennas: int
-    frequencies_hz: FloatArray
+    by_uplink: bool  # whether the uplink channel is the condition instead of the position
+    antennas: int  # antennas of the base station; each is a condition with the uplink, else an output
+    frequencies_hz: FloatArray  # frequency of each output, [outputs]; 0 where unknown
 
     @property
     def count(self) -> int:
@@ -72,11 +73,7 @@ def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
 
 
 def outputs_of(record: Record) -> Outputs:
-    """The outputs for a record.
-
-    Raises:
-        InputError: different numbers of antennas in uplink and downlink, or an uplink beside several receivers.
-    """
+    """The outputs for a record (InputError: other antennas than the uplink's, or several receivers beside one)."""
     if not task_of(record).is_complex:
         known = record.frequencies_hz
         return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
@@ -129,11 +126,7 @@ def placed_receivers(record: Record, by_uplink: bool) -> tuple[Receiver, ...]:
 
 
 def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> FloatArray | None:
-    """Headings [count] of transmitters, radians; None where a model does not use them.
-
-    Raises:
-        InputError: headings that are missing, not used, of another shape or not finite.
-    """
+    """Headings [count] of transmitters, radians, None for models that use none (InputError: unsuitable ones)."""
     if (heading_rad is not None) != used:
         unused = "does not know how the transmitter is turned; omit heading_rad"
         raise InputError(f"transmitter: the model {'needs headings; give heading_rad' if used else unused}")
@@ -143,13 +136,6 @@ def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> Flo
     if heading.shape != (count,) or not np.isfinite(heading).all():
         raise InputError(f"headings: shape {list(heading.shape)} or not finite; give one for each of {count} rows")
     return heading
-
-
-def known_uplink(uplink: NDArray[Any] | None) -> NDArray[Any]:
-    """The uplink of rows to predict; an `InputError` if it is None."""
-    if uplink is None:
-        raise InputError("fitted to uplink channels, but the rows to predict have none; give `uplink`")
-    return uplink
 
 
 def channel_scales(record: Record, rows: IntArray) -> FloatArray:
@@ -177,8 +163,7 @@ def truth_of(
         channel = observed.reshape(len(rows), outputs.antennas, -1) / divisor[..., None]
     else:
         channel = observed / scales[receiver]
-    flat = channel.reshape(-1, outputs.count)
-    return np.concatenate([flat.real, flat.imag], axis=1).astype(np.float32)
+    return real_parts(channel.reshape(-1, outputs.count))
 
 
 def channels_from(parts: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]) -> NDArray[np.complex64]:

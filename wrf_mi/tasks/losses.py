@@ -20,8 +20,7 @@ from ..backend.device import quads
 from ..core import InputError
 from .scores import SSIM_C1, SSIM_C2, SSIM_SAMPLE, WINDOW
 
-SSIM_WEIGHT = 0.2
-"""Weight of the structural term, eta of the paper."""
+SSIM_WEIGHT = 0.2  # Weight of the structural term, eta of the paper
 BORDER = WINDOW - 1
 
 
@@ -45,13 +44,10 @@ def _mean_error(function: Callable[[Any], Any], prediction: Any, truth: Any) -> 
 def spectrum_loss(
     prediction: Any, truth: Any, batch: int, height: int, width: int, eta: float = SSIM_WEIGHT
 ) -> tuple[Any, Any]:
-    """(1 - eta) L1 + eta (1 - SSIM), averaged over a batch of spectra; arguments as of `ssim`.
+    """(1 - eta) L1 + eta (1 - SSIM), averaged over a batch of spectra; arguments and errors as of `ssim`.
 
     Returns:
         The loss, a Dr.Jit float of one value, and the structural similarity of each spectrum [batch].
-
-    Raises:
-        InputError: an image smaller than the window of SSIM, or arrays of another size or type.
 
     Source: WRF-GS+, the loss of the spectrum synthesis; SSIM of scikit-image.
     """
@@ -61,17 +57,10 @@ def spectrum_loss(
 
 
 def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> Any:
-    """Mean structural similarity of each image, differentiable in the prediction.
+    """Mean structural similarity of each image, a Dr.Jit float array [batch], differentiable in the prediction.
 
-    Args:
-        prediction: flat Dr.Jit float array of ``batch * height * width`` values (a data range of one).
-        truth: array of the same shape and type; taken as constant.
-        batch: number of images.
-        height: rows, at least 7.
-        width: columns, at least 7.
-
-    Returns:
-        Dr.Jit float array [batch].
+    Prediction and truth, which is taken as constant, are flat Dr.Jit float arrays of one type, of ``batch * height *
+    width`` values in a range of one.
 
     Raises:
         InputError: an image smaller than the window, or arrays of another size or type.
@@ -80,9 +69,8 @@ def ssim(prediction: Any, truth: Any, batch: int, height: int, width: int) -> An
         raise InputError(f"image of {height} x {width} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
     if type(prediction) is not type(truth):
         raise InputError(f"prediction is {type(prediction)} and truth {type(truth)}: convert one to the other's type")
-    size = batch * height * width
     for name, array in (("prediction", prediction), ("truth", truth)):
-        if len(array) != size:
+        if len(array) != (size := batch * height * width):
             raise InputError(f"{name} has {len(array)} values, {batch} x {height} x {width} needs {size}: reshape it")
     single: Any = type(prediction)
     double: Any = dr.float64_array_t(single)

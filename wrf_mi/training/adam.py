@@ -1,19 +1,124 @@
-"""A guarded step of Adam, as part of a function that `dr.freeze` can record."""
+"""Schedule of a fit, known before its first step, and guarded steps of Adam that `dr.freeze` can record."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from drjit.opt import Adam
+from numpy.typing import NDArray
 
+from ..core import InputError
+from ..core.types import IntArray
 from ..graph.settings import TRACED_NAMES
-from .schedule import Schedule
+from .config import AdamConfig, DensityConfig, LoopConfig
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Rows and learning rates of each step of a fit."""
+
+    rows: IntArray  # rows of each step's batch, [steps, batch]
+    receiver: IntArray  # receiver of each step, [steps]
+    factor: NDArray[np.float64]  # factor of the learning rates at each step, [steps]
+    decay: NDArray[np.float64]  # decay of the running mean of the parameters at each step, [steps]
+    density: frozenset[int]  # steps after which a round of density control follows
+    joined: int  # first step that may train on the validation rows; ``steps`` if never
+    # first steps of the stages after the first, in ascending order; learning rates fall anew in each, and no state of
+    # the first stage is chosen before its end
+    stages: tuple[int, ...] = ()
+
+    def stage(self, step: int) -> int:
+        """Number of the stage of a step, from 0."""
+        return sum(step >= start for start in self.stages)
+
+    def after(self, best: int) -> tuple[Schedule, int]:
+        """The schedule that continues from the best state, of step ``best``, before the validation rows join.
+
+        Returns:
+            Schedule whose learning rates fall in fewer steps, in proportion to ``best``, and the first of these steps.
+        """
+        last = len(self.rows) - self.joined
+        left = min(last, max(1, round(last * best / self.joined))) if last else 0
+        start = len(self.rows) - left
+        factor = self.factor.copy()
+        if left:
+            # The remaining rates in fewer steps: they still fall to their last value.
+            factor[start:] = self.factor[self.joined + np.arange(left) * last // left]
+        return replace(self, factor=factor), start
+
+
+def plan(
+    config: LoopConfig,
+    train: Sequence[IntArray],
+    everything: Sequence[IntArray],
+    rng: np.random.Generator,
+    density: frozenset[int] = frozenset(),
+    stages: tuple[int, ...] = (),
+) -> Schedule:
+    """The schedule of a fit, a function of settings, rows and seed only: a resumed run gets the same.
+
+    Each epoch visits every row once at every receiver that observed it, in random order; a batch belongs to one
+    receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch. ``train`` are
+    rows (conditions) of each receiver that train while validation rows are held out, ``everything`` all of them;
+    ``density`` and ``stages`` as in `Schedule`.
+
+    Raises:
+        InputError: a receiver without rows that train.
+    """
+    steps = config.steps
+    joined = steps if config.holdout_steps_fraction >= 1 else round(config.holdout_steps_fraction * steps)
+    # Batches have one size, as recorded kernels do.
+    batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
+    if not batch:
+        beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
+        raise InputError(f"no training row at one receiver{beside}: use more rows")
+    plans = _epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)
+    chosen, receiver = (np.concatenate(parts) for parts in zip(*plans, strict=True))
+    t, o = np.arange(steps), config.optimiser
+    factor = np.concatenate([_falling(int(part), o) for part in np.diff([0, *stages, steps])])
+    # Shorten the window of the running mean early in training, or it would be mostly the starting values.
+    decay = np.minimum(o.ema_decay, (t + 1) / (t + 10))
+    return Schedule(chosen, receiver, factor, decay, density, joined, stages)
+
+
+def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
+    # A linear warm-up, and half a cosine. Adam's moments are sums of few gradients at first, and full rates would
+    # follow their noise: hence the warm-up.
+    t, final = np.arange(steps), optimiser.final
+    flat = round(optimiser.cosine_start * steps)
+    cosine = final + (1 - final) * 0.5 * (1 + np.cos(np.pi * np.maximum(t - flat, 0) / max(1, steps - flat)))
+    return np.asarray(cosine * np.minimum(1.0, (t + 1) / max(1, optimiser.warm_up)))
+
+
+def density_rounds(config: DensityConfig, steps: int, before: int = 0) -> frozenset[int]:
+    """Steps after which a round of density control follows; before the last stage there are no Gaussians."""
+    left = steps - before
+    first, last = int(config.start * left), int(config.stop * left)
+    rounds = range(config.every, left, config.every) if config.every else ()
+    return frozenset(before + s for s in rounds if first <= s <= last)
+
+
+def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
+    if steps == 0:
+        return np.empty((0, batch), np.int64), np.empty(0, np.int64)
+    counts = [len(of_receiver) // batch for of_receiver in rows]
+    batches, owners = [], []
+    for _ in range(-(-steps // sum(counts))):
+        drawn = [rng.permutation(r)[: n * batch].reshape(n, batch) for r, n in zip(rows, counts, strict=True)]
+        chosen = np.concatenate(drawn)
+        # Batches of all receivers in turn: a receiver at a time would be forgotten while the others train.
+        order = rng.permutation(len(chosen))
+        batches.append(chosen[order])
+        owners.append(np.repeat(np.arange(len(rows)), counts)[order])
+    return np.concatenate(batches)[:steps], np.concatenate(owners)[:steps]
+
 
 Params = dict[str, Any]
 
@@ -26,15 +131,10 @@ class NumericsError(RuntimeError):
 
 @dataclass
 class NonFiniteReport:
-    """First step whose loss, parameters, gradient or squared gradient were not finite; no step is taken after it.
+    """First step whose loss, parameters, gradient or squared gradient were not finite; no step is taken after it."""
 
-    Attributes:
-        step: number of the step from 1; 0: all finite so far.
-        groups: 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0.
-    """
-
-    step: Any
-    groups: Any
+    step: Any  # number of the step from 1; 0: all finite so far
+    groups: Any  # 1 for the loss and for each watched group (`watched_groups`) that was not finite then, else 0
 
     @classmethod
     def none(cls, names: Iterable[str]) -> NonFiniteReport:
@@ -45,11 +145,8 @@ class NonFiniteReport:
 
 
 def watched_groups(names: Iterable[str]) -> list[str]:
-    """Names of the parameters that `NonFiniteReport` watches, in its order, after the loss.
-
-    Parameters of Gaussians and of the traced side are watched directly, a layer through its bias, whose gradient is the
-    sum of all gradients that reach the layer.
-    """
+    """Names of the parameters that `NonFiniteReport` watches, in its order, after the loss."""
+    # A layer is watched through its bias, whose gradient is the sum of all gradients that reach the layer.
     return [n for n in names if "." not in n or n.endswith(".bias") or n.startswith(TRACED_NAMES)]
 
 
@@ -67,19 +164,12 @@ def rated_params(adam: Adam, rates: Mapping[str, float], factor: Any) -> Params:
 
 @dataclass
 class ScheduledStep:
-    """Numbers of one step, opaque to a recording: as Python numbers they would be recorded as constants.
+    """Numbers of one step, opaque to a recording: as Python numbers they would be recorded as constants."""
 
-    Attributes:
-        factor: factor of the learning rates.
-        decay: decay of the running mean of the parameters.
-        number: number of the step, from 1.
-        trouble: report of the steps before.
-    """
-
-    factor: Any
-    decay: Any
-    number: Any
-    trouble: NonFiniteReport
+    factor: Any  # factor of the learning rates
+    decay: Any  # decay of the running mean of the parameters
+    number: Any  # number of the step, from 1
+    trouble: NonFiniteReport  # report of the steps before
 
     @classmethod
     def of(cls, schedule: Schedule, t: int, trouble: NonFiniteReport) -> ScheduledStep:
@@ -91,15 +181,7 @@ class ScheduledStep:
 def guarded_step(
     adam: Adam, params: Params, loss: Any, mean: Params, step: ScheduledStep
 ) -> tuple[Params, NonFiniteReport, Any]:
-    """Differentiate a loss of ``params`` (`rated_params`) and take a step of Adam in place, unless a value is or was
-    not finite.
-
-    Args:
-        adam: optimiser that owns the parameters.
-        params: parameters, which hold gradients afterwards.
-        loss: loss, one value.
-        mean: running mean of the parameters.
-        step: numbers of the step, and the report so far.
+    """Differentiate a loss of ``params`` (`rated_params`) and step in place, unless a value is or was not finite.
 
     Returns:
         Running mean, report, and whether the step was taken; all unevaluated.

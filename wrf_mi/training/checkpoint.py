@@ -39,11 +39,7 @@ def write_checkpoint(folder: Path, loop: TrainingLoop, beside: Mapping[str, NDAr
 
 
 def read_checkpoint(folder: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of ``checkpoint.npz``.
-
-    Raises:
-        InputError: missing, damaged, or of another format version.
-    """
+    """Arrays of ``checkpoint.npz`` (InputError: missing, damaged, or of another format version)."""
     path = folder / CHECKPOINT
     missing = f"{folder}: no {CHECKPOINT}, the run was stopped early; go on with train --resume"
     with readable(path, missing, "restore it or train anew"):
@@ -76,11 +72,7 @@ def _check_state(path: Path, arrays: Mapping[str, NDArray[Any]], lead: str) -> N
 
 
 def checkpoint_seconds(folder: Path) -> float:
-    """Training time up to the checkpoint in a folder; 0 without a checkpoint.
-
-    Raises:
-        InputError: damaged, or of another format version.
-    """
+    """Training time up to the checkpoint in a folder, 0 without one; errors as `read_checkpoint`."""
     return float(read_checkpoint(folder)["seconds"]) if (folder / CHECKPOINT).exists() else 0.0
 
 
@@ -108,7 +100,6 @@ def cut_log(folder: Path, step: int) -> None:
 
 
 def _step_of(line: bytes) -> int | None:
-    """Step of a line of the log; None if it is damaged."""
     try:
         at = json.loads(line)["step"]
     except (ValueError, TypeError, KeyError, RecursionError):

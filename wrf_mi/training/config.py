@@ -11,16 +11,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import (
-    NOT_NEGATIVE,
-    CheckedSettings,
-    Count,
-    Inside,
-    Positive,
-    Share,
-    ShareBelow1,
-    with_settings,
-)
+from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Inside, Positive, Share, ShareBelow1, with_settings
 from ..gaussians.network import unambiguous_scale
 from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
@@ -31,56 +22,38 @@ AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and le
 
 @dataclass(frozen=True)
 class AdamConfig:
-    """Adam (Kingma and Ba 2015): warm-up, then a cosine to ``final`` of each rate.
+    """Adam (Kingma and Ba 2015): warm-up, then a cosine to ``final`` of each rate."""
 
-    Attributes:
-        network: rate of all networks.
-        warm_up: steps over which rates rise from zero.
-        cosine_start: share of the steps after which rates begin to fall.
-        final: final factor of each rate.
-        ema_decay: decay per step of the running mean of the parameters, which is evaluated and stored.
-    """
-
-    network: float = 1e-3
-    warm_up: int = 100
-    cosine_start: Share = 0.0
-    final: Share = 0.01
+    network: float = 1e-3  #: rate of all networks
+    warm_up: int = 100  #: steps over which rates rise from zero
+    cosine_start: Share = 0.0  #: share of the steps after which rates begin to fall
+    final: Share = 0.01  #: final factor of each rate
+    #: decay per step of the running mean of the parameters, which is evaluated and stored
     ema_decay: ShareBelow1 = 0.999
 
 
 @dataclass(frozen=True)
 class LoopConfig(CheckedSettings):
-    """Settings of `wrf_mi.training.loop.TrainingLoop`.
+    """Settings of `wrf_mi.training.loop.TrainingLoop`."""
 
-    Attributes:
-        steps: optimiser steps.
-        batch: largest number of samples in a step.
-        holdout_steps_fraction: share of the steps in which the validation rows are kept out of training. 1 keeps them
-            out to the end, as every choice of settings must; less ends with a fit on all training rows.
-        patience: number of scores on the validation rows without improvement after which the fit goes on from the best
-            state with all training rows, for a share of the steps that led to it. 0: all steps are taken, and the last
-            state counts.
-        checkpoint_every: steps between two checkpoints.
-        log_every: steps between two lines of the log.
-        validate_every: steps between two scores on the validation rows.
-        optimiser: learning rates and running mean.
-    """
-
-    steps: Count = 1000
-    batch: Count = 1
+    steps: Count = 1000  #: optimiser steps
+    batch: Count = 1  #: largest number of samples in a step
+    #: share of the steps in which the validation rows are kept out of training. 1 keeps them out to the end, as every
+    #: choice of settings must; less ends with a fit on all training rows
     holdout_steps_fraction: Share = 0.7
+    #: number of scores on the validation rows without improvement after which the fit goes on from the best state with
+    #: all training rows, for a share of the steps that led to it. 0: all steps are taken, and the last state counts
     patience: int = 0
-    checkpoint_every: Count = 2000
-    log_every: Count = 100
-    validate_every: Count = 1000
-    optimiser: AdamConfig = field(default_factory=AdamConfig)
+    checkpoint_every: Count = 2000  #: steps between two checkpoints
+    log_every: Count = 100  #: steps between two lines of the log
+    validate_every: Count = 1000  #: steps between two scores on the validation rows
+    optimiser: AdamConfig = field(default_factory=AdamConfig)  #: learning rates and running mean
 
 
 _OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}
 
 
-def _chosen(options: Any) -> list[str]:
-    """Settings that are not null, as ``--set`` takes them."""
+def _chosen(options: Any) -> list[str]:  # settings that are not null, as ``--set`` takes them
     values = {name: getattr(options, name) for name in _OPTIONAL}
     return [f"{name}={value}" for name, value in values.items() if value is not None]
 
@@ -96,65 +69,41 @@ LoopOptions: Any = make_dataclass(
 
 @dataclass(frozen=True)
 class InitialConfig:
-    """Starting values of Gaussians: random, or from one of ``points``, ``mesh`` and ``paths``.
+    """Starting values of Gaussians: random, or from one of ``points``, ``mesh`` and ``paths``."""
 
-    Attributes:
-        gaussians: number of Gaussians.
-        points: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres.
-        mesh: scene (`wrf_mi.tracing.open_scene`) on whose surfaces they start.
-        paths: scene whose traced paths of the training transmitters they start from.
-        size_deg: standard deviation of a random Gaussian as seen from its receiver, degrees.
-        nearest_m: smallest distance of a random Gaussian from its receiver, metres.
-        farthest_m: largest distance, metres.
-        opacity: alpha at a footprint's centre.
-        signal: standard deviation of the starting signals.
-    """
-
-    gaussians: Count = 270
-    points: str = ""
-    mesh: str = ""
-    paths: str = ""
-    size_deg: AcuteAngle = 7.0
-    nearest_m: Positive = 1.0
-    farthest_m: Positive = 8.0
-    opacity: Inside = 0.4
-    signal: float = 0.3
+    gaussians: Count = 270  #: number of Gaussians
+    points: str = ""  #: file with a point cloud (.ply, .xyz, .npz with ``points``), world frame, metres
+    mesh: str = ""  #: scene (`wrf_mi.tracing.open_scene`) on whose surfaces they start
+    paths: str = ""  #: scene whose traced paths of the training transmitters they start from
+    size_deg: AcuteAngle = 7.0  #: standard deviation of a random Gaussian as seen from its receiver, degrees
+    nearest_m: Positive = 1.0  #: smallest distance of a random Gaussian from its receiver, metres
+    farthest_m: Positive = 8.0  #: largest distance, metres
+    opacity: Inside = 0.4  #: alpha at a footprint's centre
+    signal: float = 0.3  #: standard deviation of the starting signals
 
 
 @dataclass(frozen=True)
 class EncodingConfig:
-    """Positional encoding (`wrf_mi.gaussians.network`).
+    """Positional encoding (`wrf_mi.gaussians.network`)."""
 
-    Attributes:
-        position_octaves: octaves for Gaussians, L + 1 of the paper.
-        position_scale_m: metres per unit for Gaussians.
-        tx_octaves: octaves for transmitters.
-        tx_scale_m: metres per unit for transmitters; 0: the smallest multiple of `LEAST_TX_SCALE_M` that distinguishes
-            all training transmitters.
-    """
-
-    position_octaves: Count = 4
-    position_scale_m: Positive = 4.0
-    tx_octaves: int = 4
+    position_octaves: Count = 4  #: octaves for Gaussians, L + 1 of the paper
+    position_scale_m: Positive = 4.0  #: metres per unit for Gaussians
+    tx_octaves: int = 4  #: octaves for transmitters
+    #: metres per unit for transmitters; 0: the smallest multiple of `LEAST_TX_SCALE_M` that distinguishes all training
+    #: transmitters
     tx_scale_m: float = 0.0
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Size of the networks, which dominate a field's size and time.
+    """Size of the networks, which dominate a field's size and time."""
 
-    Attributes:
-        width: neurons of a layer; 0: the paper's (256 for WRF-GS+, 128 for WRF-GS), 128 for a factorised field.
-        layers: hidden layers; 0: the paper's eight, three for a factorised field. WRF-GS+ joins its input again
-            half-way.
-        terms: terms of a factorised field; 0: 32.
-        static_geometry: WRF-GS+ moves only signals with the transmitter, not rotation and scale: the map from signals
-            to the receiver is then the same for all transmitters.
-    """
-
-    width: int = 0
+    width: int = 0  #: neurons of a layer; 0: the paper's (256 for WRF-GS+, 128 for WRF-GS), 128 for a factorised field
+    #: hidden layers; 0: the paper's eight, three for a factorised field. WRF-GS+ joins its input again half-way
     layers: int = 0
-    terms: int = 0
+    terms: int = 0  #: terms of a factorised field; 0: 32
+    #: WRF-GS+ moves only signals with the transmitter, not rotation and scale: the map from signals to the receiver is
+    #: then the same for all transmitters
     static_geometry: bool = False
 
     FIXED: ClassVar[Mapping[str, float]] = {"phase_hz": 0.0}
@@ -162,61 +111,37 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """Directions of a single antenna, which may be coarse as their signals are summed.
+    """Directions of a single antenna, which may be coarse as their signals are summed."""
 
-    Attributes:
-        height: elevations of each hemisphere.
-        columns: azimuths.
-        components: largest number of complex signals of a Gaussian, coefficients of the principal components of
-            channels.
-    """
-
-    height: Count = 9
-    columns: Count = 36
+    height: Count = 9  #: elevations of each hemisphere
+    columns: Count = 36  #: azimuths
+    #: largest number of complex signals of a Gaussian, coefficients of the principal components of channels
     components: Count = 6
 
 
 @dataclass(frozen=True)
 class OptimiserConfig(AdamConfig):
-    """Adam with a rate for each parameter group of Gaussians.
+    """Adam with a rate for each parameter group of Gaussians."""
 
-    Attributes:
-        position: rate of centres, metres.
-        scale: rate of log scales.
-        rotation: rate of quaternions.
-        opacity: rate of opacity logits.
-        signal: rate of static signals.
-        level: rate of the logarithm of each receiver's unit of the field, where it has one.
-    """
-
-    position: float = 5e-3
-    scale: float = 5e-3
-    rotation: float = 2e-3
-    opacity: float = 2e-2
-    signal: float = 5e-3
-    level: float = 2e-2
+    position: float = 5e-3  #: rate of centres, metres
+    scale: float = 5e-3  #: rate of log scales
+    rotation: float = 2e-3  #: rate of quaternions
+    opacity: float = 2e-2  #: rate of opacity logits
+    signal: float = 5e-3  #: rate of static signals
+    level: float = 2e-2  #: rate of the logarithm of each receiver's unit of the field, where it has one
 
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Adaptive density control (Kerbl et al. 2023, section 5.2; `wrf_mi.gaussians.initial`).
+    """Adaptive density control (Kerbl et al. 2023, section 5.2; `wrf_mi.gaussians.initial`)."""
 
-    Attributes:
-        every: steps between two rounds; 0 turns it off.
-        start: share of the steps before the first round.
-        stop: share of the steps after the last round.
-        growth_fraction: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a
-            round.
-        max_gaussians: largest number of Gaussians.
-        reset_every: rounds between two opacity resets; 0 turns them off.
-    """
-
-    every: int = 1000
-    start: Share = 0.05
-    stop: Share = 0.4
+    every: int = 1000  #: steps between two rounds; 0 turns it off
+    start: Share = 0.05  #: share of the steps before the first round
+    stop: Share = 0.4  #: share of the steps after the last round
+    #: share of the Gaussians, those with the largest mean gradient, that are cloned or split in a round
     growth_fraction: Share = 0.05
-    max_gaussians: Count = 320
-    reset_every: int = 0
+    max_gaussians: Count = 320  #: largest number of Gaussians
+    reset_every: int = 0  #: rounds between two opacity resets; 0 turns them off
 
     # Constants of `wrf_mi.gaussians.initial`, which run files of earlier versions have as settings.
     FIXED: ClassVar[Mapping[str, float]] = {"split_deg": 5.0, "least_opacity": 0.005, "reset_opacity": 0.05}
@@ -224,13 +149,9 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Loss of spectra: (1 - eta) L1 + eta (1 - SSIM), as in the WRF-GS papers.
+    """Loss of spectra: (1 - eta) L1 + eta (1 - SSIM), as in the WRF-GS papers."""
 
-    Attributes:
-        ssim_weight: eta.
-    """
-
-    ssim_weight: Share = 0.2
+    ssim_weight: Share = 0.2  #: eta
 
 
 PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians
@@ -285,11 +206,6 @@ class TrainConfig(LoopConfig):
         return dataclasses.replace(self, steps=steps, encoding=dataclasses.replace(self.encoding, tx_scale_m=scale))
 
     def __post_init__(self) -> None:
-        """Refuse values that no fit can use.
-
-        Raises:
-            InputError: naming the setting.
-        """
         super().__post_init__()
         sources = [name for name in ("points", "mesh", "paths") if getattr(self.initial, name)]
         if len(sources) > 1:
@@ -358,9 +274,7 @@ JOINT: Mapping[str, tuple[str, ...]] = {"rssi": JOINT_STRENGTHS, "csi": JOINT_ON
 
 
 def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
-    """Settings of a task that differ from `TrainConfig`, as ``--set`` takes them; ``image``: whether observations are
-    images.
-    """
+    """Settings of a task that differ from `TrainConfig`; ``image``: whether observations are images."""
     # Images are the papers' task: `TrainConfig` has their settings.
     if image:
         return JOINT_IMAGES if with_scene else ()
@@ -373,11 +287,7 @@ def default_config(task: str, with_scene: bool = False) -> TrainConfig:
 
 
 def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:
-    """The settings of a fit of paths alone.
-
-    Args:
-        parts: names in `CALIBRATED` of what is fitted; the other parts are held.
-        images: whether observations are images.
+    """The settings of a fit of paths alone, of the parts of `CALIBRATED`; ``images``: whether observations are images.
 
     Raises:
         InputError: no part, or an unknown one.

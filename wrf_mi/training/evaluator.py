@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +28,7 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
 from ..core.types import IntArray
 from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
-from ..gaussians.operator import Coefficients, Images, PixelOperator, pixel_weights, static_signals
+from ..gaussians.operator import Images, PixelOperator, pixel_weights, static_signals
 from ..gaussians.parameters import CHUNK_SIZE
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph, Report
@@ -46,25 +47,15 @@ MOST_BYTES = 1 << 30  # largest size of one receiver's weights; larger fields ar
 
 @dataclass(frozen=True)
 class Request:
-    """Transmitters whose reports of one port are evaluated.
+    """Transmitters whose reports of one port are evaluated."""
 
-    Attributes:
-        condition: positions [m, 3], metres, or features [m, features].
-        port: number of the port.
-        side: its traced side, or None.
-        slots: rows of the traced side [m].
-        weight: weight of the Gaussians' signal [m], 0 to 1; None: 1.
-        alone: component reported alone (`Graph.report`); None: both together.
-        phase_error: see `Graph.report`.
-    """
-
-    condition: FloatArray
-    port: int
-    side: TracedField | None
-    slots: IntArray
-    weight: NDArray[Any] | None = None
-    alone: Alone | None = None
-    phase_error: float = 0.0
+    condition: FloatArray  # positions [m, 3], metres, or features [m, features]
+    port: int  # number of the port
+    side: TracedField | None  # its traced side, or None
+    slots: IntArray  # rows of the traced side [m]
+    weight: NDArray[Any] | None = None  # weight of the Gaussians' signal [m], 0 to 1; None: 1
+    alone: Alone | None = None  # component reported alone (`Graph.report`); None: both together
+    phase_error: float = 0.0  # see `Graph.report`
 
     def rows(self, chosen: slice) -> Request:
         """The request for some of the transmitters."""
@@ -73,14 +64,7 @@ class Request:
 
 
 class Evaluator(ABC):
-    """Evaluates reports of a graph with one set of parameters.
-
-    Args:
-        graph: Gaussians, paths and receivers.
-
-    Attributes:
-        params: parameters, Dr.Jit tensors.
-    """
+    """Evaluates reports of a graph with one set of parameters, Dr.Jit tensors."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -96,16 +80,12 @@ class Evaluator(ABC):
 
 
 class _InBatches(Evaluator):
-    """Evaluates batches of transmitters by functions of Dr.Jit, recorded where it can record them.
-
-    Attributes:
-        recordings: recorded functions by their names and numbers of transmitters.
-    """
+    """Evaluates batches of transmitters by functions of Dr.Jit, recorded where it can record them."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__(graph)
         self._places, self._count = places_of(graph), 0
-        self.recordings: dict[tuple[Hashable, int], Recorded] = {}
+        self.recordings: dict[tuple[Hashable, int], Recorded] = {}  # by names and numbers of transmitters
 
     def update(self, params: Params) -> None:
         """Replace the parameters (Dr.Jit tensors)."""
@@ -134,17 +114,13 @@ class _InBatches(Evaluator):
     def _evaluated(self, request: Request) -> Any:
         """Flat report of a batch, a Dr.Jit array."""
 
-    def _plain(self, report: Report, request: Request, **signal: Any) -> Any:
-        """A report that is not recorded."""
+    def _not_recorded(self, report: Report, request: Request, **signal: Any) -> Any:
         place = self._places[request.port]
         return evaluated(report, self.params, request.condition.T, place, request.slots, request.weight, **signal)
 
     def _may_record(self, size: int) -> bool:
-        """Whether functions of Gaussians are recorded for batches of a size.
-
-        Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
-        room for all: neither is for very many Gaussians.
-        """
+        # Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
+        # room for all: neither is for very many Gaussians.
         return self.graph.evaluation.recordable and self._count * size <= CHUNK_SIZE
 
     def _recorded(
@@ -187,23 +163,17 @@ class _InBatches(Evaluator):
 class SplattedReports(_InBatches):
     """Reports of Gaussians alone, splatted."""
 
-    @property
-    def _pixels(self) -> bool:
-        return self.graph.form.receiver == PIXEL
-
     def _batch_size(self, numbers: int) -> int:
         # An image of thousands of pixels fills the processors, and one recording serves any number of transmitters.
-        return 1 if self._pixels else TOGETHER
+        return 1 if self.graph.form.receiver == PIXEL else TOGETHER
 
     def _evaluated(self, request: Request) -> Any:
         size, port = self._batch_size(1), request.port
         if not self._may_record(size):
-            return self._plain(self.graph.report(port, None, chunked=True), request)
+            return self._not_recorded(self.graph.report(port, None, chunked=True), request)
         # One recording serves the pixels of all ports, whose poses are arguments.
-        name = "report", None if self._pixels else port
-        return self._recorded(
-            name, size, self.graph.report(port, None), request, partial(self.graph.arrays, port, None)
-        )
+        name, read = ("report", None if size == 1 else port), partial(self.graph.arrays, port, None)
+        return self._recorded(name, size, self.graph.report(port, None), request, read)
 
 
 class TracedReports(_InBatches):
@@ -232,7 +202,7 @@ class TracedReports(_InBatches):
             name = "signal", port if self.graph.moves else None
             signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
         report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
-        return self._plain(report, request, signal=signal)
+        return self._not_recorded(report, request, signal=signal)
 
     def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
         """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""
@@ -252,11 +222,8 @@ class OperatorReports(Evaluator):
 
         operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
 
-    The file is a cache: its key is a digest of all that the weights depend on, including the package's version.
-
-    Args:
-        graph: Gaussians whose geometry and attenuation do not depend on the transmitter.
-        store: folder of the files; None: in memory only.
+    The file, in the folder ``store`` unless that is None, is a cache: its key is a digest of all that weights depend
+    on, including the package's version. Geometry and attenuation of Gaussians must not depend on the transmitter.
     """
 
     def __init__(self, graph: Graph, store: Path | None) -> None:
@@ -264,27 +231,14 @@ class OperatorReports(Evaluator):
         self._store, self._field = store, cast(Field, graph.field)
         self._ready: dict[int, Images | PixelOperator] = {}
 
-    @cached_property
-    def _arrays(self) -> dict[str, NDArray[np.float32]]:
-        return {name: dr.detach(values).numpy() for name, values in self.params.items()}
-
-    @cached_property
-    def _signals(self) -> tuple[NDArray[np.complex64] | None, Coefficients]:
-        return static_signals(self._field, self._arrays)
-
     def update(self, params: Params) -> None:
         """Replace the parameters; operators are built anew at the next prediction."""
         super().update(params)
-        self._ready = {}
-        for derived in ("_arrays", "_signals"):
-            vars(self).pop(derived, None)
+        self._arrays = {name: dr.detach(values).numpy() for name, values in params.items()}
+        self._signals, self._ready = static_signals(self._field, self._arrays), {}
 
     def __call__(self, request: Request) -> NDArray[np.float32]:
-        """Magnitudes [m, height, width].
-
-        Raises:
-            MemoryError: weights of more than `MOST_BYTES`.
-        """
+        """Magnitudes [m, height, width] (MemoryError: weights of more than `MOST_BYTES`)."""
         receiver, (factors, coefficients) = request.port, self._signals
         if receiver not in self._ready:
             operator = PixelOperator(self._weights(receiver), *self.graph.form.size)
@@ -316,17 +270,10 @@ class OperatorReports(Evaluator):
             pose, plane = device_pose(self.graph.receivers[receiver]), perception_plane(*size, mi.Float)
             weights = pixel_weights(gaussians, pose, plane, MOST_BYTES)
         if path is not None:
-            write_weights(path, key, weights)
+            parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+            with suppress(OSError):  # a run in a folder of someone else is predicted all the same
+                write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
         return weights
-
-
-def write_weights(path: Path, key: str, weights: csr_array) -> None:
-    """Store weights if the folder can be written."""
-    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
-    try:
-        write_arrays(path, {"format": np.asarray(FORMAT), "key": np.asarray(key)} | parts, checksum=True)
-    except OSError:  # a run in a folder of someone else is predicted all the same
-        return
 
 
 def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | None:

@@ -1,33 +1,256 @@
-"""Data, graph and schedule of a fit, known before its first step."""
+"""Data, field, graph and schedule of a fit, known before its first step.
+
+A *condition* is the input of a field: a row's transmitter position, or the uplink channel of one antenna of a row.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..core import InputError, Receiver, Record, Split
+from ..core.angles import FloatArray
+from ..core.memory import require_memory
+from ..core.types import IntArray
 from ..datasets.observations import check_observations
+from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..graph.graph import Field, Graph
+from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import task_of
-from ..tasks.conditions import placed_receivers
+from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
-from .config import TrainConfig
-from .fields import check_memory, field_of
-from .schedule import Schedule, density_rounds, plan
+from .adam import Schedule, density_rounds, plan
+from .config import PATHS_ALONE, TrainConfig
 from .selection import hold_out_groups
-from .targets import form_of, targets_of
+
+BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
+"""Memory of a training step for each neuron, and beside networks, of each pair of a Gaussian and a transmitter, and for
+each number of a Gaussian (its value, gradient, moments, running mean and best state): measured on 4,000 and 16,000
+Gaussians of the three fields, within a third."""
+MOST_NUMBERS = (1 << 32) - 1  # most numbers of an array of Dr.Jit
+
+
+def field_of(config: TrainConfig, form: Form) -> Field | None:
+    """The field for observations of a form (`make_field`); None: paths are trained alone."""
+    if config.model == PATHS_ALONE:
+        return None
+    return make_field(config, form.components, form.features, form.carriers_hz is not None)
+
+
+def make_field(config: TrainConfig, components: int = 1, features: int = 0, carrier: bool = False) -> Field:
+    """The field of a configuration, of ``components`` complex signals of a Gaussian.
+
+    ``features`` is the number of those that describe a transmitter instead of its position; 0: its position.
+    ``carrier``: whether networks see the carrier.
+
+    Raises:
+        InputError: no trainable model of that name, unsuitable settings, or an unresolved scale of transmitters.
+    """
+    model, e, n = config.model, config.encoding, config.network
+    if model not in FIELDS:
+        raise InputError(f"model {model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
+    if not e.tx_scale_m:
+        raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
+    plus = model == "wrf-gs+"
+    if n.static_geometry and not plus:
+        raise InputError(f"setting network.static_geometry: {model} always moves signals alone; omit it")
+    if n.terms and model != "factorised":
+        raise InputError(f"setting network.terms: {model} has none; omit it")
+    sizes: dict[str, Any] = {name: getattr(n, name) for name in ("width", "layers", "terms") if getattr(n, name)}
+    if model == "wrf-gs" and n.width:
+        sizes["signal_widths"] = (n.width, max(1, n.width // 2))
+    if plus:
+        sizes["static_geometry"] = n.static_geometry
+        sizes |= {"skip": n.layers // 2} if n.layers else {}
+    encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
+    field: Field = FIELDS[model](encoding=encoding, components=components, **sizes)
+    return field
+
+
+def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
+    """Shapes of the parameters of a field with four Gaussians, by name."""
+    place, rng = Receiver("", np.zeros(3), np.array([0.0, 0, 0, 1])), np.random.default_rng(0)
+    return {name: values.shape for name, values in field.init(random_gaussians([place], 4, rng), rng).items()}
+
+
+def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
+    """Refuse parameters of a file ``source`` that are missing, not finite, or of other shapes than the field's."""
+    for name, values in params.items():
+        if values.dtype.kind != "f" or not np.isfinite(values).all():
+            raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
+    if field is None:
+        return
+    # The backend ends the process on other shapes.
+    count = params["position"].shape[1] if "position" in params else 0
+    for name, shape in _shapes(field).items():
+        wanted = (shape[0], count) if name in field.per_gaussian else shape
+        shape_in_file = params[name].shape if name in params else "none"
+        if shape_in_file != wanted or not count:
+            text = f"parameter {name} of shape {shape_in_file}, where the settings need {wanted}"
+            raise InputError(f"{source}: {text}; train the run anew")
+
+
+def check_memory(config: TrainConfig, field: Field) -> None:
+    """Refuse a training step that does not fit into memory; raises InputError."""
+    density = config.density
+    # Of the largest field that density control may grow, so that no fit ends in its middle.
+    count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)
+    sizes = _shapes(field)
+    neurons = sum(shape[0] for name, shape in sizes.items() if name.endswith(".bias"))
+    numbers = sum(sizes[name][0] for name in field.per_gaussian)
+    widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=numbers)
+    grown = count > config.initial.gaussians
+    what = f"setting {'density.max_gaussians' if grown else 'initial.gaussians'}={count} with batch={config.batch}: "
+    remedy = "lower one of them, or network.width"
+    pairs = count * config.batch
+    # The widest layer has its width of numbers for every pair; Dr.Jit's indices of 32 bits would wrap around unnoticed.
+    if pairs * widest > MOST_NUMBERS:
+        raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
+    # `require_memory` knows the machine's memory, not that of a GPU.
+    if not (mi.variant() or "").startswith("cuda"):
+        step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
+        require_memory(step + BYTES_PER_NUMBER * count * numbers, f"{what}a training step", remedy)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Conditions and observations of a record."""
+
+    condition: FloatArray  # positions [3, c] in metres or features [features, c]
+    truth: NDArray[np.float32]  # float32 [n_rx, c, *shape of a report], NaN where nothing was received
+    unit: FloatArray  # unit of each receiver's differences in the loss, [n_rx]
+    per_row: int = 1  # number of consecutive conditions of a row
+    weight: FloatArray | None = None  # factor of each observation's difference in the loss [n_rx, c]; None: 1
+    carriers_hz: FloatArray | None = None  # carriers of the training rows, ascending; None: rows have a single carrier
+    carrier: IntArray | None = None  # number of each condition's carrier [c], -1 for carriers without training rows
+
+    @property
+    def ports(self) -> int:
+        """Number of receivers times that of carriers."""
+        return len(self.truth) * self.carriers
+
+    @property
+    def carriers(self) -> int:
+        """Number of carriers of the training rows."""
+        return 1 if self.carriers_hz is None else len(self.carriers_hz)
+
+    def at(self, port: int, conditions: IntArray) -> IntArray:
+        """Those of some conditions that have a port's carrier."""
+        return conditions if self.carrier is None else conditions[self.carrier[conditions] == port % self.carriers]
+
+    def conditions(self, rows: IntArray) -> IntArray:
+        """Numbers of the conditions of rows."""
+        return np.asarray((rows[:, None] * self.per_row + np.arange(self.per_row)).ravel())
+
+    def received(self, port: int, rows: IntArray) -> IntArray:
+        """Conditions of those rows that a port's receiver observed at its carrier."""
+        chosen = self.at(port, self.conditions(rows))
+        return np.asarray(chosen[self._complete[port // self.carriers, chosen]])
+
+    @cached_property
+    def _complete(self) -> NDArray[np.bool_]:
+        """Whether each receiver observed each condition [n_rx, c]; of images it takes long, and is asked for often."""
+        return np.asarray(np.isfinite(self.truth).all(axis=tuple(range(2, self.truth.ndim))))
+
+
+def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targets:
+    """Conditions and observations of a record; units are measured on training rows.
+
+    An uplink is the condition where there is one, except beside paths of a scene, which are traced from positions.
+
+    Raises:
+        InputError: an unknown position, or an uplink without a signal or with a different number of antennas.
+    """
+    task, observed = task_of(record), np.asarray(record.observation)
+    if record.uplink is None or with_scene:
+        if not np.isfinite(record.tx_pos_m[rows]).all():
+            row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
+            raise InputError(f"{record.name} has no position in row {row}; choose a model that needs none")
+        units = np.array([task.unit(values[rows]) for values in observed])
+        weight = _weights(record, rows)
+        targets = Targets(np.ascontiguousarray(record.tx_pos_m.T, float), _real(observed), units, weight=weight)
+        if record.carriers_hz is None:
+            return targets
+        carriers = np.unique(record.carriers_hz[rows])
+        number = np.where(np.isin(record.carriers_hz, carriers), np.searchsorted(carriers, record.carriers_hz), -1)
+        return replace(targets, carriers_hz=carriers, carrier=number)
+    outputs = outputs_of(record)
+    features, divisor = normalised_uplink(record.uplink)
+    # Divided as the uplink is: path loss and the radios' phases are equal in both links and need not be learned.
+    channels = observed[0].reshape(len(record), outputs.antennas, -1) / divisor[..., None]
+    truth = _real(channels.reshape(1, -1, outputs.count).astype(np.complex64))
+    received = Targets(np.zeros((0, 0)), truth, np.ones(1), outputs.antennas).received(0, rows)
+    # Root mean square of the complex numbers, whose two parts have half of the mean square each.
+    unit = float(np.sqrt(2 * np.mean(np.square(truth[0, received], dtype=float)))) or 1.0
+    return Targets(np.asarray(features.T, float), truth, np.array([unit]), outputs.antennas)
+
+
+def _weights(record: Record, rows: IntArray) -> FloatArray | None:
+    # Inverse standard deviation of the noise, 1 in other rows: differences become standardised residuals, an absolute
+    # error is weighted by 1 / std, a squared one by 1 / variance.
+    precision = record.precision(rows)
+    if precision is None:
+        return None
+    weight, inverse = np.ones(record.observation.shape[:2]), np.sqrt(precision)
+    # A mean of 1, so that learning rates and losses compare with those of unweighted rows.
+    weight[:, rows] = inverse / inverse[np.isfinite(record.observation[:, rows])].mean()
+    return weight
+
+
+def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Complex values with a last axis of real and imaginary part."""
+    if not np.iscomplexobj(values):
+        return np.ascontiguousarray(values, np.float32)
+    single = np.ascontiguousarray(values, np.complex64)
+    return single.view(np.float32).reshape(*single.shape, 2)
+
+
+def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
+    """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
+    task = task_of(record)
+    default = task.receiver_with_scene if with_scene else task.receiver
+    if not default:
+        raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
+    name = default if config.receiver == AUTO else config.receiver
+    receiver_kind(name, task.name)
+    height, width = map(int, record.observation.shape[-2:] if task.image else (config.view.height, config.view.columns))
+    basis = _basis(targets, rows, config.view.components) if task.is_complex else None
+    outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
+    features = 0 if record.uplink is None or with_scene else len(targets.condition)
+    headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
+    if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
+        raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
+    # The tracer finds no path through many walls; what was measured there is the weakest of all.
+    floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
+    size, carriers_hz = (height, width), targets.carriers_hz
+    return Form(name, size, record.frequencies_hz, outputs, basis, features, headings, floor_db, carriers_hz)
+
+
+def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:
+    """Principal components [components, outputs] of the training rows' channels, without subtraction of the mean."""
+    # Receivers have equal weight, as scores are relative.
+    power: NDArray[np.complex128] | float = 0.0
+    for receiver in range(len(targets.truth)):
+        pairs = targets.truth[receiver, targets.received(receiver, rows)].astype(float)
+        channels = (pairs[..., 0] + 1j * pairs[..., 1]).reshape(len(pairs), -1)
+        power = power + channels.conj().T @ channels / (np.square(np.abs(channels)).sum() or 1.0)
+    _, vectors = np.linalg.eigh(power)
+    # Rows v^H: a channel h has coefficients h v and is their sum with v^H.
+    return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
+
 
 CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
 """Stages of a training: parameters of paths; Gaussians on surfaces with them; and the field's Gaussians, too."""
 
 
 def check_rows(split: Split, record: Record, source: str) -> None:
-    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message.
-
-    Raises:
-        InputError: such a row.
-    """
+    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message; raises InputError."""
     rows = np.concatenate([split.train, split.validation, split.test])
     bad = rows[(rows < 0) | (rows >= len(record))]
     if len(bad):
@@ -38,16 +261,11 @@ class FitPlan:
     """Data, graph and schedule of a fit, a function of its arguments, those of `wrf_mi.training.trainer.Trainer`.
 
     Attributes:
-        record, split: data.
-        task: task of the record.
         config: settings with number of steps and scale of transmitters.
-        targets: conditions and observations.
-        graph: Gaussians, paths and receivers.
         stages: names of the stages in their order.
         in_groups: whether the state is chosen on rows held out in groups, far from the training rows too.
         choosing: split of these rows; ``split`` itself where there are none.
         unjudged: whether the training rows do not suffice for such groups.
-        schedule: rows and learning rates of each step.
         known: slots of the traced sides by port: conditions that train or choose at its carrier.
 
     Raises:
@@ -89,11 +307,7 @@ class FitPlan:
         return self.in_groups and self.graph.scene is not None
 
     def traced(self) -> list[TracedField | None]:
-        """Traced side of the training rows at each port; None without a scene.
-
-        Raises:
-            InputError: a transmitter or receiver inside a solid.
-        """
+        """Traced side of the training rows at each port, None without a scene (InputError: positions in a solid)."""
         record, rows, form = self.record, self.split.all_train, self.graph.form
         self.graph.check(record.tx_pos_m)
         headings = record.tx_heading_rad if form.headings else None
@@ -103,7 +317,6 @@ class FitPlan:
         return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, heading, carrier)]
 
     def _stage_names(self) -> tuple[str, ...]:
-        """Stages in their order: paths, Gaussians on surfaces, those of the field if there is one."""
         if self.graph.scene is None:
             return (FIELD,)
         traced = self.config.traced
@@ -111,12 +324,9 @@ class FitPlan:
         return (CALIBRATION, *more) if traced.alone else (more or (CALIBRATION,))[-1:]
 
     def _planned(self) -> Schedule:
-        """The schedule, in which each port learns from its receiver's observations."""
         config, targets = self.config, self.targets
-        everything, train = (
-            [targets.received(port, rows) for port in range(targets.ports)]
-            for rows in (self.choosing.all_train, self.choosing.train)
-        )
+        parts, ports = (self.choosing.all_train, self.choosing.train), range(targets.ports)
+        everything, train = ([targets.received(port, rows) for port in ports] for rows in parts)
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
         alone, end = config.traced.alone, config.holdout_steps_fraction

@@ -50,23 +50,22 @@ def gaussians_from_paths(
     """Gaussians on clusters of the last points of interaction of traced paths (of direct paths: the transmitter).
 
     Points are clustered by direction and distance from their receiver, weighted by power; a cluster's mean is the
-    centre, its spread the scale, its mean power the signal and (relative to the strongest) the opacity.
-
-    Args:
-        paths: paths of the training transmitters.
-        tx_pos_m: these transmitters [n, 3], metres.
-        receivers: receivers of the paths.
-        count: number of Gaussians.
-        rng: generator of the clusters' first centres.
-        opacity: opacity of the strongest Gaussian; the weakest has a tenth of it.
-        signal: amplitude of the strongest Gaussian.
+    centre, its spread the scale, its mean power the signal and (relative to the strongest) the opacity. ``tx_pos_m``
+    are the transmitters of the paths [n, 3], metres; ``opacity`` and ``signal`` opacity and amplitude of the strongest
+    of ``count`` Gaussians.
 
     Raises:
         InputError: no path.
     """
     if not len(paths):
         raise InputError("start from paths: no path arrives; trace more kinds of path, or start at random")
-    last, features = _last_points(paths, tx_pos_m, receivers)
+    bounces = paths.bounces
+    last = paths.vertices_m[np.arange(len(paths)), np.maximum(bounces - 1, 0)]
+    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
+    away = last - np.stack([receiver.position_m for receiver in receivers])[paths.rx]
+    distance = np.linalg.norm(away, axis=1)
+    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
+    features = np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
     power = np.abs(paths.gain) ** 2
     # Centres are found on a sample, as paths may be millions; every path then joins the nearest.
     drawn = rng.choice(len(paths), min(len(paths), 40 * count), replace=False)
@@ -76,7 +75,7 @@ def gaussians_from_paths(
     used = np.unique(label)
     # With fewer clusters than Gaussians random clusters are taken more than once.
     chosen = np.concatenate([used, rng.choice(used, count - len(used))]) if len(used) < count else used
-    position, scale, strength, phase = np.empty((count, 3)), np.empty(count), np.empty(count), np.empty(count)
+    position, (scale, strength, phase) = np.empty((count, 3)), np.empty((3, count))
     for index, cluster in enumerate(chosen):
         members = np.flatnonzero(label == cluster)
         total = power[members].sum()
@@ -96,24 +95,8 @@ def gaussians_from_paths(
     return InitialGaussians(position + jitter, scale, opacities, signal, amplitude * np.exp(1j * phase))
 
 
-def _last_points(paths: Paths, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, FloatArray]:
-    """Last point of interaction of each path [n, 3], and features [n, 4] in units of a receiver's resolution."""
-    bounces = paths.bounces
-    last = paths.vertices_m[np.arange(len(paths)), np.maximum(bounces - 1, 0)]
-    last = np.where((bounces > 0)[:, None], last, tx_pos_m[paths.tx])
-    away = last - np.stack([receiver.position_m for receiver in receivers])[paths.rx]
-    distance = np.linalg.norm(away, axis=1)
-    # Directions in units of a tenth of a radian, distances in octaves: the resolution of a receiver.
-    return last, np.column_stack([10 * away / distance[:, None], 2 * np.log2(distance)])
-
-
 def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Generator) -> InitialGaussians:
-    """Gaussians on a mesh's surfaces, drawn evenly by area, with scales as in `gaussians_from_points`.
-
-    Args:
-        triangles_m: corners [f, 3, 3], metres.
-        count: number of Gaussians, at least 4.
-        rng: generator of the points.
+    """Gaussians on the surfaces of triangles [f, 3, 3], metres, drawn by area; scales as in `gaussians_from_points`.
 
     Raises:
         InputError: no surface.
@@ -134,22 +117,17 @@ def gaussians_from_mesh(triangles_m: FloatArray, count: int, rng: np.random.Gene
 def initial_gaussians(
     config: InitialConfig, record: Record, rows: IntArray, rng: np.random.Generator, sphere: bool = False
 ) -> InitialGaussians:
-    """Starting values of the Gaussians by the settings.
+    """Starting values of the Gaussians by the settings, for receivers and training rows of a record.
 
-    Args:
-        config: settings.
-        record: record whose receivers observe the Gaussians.
-        rows: training rows, whose transmitters' paths are traced.
-        rng: random generator.
-        sphere: random Gaussians lie in all directions instead of the receivers' upper hemispheres.
+    With ``sphere`` random Gaussians lie in all directions instead of the receivers' upper hemispheres.
 
     Raises:
         InputError: an unusable file or scene, or paths to trace without a carrier frequency.
     """
     if config.paths:
         if Path(config.paths).suffix.lower() in MESHES:
-            remedy = f"make a scene of it (wrf-mi mesh {config.paths} --out DIR) and name that folder, "
-            remedy += f"or start on its surfaces: initial.mesh={config.paths}"
+            remedy = f"make a scene of it (wrf-mi mesh {config.paths} --out DIR) and name that folder, or start on its "
+            remedy += f"surfaces: initial.mesh={config.paths}"
             raise InputError(f"setting initial.paths: {config.paths} is a mesh without radio materials; {remedy}")
         if record.frequencies_hz is None:
             raise InputError(f"setting initial.paths: {record.name} states no carrier frequency; start otherwise")
@@ -177,11 +155,7 @@ def starting_values(
 ) -> dict[str, NDArray[np.float32]]:
     """Starting values of a fit: Gaussians, and gains and levels that match the observations on average.
 
-    Args:
-        plan: data and graph.
-        sides: traced side of each port.
-        places: places of the ports.
-        initial: Gaussians in place of those of the settings.
+    ``sides`` and ``places`` are those of the ports; ``initial`` replaces the Gaussians of the settings.
     """
     graph, config, targets = plan.graph, plan.config, plan.targets
     rng = np.random.default_rng([config.seed, 0])

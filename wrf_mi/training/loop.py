@@ -1,66 +1,186 @@
-"""The training loop of every model that is trained by gradients: Gaussians, paths of a scene, both, and networks."""
+"""The training loop of every model that is trained by gradients (Gaussians, paths, networks), and its state."""
 
 from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drjit.opt import Adam
+from numpy.typing import NDArray
 
-from .adam import NonFiniteReport, NumericsError, watched_groups
+from ..backend.device import to_float, to_tensor
+from ..gaussians.initial import DensityChange
+from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
-from .schedule import Schedule
-from .state import FitState
+
+Arrays = dict[str, NDArray[Any]]
+VIEW_GRADIENT = ("view_gradient_norm", "view_gradient_steps")
+OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")  # belong to a fit, not to one of its states
+KEPT = ("step", "chosen", *VIEW_GRADIENT, "reach_m", "searched_m", "surface", "phase_error", *OF_FIT)
+"""Attributes that a checkpoint stores under their names."""
+
+
+class FitState:
+    """Parameters under optimisation, from starting values; ``momentum``: Adam's decay of the first moment."""
+
+    def __init__(self, params: Mapping[str, NDArray[np.float32]], momentum: float = 0.9) -> None:
+        self.adam = Adam(lr=0.0, beta_1=momentum)  # owns the current parameters
+        self.adam.update({name: to_tensor(values) for name, values in params.items()})
+        # Running mean of the parameters, used for evaluation.
+        self.mean = {name: to_tensor(values) for name, values in params.items()}
+        self.step = 0  # steps taken
+        self.chosen = 0  # step from which the fit went on (`LoopConfig.patience`); 0: none was chosen
+        self.reach_m = float(np.inf)  # reach of the Gaussians around training transmitters (`Reach`)
+        self.searched_m = np.zeros((0, 3))  # position of each receiver at the last search for paths; empty: no scene
+        self.surface = False  # whether Gaussians on surfaces are trained
+        self.phase_error = 0.0  # standard deviation of a reflection's phase in predictions, rad, once chosen
+        # Scores of the held-out rows by the best state before the present stage, and by the best state.
+        self.baseline, self.best_scores = np.zeros(0), np.zeros(0)
+        self.stage_scores = np.zeros(0)  # best mean score of the held-out rows in each stage so far
+        self.held_out = np.zeros(0)  # reports of the held-out rows by the chosen state
+        self.best: Arrays | None = None  # arrays of the state with the best validation score
+        self.best_score = -np.inf  # its score, the higher the better; kept once the fit went on from it
+        self.waited = 0  # number of scores since then
+        self._reset_view_gradient()
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians; 0 where paths are trained alone."""
+        return int(self.adam["position"].shape[1]) if "position" in self.adam else 0
+
+    def _reset_view_gradient(self) -> None:
+        # Sum since the last round of density control of each Gaussian's directional gradient, [n], and its steps.
+        self.view_gradient_norm, self.view_gradient_steps = dr.zeros(mi.Float, max(self.gaussians, 1)), 0
+        dr.make_opaque(self.view_gradient_norm)  # a literal would be recorded as a constant
+
+    def params(self) -> Arrays:
+        """Current parameters."""
+        return {name: dr.detach(self.adam[name]).numpy().copy() for name in self.adam}
+
+    def mean_params(self) -> Arrays:
+        """Running mean of the parameters."""
+        return {name: self.mean[name].numpy().copy() for name in self.mean}
+
+    def moments(self) -> tuple[Arrays, Arrays, int]:
+        """Adam's first and second moments in the parameters' shapes, and its step count."""
+        first, second, count = {}, {}, 0
+        for name, (value, _, _, (t, m, v, _)) in self.adam.state.items():
+            first[name], second[name] = (a.numpy().copy().reshape(value.shape) for a in (m, v))
+            count = int(t[0])
+        return first, second, count
+
+    def _set_moments(self, first: Arrays, second: Arrays, count: int) -> None:
+        # The step count is opaque: as a number it would be a constant of recorded kernels.
+        for name, (value, promoted, rate, _) in list(self.adam.state.items()):
+            moments = (to_float(first[name]), to_float(second[name]))
+            self.adam.state[name] = (value, promoted, rate, (dr.opaque(mi.UInt32, count), *moments, None))
+
+    def change_density(self, change: DensityChange) -> None:
+        """Replace the set of Gaussians; fresh Gaussians start without momentum, new values without a past mean."""
+        # Dr.Jit's Adam has no rows to add or drop: moments are taken out, changed in NumPy and put back.
+        first, second, count = self.moments()
+        before, mean = self.params(), self.mean_params()
+        for name, values in change.parameters.items():
+            fresh = np.broadcast_to(change.fresh, values.shape)
+            first[name] = np.where(fresh, 0, first[name][:, change.source]).astype(np.float32)
+            second[name] = np.where(fresh, 0, second[name][:, change.source]).astype(np.float32)
+            # The original of a clone has a new opacity, for which the old mean does not hold.
+            new = fresh | (values != before[name][:, change.source])
+            mean[name] = np.where(new, values, mean[name][:, change.source]).astype(np.float32)
+            self.adam[name] = to_tensor(values)
+        self.mean = {name: to_tensor(values) for name, values in mean.items()}
+        self._set_moments(first, second, count)
+        self._reset_view_gradient()
+
+    def set_param(self, name: str, values: NDArray[np.float32]) -> None:
+        """Set one parameter and reset its momentum (opacity reset)."""
+        first, second, count = self.moments()
+        self.adam[name] = to_tensor(values)
+        nothing = {name: np.zeros_like(values)}
+        self._set_moments(first | nothing, second | nothing, count)
+
+    def keep_best(self, score: float) -> None:
+        """Keep the state if its score is the best so far."""
+        self.waited += 1
+        if score > self.best_score:
+            self.best, self.best_score, self.waited = self._now(), score, 0
+
+    def go_back(self) -> FitState:
+        """The best state, with its score."""
+        if self.best is None:
+            return self
+        of_fit = {name: np.asarray(getattr(self, name)) for name in OF_FIT}
+        return FitState.from_arrays(self.best | of_fit | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
+
+    def next_stage(self) -> FitState:
+        """The best state so far as the start of another stage, at the present step, without moments."""
+        # Moments of the former stage would push the first steps of this one where its loss fell.
+        state = self.go_back()
+        state.step, state.best, state.waited = self.step, self.best, 0
+        nothing = {name: np.zeros_like(values) for name, values in state.params().items()}
+        state._set_moments(nothing, nothing, 0)
+        return state
+
+    def arrays(self) -> Arrays:
+        """All arrays, for a checkpoint."""
+        best = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
+        return self._now() | best | {f"best/{name}": values for name, values in (self.best or {}).items()}
+
+    def _now(self) -> Arrays:
+        """All arrays without the best state."""
+        first, second, count = self.moments()
+        groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
+        flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
+        attributes = {name: np.array(getattr(self, name)) for name in KEPT}
+        return flat | attributes | {"adam_step": np.asarray(count)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
+        """State from the arrays of a checkpoint, with Adam's decay of the first moment."""
+
+        def group(prefix: str) -> Arrays:
+            return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
+
+        state = cls(group("param/"), momentum)
+        state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
+        state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
+        for name in KEPT:
+            setattr(state, name, np.array(arrays[name]) if np.ndim(arrays[name]) else arrays[name].item())
+        state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
+        state.best = group("best/") or None
+        state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
+        return state
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress at a log line.
+    """Progress at a log line."""
 
-    Attributes:
-        step: steps taken.
-        seconds: training time so far, resumed runs included.
-        loss: mean over the steps since the last line.
-        validation_score: median on the validation rows, where it was just computed.
-        held_out: whether the validation rows are still kept out of training.
-        gaussians: number of Gaussians; 0 without a field.
-        left_s: estimated seconds to the end.
-        label: name of the score.
-    """
-
-    step: int
-    seconds: float
-    loss: float
-    validation_score: float | None
-    held_out: bool
-    gaussians: int
-    left_s: float
-    label: str = "SSIM"
+    step: int  # steps taken
+    seconds: float  # training time so far, resumed runs included
+    loss: float  # mean over the steps since the last line
+    validation_score: float | None  # median on the validation rows, where it was just computed
+    held_out: bool  # whether the validation rows are still kept out of training
+    gaussians: int  # number of Gaussians; 0 without a field
+    left_s: float  # estimated seconds to the end
+    label: str = "SSIM"  # name of the score
 
 
 class TrainingLoop(ABC):
-    """Steps of Adam, with validation, early stopping, progress and checkpoints.
+    """Steps of Adam, with validation, early stopping, progress and checkpoints."""
 
-    Attributes:
-        config: settings of the loop.
-        schedule: rows and learning rates of each step.
-        state: state between two steps.
-        seconds: training time so far, resumed runs included.
-        label: name of the validation score.
-        higher_is_better: direction of the validation score.
-    """
-
-    config: LoopConfig
-    schedule: Schedule
-    state: FitState
-    seconds: float = 0.0
-    label: str
-    higher_is_better: bool
+    config: LoopConfig  # settings of the loop
+    schedule: Schedule  # rows and learning rates of each step
+    state: FitState  # state between two steps
+    seconds: float = 0.0  # training time so far, resumed runs included
+    label: str  # name of the validation score
+    higher_is_better: bool  # direction of the validation score
 
     @abstractmethod
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
@@ -87,15 +207,12 @@ class TrainingLoop(ABC):
         save: Callable[[], None] = lambda: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> bool:
-        """Train from the current step to the last.
+        """Train from the current step to the last; whether that was reached.
 
         Args:
             on_progress: called every ``log_every`` steps and at the end.
             save: writes a checkpoint; called every ``checkpoint_every`` steps, when stopped and at the end.
             stop: stop condition, called after each step.
-
-        Returns:
-            Whether the last step was reached.
 
         Raises:
             NumericsError: a loss or gradient is not finite, raised right after that step, which leaves the parameters
@@ -131,11 +248,8 @@ class TrainingLoop(ABC):
                 score = self.validate() if scored else None
                 self.seconds = before + time.perf_counter() - start
                 left = (self.seconds - before) / steps * (config.steps - state.step)
-                held_out = state.step <= schedule.joined
-                loss = losses[0] / logged
-                on_progress(
-                    Progress(state.step, self.seconds, loss, score, held_out, state.gaussians, left, self.label)
-                )
+                of_state = state.step <= schedule.joined, state.gaussians
+                on_progress(Progress(state.step, self.seconds, losses[0] / logged, score, *of_state, left, self.label))
                 losses, logged = dr.zeros(mi.Float), 0
                 if score is not None and choosing and self.choose(score):
                     state, schedule = self.state, self.schedule
@@ -171,7 +285,6 @@ class TrainingLoop(ABC):
             where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
             raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
         if step:
-            names = ["loss", *watched_groups(self.state.adam)]
-            broken = ", ".join(n for n, flag in zip(names, trouble.groups.numpy(), strict=True) if flag)
-            where = f"step {step}: not finite: {broken}"
+            names = np.array(["loss", *watched_groups(self.state.adam)])[trouble.groups.numpy() > 0]
+            where = f"step {step}: not finite: {', '.join(names)}"
             raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")

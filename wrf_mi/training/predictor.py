@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,7 +22,7 @@ from ..gaussians.parameters import Gaussians
 from ..graph.graph import Alone, Field, Graph
 from ..graph.receivers import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
-from ..tasks.conditions import known_headings, known_uplink, normalised_uplink
+from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
 from .adam import Params
 from .by_distance import Reach
@@ -41,9 +42,6 @@ class Predictor:
         store: folder in which operators are stored; None: in memory only.
         reach: region in which the Gaussians are used; None: everywhere.
         phase_error: see `wrf_mi.graph.graph.Graph.report`.
-
-    Attributes:
-        evaluate: evaluates transmitters whose paths are known.
     """
 
     def __init__(
@@ -88,8 +86,7 @@ class Predictor:
     def gaussians(self, tx_pos_m: ArrayLike, log_carrier: float = 0.0) -> Gaussians:
         """The field's Gaussians for transmitter positions [m, 3] (metres), world frame.
 
-        ``log_carrier`` is the logarithm of the carrier over the middle one of training (`Graph.log_carrier`), for
-        fields that were trained on several carriers; others ignore it.
+        ``log_carrier`` is that of `Graph.log_carrier`, for fields that were trained on several carriers.
         """
         columns = np.ascontiguousarray(np.asarray(tx_pos_m, np.float32).reshape(-1, 3).T)
         # Fields of several carriers have the carrier as a last input.
@@ -125,9 +122,12 @@ class Predictor:
                 used, or no such receiver.
         """
         index, form = receiver_index(self.receivers, receiver), self.graph.form
-        # Antennas of an uplink are independent inputs, without positions and paths.
         if form.features:
-            return self._by_uplink(uplink, index)
+            # Antennas of an uplink are independent inputs, without positions and paths.
+            features, divisor = normalised_uplink(uplink)
+            reports = self._reported(np.asarray(features, float), index).reshape(*divisor.shape, -1)
+            channels = reports * divisor[..., None]
+            return (channels if len(form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
         positions = np.asarray(tx_pos_m, float)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
@@ -156,13 +156,6 @@ class Predictor:
         parts = (None if part is None else part[rows] for part in (record.uplink, headings, record.carriers_hz))
         return self(record.tx_pos_m[rows], receiver, *parts)
 
-    def _by_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
-        """Channels [m, antennas, k] of uplink channels, or [m, k] of a single antenna."""
-        features, divisor = normalised_uplink(known_uplink(uplink))
-        reports = self._reported(np.asarray(features, float), receiver)
-        channels = reports.reshape(*divisor.shape, -1) * divisor[..., None]
-        return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
-
     def decompose(
         self,
         tx_pos_m: FloatArray,
@@ -170,9 +163,7 @@ class Predictor:
         tx_heading_rad: FloatArray | None = None,
         carriers_hz: FloatArray | None = None,
     ) -> tuple[dict[str, NDArray[Any]], PathStatistics]:
-        """Reports with a scene's paths, by sides, and statistics of the paths, from one search.
-
-        Arguments as those of a call with finite positions.
+        """Reports with a scene's paths, by sides, and statistics of the paths, from one search; arguments as of a call.
 
         Returns:
             ``whole`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.report`), [m, ...], NaN where Gaussians
@@ -196,10 +187,7 @@ class Predictor:
     def _sides(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
     ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
-        """Groups of positions: their numbers, predictor and port, and traced side.
-
-        Positions at several carriers are in the same group, as are all without a scene.
-        """
+        """Groups of positions: their numbers, predictor and port, and traced side; without a scene one group."""
         order = np.arange(len(tx_pos_m))
         size = SEARCHED if self.graph.scene is not None else max(len(order), 1)
         if self.graph.scene is not None and carriers_hz is not None:
@@ -230,10 +218,7 @@ class Predictor:
     def _reported(
         self, conditions: FloatArray, port: int, side: TracedField | None = None, slots: IntArray | None = None
     ) -> NDArray[Any]:
-        """Reports for positions [m, 3] or features [m, features], complex numbers as such.
-
-        ``side`` has the paths of the positions in its rows ``slots`` [m]; None: in its rows in order.
-        """
+        """Reports for positions [m, 3] or features [m, features], with paths of ``side`` in its rows ``slots`` [m]."""
         slots = np.arange(len(conditions)) if slots is None else slots
         weight = None if self.reach is None else self.reach.weight(conditions, port // self.graph.carriers)
         if weight is not None and not weight.all():
@@ -245,7 +230,7 @@ class Predictor:
             # Channels are zero without Gaussians, and nothing has to be evaluated.
             if self.graph.scene is None:
                 return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
-        return self.of_side(conditions, port, side, slots, weight)
+        return self.of_side(Request(conditions, port, side, slots, weight))
 
     def _of_one_side(self, tx_pos_m: FloatArray, port: int, side: TracedField, alone: Alone) -> NDArray[Any]:
         """Reports of one side alone, NaN where Gaussians are out of reach."""
@@ -254,22 +239,15 @@ class Predictor:
         used = np.arange(len(tx_pos_m))
         if alone == "learned" and weight is not None:
             used = np.flatnonzero(weight)
-        reports = self.of_side(tx_pos_m[used], port, side, used, None if weight is None else weight[used], alone)
+        weight = None if weight is None else weight[used]
+        reports = self.of_side(Request(tx_pos_m[used], port, side, used, weight, alone))
         spread = np.full((len(tx_pos_m), *reports.shape[1:]), np.nan, reports.dtype)
         spread[used] = reports
         return spread
 
-    def of_side(
-        self,
-        conditions: FloatArray,
-        port: int,
-        side: TracedField | None,
-        slots: IntArray,
-        weight: NDArray[Any] | None,
-        alone: Alone | None = None,
-    ) -> NDArray[Any]:
-        """Predictions, as of `__call__`, for transmitters whose paths are known (`Request`)."""
-        request = Request(conditions, port, side, slots, weight, alone, self.phase_error)
+    def of_side(self, request: Request) -> NDArray[Any]:
+        """Predictions, as of `__call__`, for transmitters whose paths are known, with the phase error of the model."""
+        request = replace(request, phase_error=self.phase_error)
         try:
             reports = self.evaluate(request)
         except MemoryError as error:

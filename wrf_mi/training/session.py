@@ -30,20 +30,14 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True)
 class FitSession:
-    """Folder, progress callback and stop condition of a fit.
+    """Folder, progress callback and stop condition of a fit."""
 
-    Attributes:
-        folder: folder for files of this fit (of one fold where there are several). ``checkpoint.npz`` in it is removed
-            when the fitted model is stored. None: no files are written.
-        run: the run folder, for files that all folds share.
-        on_progress: progress callback.
-        stop: stop condition, called wherever nothing would be lost.
-    """
-
+    # folder for files of this fit (of one fold where there are several). ``checkpoint.npz`` in it is removed when the
+    # fitted model is stored. None: no files are written
     folder: Path | None = None
-    run: Path | None = None
-    on_progress: OnProgress = quiet
-    stop: Callable[[], bool] = lambda: False
+    run: Path | None = None  # the run folder, for files that all folds share
+    on_progress: OnProgress = quiet  # progress callback
+    stop: Callable[[], bool] = lambda: False  # stop condition, called wherever nothing would be lost
 
     @property
     def fold(self) -> str:
@@ -55,11 +49,7 @@ class FitSession:
         self.on_progress(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
 
     def report(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
-        """Report progress of a fit without checkpoints.
-
-        Raises:
-            Interrupted: the stop condition holds.
-        """
+        """Report progress of a fit without checkpoints (Interrupted: the stop condition holds)."""
         self.tell(stage, share, progress)
         if self.stop():
             raise self.interrupted(f"in {stage}")

@@ -25,41 +25,32 @@ from ..gaussians.tiles import Plane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
 from ..tracing.paths.traced_field import TracedField
-from .adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
-from .fit_plan import FIELD, FitPlan
-from .schedule import Schedule
-from .state import FitState
-from .targets import Targets
+from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
+from .fit_plan import FIELD, FitPlan, Targets
+from .loop import FitState
 
 Loss = Callable[..., Any]
 """``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
-
+StepFunction = Callable[..., tuple[Params, NonFiniteReport, Any, Any]]
+"""Takes a step of an optimiser in place, by `Steps._recorded`; returns running mean, report, loss of the batch before
+the step, and norm of the gradient by each Gaussian's direction from the receiver, [n]."""
 CENTRES = "position"  # parameter [3, n] of every field with Gaussians
 
 
 def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
     """A receiver's pose as opaque device arrays of ``float_type``, by default ``mi.Float``."""
-
-    def number(x: float) -> Any:
-        return dr.opaque(float_type or mi.Float, float(x))
-
-    return Pose([number(x) for x in receiver.position_m], [[number(x) for x in row] for row in receiver.to_world])
+    parts = receiver.position_m, *receiver.to_world
+    position, *rows = ([dr.opaque(float_type or mi.Float, float(x)) for x in part] for part in parts)
+    return Pose(position, rows)
 
 
 class Place(NamedTuple):
-    """Constants of a batch at one port of a graph.
+    """Constants of a batch at one port of a graph."""
 
-    Attributes:
-        receiver: number of the receiver.
-        pose: its pose.
-        plane: directions of the learned signal.
-        log_carrier: logarithm of the carrier over the middle one; None: rows have a single carrier.
-    """
-
-    receiver: int
-    pose: Pose
-    plane: Plane
-    log_carrier: float | None = None
+    receiver: int  # number of the receiver
+    pose: Pose  # its pose
+    plane: Plane  # directions of the learned signal
+    log_carrier: float | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
 
     def batch(self, condition: Any, slots: Any, weight: Any = None, signal: Complex | None = None) -> Batch:
         """A `Batch` at the port, of arrays on the device."""
@@ -70,31 +61,25 @@ class Place(NamedTuple):
 
 def places_of(graph: Graph) -> list[Place]:
     """The places of a graph's ports."""
-    plane, ports = perception_plane(*graph.form.size, mi.Float), range(len(graph.models))
-    receivers = [port // graph.carriers for port in ports]
-    poses = [device_pose(graph.receivers[receiver]) for receiver in receivers]
-    return [Place(receivers[port], poses[port], plane, graph.log_carrier(port)) for port in ports]
+    plane, receivers = perception_plane(*graph.form.size, mi.Float), np.arange(len(graph.models)) // graph.carriers
+    return [
+        Place(receiver, device_pose(graph.receivers[receiver]), plane, graph.log_carrier(port))
+        for port, receiver in enumerate(receivers.tolist())
+    ]
 
 
 @dataclass
 class TrainingData:
-    """Conditions and observations on the device (`wrf_mi.training.targets.Targets`).
+    """Conditions and observations on the device (`Targets`)."""
 
-    Attributes:
-        condition: conditions of all rows, tensor [3, c] in metres or [features, c].
-        truth: observations of all receivers and conditions, flat.
-        scale: inverse unit of each receiver, [n_rx].
-        weight: factors of the observations' differences in the loss, in the order of ``truth``; None: 1.
-    """
-
-    condition: Any
-    truth: Any
-    scale: Any
-    weight: Any = None
+    condition: Any  # conditions of all rows, tensor [3, c] in metres or [features, c]
+    truth: Any  # observations of all receivers and conditions, flat
+    scale: Any  # inverse unit of each receiver, [n_rx]
+    weight: Any = None  # factors of the observations' differences in the loss, in the order of ``truth``; None: 1
 
     @classmethod
     def of(cls, targets: Targets) -> TrainingData:
-        """Targets on the device."""
+        """The targets of a fit on the device."""
         weight = None if targets.weight is None else to_float(targets.weight)
         return cls(to_tensor(targets.condition), to_float(targets.truth), to_float(1 / targets.unit), weight)
 
@@ -115,54 +100,12 @@ class TrainingData:
         return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values), factor
 
 
-@dataclass
-class StepBatch:
-    """Data of one step.
-
-    Attributes:
-        data: all conditions and observations.
-        rows: numbers of the conditions of the batch.
-        batch: their port, without conditions, which are drawn from ``data``.
-        step: numbers of the step.
-    """
-
-    data: TrainingData
-    rows: Any
-    batch: Batch
-    step: ScheduledStep
-
-
-@dataclass
-class StepResult:
-    """Result of one step.
-
-    Attributes:
-        mean: running mean of the parameters.
-        trouble: report of values that are not finite, after which nothing changes any more.
-        loss: loss of the batch before the step.
-        view_gradient_norm: norm of the gradient by each Gaussian's direction from the receiver, [n].
-    """
-
-    mean: Params
-    trouble: NonFiniteReport
-    loss: Any
-    view_gradient_norm: Any
-
-
-StepFunction = Callable[[Adam, Params, StepBatch], StepResult]
-"""Takes a step of an optimiser in place, from the running mean of its parameters."""
-
-
 class Steps:
     """Optimiser steps of a fit, recorded by port where the evaluation of the Gaussians allows it.
 
-    Args:
-        plan: data and graph of the fit.
-        sides: traced side of each port; None without a scene.
-        loss: loss of a batch.
+    ``sides`` are the traced sides of the ports, None without a scene; ``loss`` is that of a batch.
 
     Attributes:
-        loss: loss of a batch.
         places: places of the ports.
         recorded: functions that take a step, by what they depend on beside their arguments.
     """
@@ -179,14 +122,14 @@ class Steps:
         port, rows = int(schedule.receiver[t]), schedule.rows[t]
         slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
         function = self._function(port, state, schedule)
-        batch = self.places[port].batch(None, slots)
-        step = ScheduledStep.of(schedule, t, trouble)
-        result = function(state.adam, state.mean, StepBatch(self._data, mi.UInt32(rows.tolist()), batch, step))
-        state.mean = result.mean
-        state.view_gradient_norm += result.view_gradient_norm
+        batch, step = self.places[port].batch(None, slots), ScheduledStep.of(schedule, t, trouble)
+        state.mean, trouble, loss, view_gradient_norm = function(
+            state.adam, state.mean, self._data, mi.UInt32(rows.tolist()), batch, step
+        )
+        state.view_gradient_norm += view_gradient_norm
         state.view_gradient_steps += 1
         dr.schedule(state.view_gradient_norm)  # evaluated together with the loop's sum of losses
-        return result.loss, result.trouble
+        return loss, trouble
 
     def _function(self, port: int, state: FitState, schedule: Schedule) -> StepFunction:
         """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
@@ -212,7 +155,6 @@ class Steps:
         return self.recorded[key]
 
     def _rates(self, names: Mapping[str, Any]) -> dict[str, float]:
-        """Learning rate of each parameter."""
         o, traced = self._plan.config.optimiser, self._plan.graph.traced
         rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
         rates |= {"log_scale": o.scale, LEVEL: o.level}
@@ -225,28 +167,29 @@ class Steps:
         evaluation, loss_of = self._plan.graph.evaluation, self.loss
         shape = self._plan.targets.truth.shape[2:]
 
-        def step(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
-            params = rated_params(adam, rates, inputs.step.factor)
-            condition, truth, scale = inputs.data.select(inputs.rows, inputs.batch.receiver, math.prod(shape))
+        # ``batch`` is the port of ``rows``, without conditions, which are drawn from ``data``.
+        def step(adam: Adam, mean: Params, data: TrainingData, rows: Any, batch: Batch, at: ScheduledStep) -> Any:
+            params = rated_params(adam, rates, at.factor)
+            condition, truth, scale = data.select(rows, batch.receiver, math.prod(shape))
             truth = truth * scale
             # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather
             # again.
             dr.schedule(truth, scale)
             # In the receiver's unit, so that learning rates suit observations of any scale.
-            prediction = report(params, replace(inputs.batch, condition=condition))
-            loss = loss_of(prediction * scale, truth, dr.width(inputs.rows), *shape)
-            mean, trouble, finite = guarded_step(adam, params, loss, mean, inputs.step)
-            result = StepResult(mean, trouble, dr.detach(loss), _view_gradient_norm(params, inputs.batch.pose, finite))
+            prediction = report(params, replace(batch, condition=condition))
+            loss = loss_of(prediction * scale, truth, dr.width(rows), *shape)
+            mean, trouble, finite = guarded_step(adam, params, loss, mean, at)
+            result = mean, trouble, dr.detach(loss), _view_gradient_norm(params, batch.pose, finite)
             dr.eval(adam, result)
             return result
 
         if evaluation.recordable:
             return Recorded(step, read)
 
-        def unrecorded(adam: Adam, mean: Params, inputs: StepBatch) -> StepResult:
+        def unrecorded(*arguments: Any) -> Any:
             # As in a recording: a row that is a constant would compile the kernels anew.
-            dr.make_opaque(adam, mean, inputs)
-            result = step(adam, mean, inputs)
+            dr.make_opaque(*arguments)
+            result = step(*arguments)
             evaluation.release()
             return result
 
@@ -254,9 +197,7 @@ class Steps:
 
 
 def _view_gradient_norm(params: Params, pose: Pose, finite: Any) -> Any:
-    """Norm of the gradient by each Gaussian's direction from the receiver, [n]: of that by its centre, times the
-    distance; 0 of a step that is not taken.
-    """
+    # Norm of the gradient by a Gaussian's centre, times its distance; 0 of a step that is not taken.
     if CENTRES not in params:
         return mi.Float(0)
     offset = [dr.detach(params[CENTRES])[k].array - pose.position[k] for k in range(3)]

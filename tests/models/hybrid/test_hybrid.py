@@ -13,7 +13,7 @@ import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import make_splits
 from wrf_mi.models import Problem
-from wrf_mi.models.hybrid.parts import HybridSettings, parts_of
+from wrf_mi.models.hybrid.model import HybridSettings, parts_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.selection import HeldOut
 
@@ -62,7 +62,7 @@ def test_field_alone_is_a_part_where_it_is_named(folder: Path, tmp_path: Path):
 
 def test_hybrid_mixes_models_from_positions_and_from_the_uplink(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Without the networks, whose training takes a minute."""
-    monkeypatch.setattr("wrf_mi.models.hybrid.parts.UPLINK_PARTS", ("r2f2", "linear"))
+    monkeypatch.setattr("wrf_mi.models.hybrid.model.UPLINK_PARTS", ("r2f2", "linear"))
     record = channels()
     run = wrf_mi.train(record, tmp_path / "run")
     held, weights = run.metrics["held_out"], run.metrics["weights"]

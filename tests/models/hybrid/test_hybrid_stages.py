@@ -17,7 +17,7 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
 from wrf_mi.models import Interrupted
-from wrf_mi.models.hybrid import paths
+from wrf_mi.models.hybrid import scene_side
 from wrf_mi.models.hybrid.scene_side import STAGES
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -159,7 +159,7 @@ def test_scene_as_stated_is_kept_where_few_rows_prefer_it(
     scenes: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stated = str(scenes["thought"])
-    monkeypatch.setattr(paths, "_held_out_score", lambda one: float(one.problem.scene == stated))
+    monkeypatch.setattr(scene_side, "_held_out_score", lambda one: float(one.problem.scene == stated))
     record, split = measured(scenes, "spectrum", 16)
     run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=("steps=20",))
     again = wrf_mi.open_run(run.folder, record)

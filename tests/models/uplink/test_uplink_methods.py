@@ -20,13 +20,12 @@ from wrf_mi.models.networks.nerf2 import Nerf2Settings
 from wrf_mi.models.networks.nerf2_march import Networks
 from wrf_mi.models.networks.training import network_adam
 from wrf_mi.models.uplink import fire, linear, optml, r2f2
-from wrf_mi.models.uplink.csi_bands import Bands, bands_of
 from wrf_mi.models.uplink.fire import FireSettings
 from wrf_mi.models.uplink.linear import LinearSettings
 from wrf_mi.models.uplink.optml import OptMLSettings, Simulation
 from wrf_mi.models.uplink.r2f2 import PathSettings
 from wrf_mi.models.uplink.uplink_paths import find_paths
-from wrf_mi.models.uplink.uplink_waves import waves_of
+from wrf_mi.models.uplink.uplink_waves import Bands, bands_of, waves_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.session import FitSession
 

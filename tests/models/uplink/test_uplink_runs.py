@@ -17,7 +17,7 @@ from wrf_mi.core import InputError, Prediction, Split
 from wrf_mi.datasets import load, write_nerf2_csi
 from wrf_mi.models import Fitted, Inputs, Problem
 from wrf_mi.models.model import Arrays
-from wrf_mi.models.uplink.csi_bands import UplinkModel
+from wrf_mi.models.uplink.uplink_waves import UplinkModel
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run

@@ -26,14 +26,11 @@ from ...tasks.conditions import placed_receivers, scene_carrier
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
-from ...training.fields import check_params, field_of
-from ...training.fit_plan import FitPlan
+from ...training.fit_plan import FitPlan, check_params, field_of
 from ...training.initial import initial_gaussians
-from ...training.loop import Progress
+from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
-from ...training.stage_selection import HeldOutReports
-from ...training.state import FitState
-from ...training.trainer import Trainer
+from ...training.trainer import HeldOutReports, Trainer
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
 
 Params = dict[str, NDArray[np.float32]]
@@ -122,7 +119,12 @@ class FittedField(Fitted):
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
         graph.cover((), self.params)
-        reach, phase_error = _reach(self._arrays), float(self._arrays.get(PHASE_ERROR, 0.0))
+        reach, phase_error = None, float(self._arrays.get(PHASE_ERROR, 0.0))
+        if REACH in self._arrays:
+            if np.isnan(length_m := float(self._arrays[REACH])):
+                raise InputError(f"array {REACH}: not a number; train the run anew")
+            known_m = np.split(self._arrays["known_m"], np.cumsum(self._arrays["known_counts"])[:-1])
+            reach = Reach(tuple(known_m), length_m)
         return Predictor(graph, self.params, self._problem.operator, self._store, reach, phase_error)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -155,67 +157,6 @@ class FittedField(Fitted):
         return FittedField(other | keyed(PARAM, params), self.config, self._problem, self._store)
 
 
-def _reach_arrays(reach: Reach | None) -> Arrays:
-    if reach is None:
-        return {}
-    # Receivers observe different numbers of transmitters: flat positions and their counts, as arrays hold no lists.
-    counts = np.array([len(positions_m) for positions_m in reach.known_m])
-    return {REACH: np.asarray(reach.length_m), "known_m": np.concatenate(reach.known_m), "known_counts": counts}
-
-
-def _reach(arrays: Arrays) -> Reach | None:
-    if REACH not in arrays:
-        return None
-    known_m = np.split(arrays["known_m"], np.cumsum(arrays["known_counts"])[:-1])
-    if np.isnan(length_m := float(arrays[REACH])):
-        raise InputError(f"array {REACH}: not a number; train the run anew")
-    return Reach(tuple(known_m), length_m)
-
-
-def load(arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
-    """The field that `FittedField.arrays` described; operators are stored in the folder."""
-    return FittedField(arrays, problem.settings, problem, folder)
-
-
-def fit(problem: Problem, split: Split, session: Session) -> FittedField:
-    """Train from the last checkpoint, or from the start, to the last step.
-
-    Raises:
-        Interrupted: stopped between two steps; the checkpoint is written.
-        NumericsError: a value that is not finite.
-    """
-    folder, record, config = session.folder, problem.record, problem.settings
-    stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
-    state = None if stored is None else FitState.from_arrays(stored)
-    # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
-    trainer = Trainer(*trained_part(record, split), config, state=state, scene=_scene(problem, split))
-    trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
-    cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
-
-    def on_progress(progress: Progress) -> None:
-        append_log(folder, progress)
-        session.on_progress(session.fold or "training", progress.step / config.steps, progress)
-
-    if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
-        raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
-    receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
-    params, reach = of_all_receivers(*_used(trainer), receivers, without_rows(split))
-    arrays: Arrays = {
-        **keyed(PARAM, params),
-        **trainer.graph.form.arrays(),
-        "tx_antenna": np.asarray(astuple(record.tx_antenna)),
-        **receiver_arrays(receivers),
-        **_reach_arrays(reach),
-    }
-    if trainer.state.phase_error:
-        arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
-    fitted = load(arrays, problem, folder)
-    fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
-    del trainer
-    release_memory()
-    return fitted
-
-
 def _used(trainer: Trainer) -> tuple[Params, Reach | None]:
     """Parameters and reach of a fit, beside paths without the Gaussians that are not used."""
     params, reach, graph = trainer.state.mean_params(), trainer.reach(), trainer.graph
@@ -234,22 +175,6 @@ def _scene(problem: Problem, split: Split) -> Any | None:
     if problem.scene is None or problem.record.carriers_hz is None:
         return problem.opened_scene
     return problem.open_scene(scene_carrier(problem.record, split.all_train))
-
-
-def check(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse settings, files and scenes that a training would refuse; warn of settings of paths without a scene."""
-    traced, default = problem.settings.traced, TrainConfig().traced
-    if problem.scene is None and traced != default:
-        names = [field.name for field in fields(traced)]
-        changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
-        logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
-    for split in splits:
-        # The first part of a fit, which takes no time: what it refuses is refused before a run folder exists.
-        record, rows = trained_part(problem.record, split)
-        plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
-        drawn = np.random.default_rng([plan.config.seed, 0])
-        placed = replace(record, receivers=plan.graph.receivers)
-        initial_gaussians(plan.config.initial, placed, rows.train, drawn)
 
 
 class GaussianField(Model):
@@ -275,16 +200,64 @@ class GaussianField(Model):
         return GaussianField(self.name, self.summary, task, with_scene) if self.serves(task) else self
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedField:
-        """Train from the last checkpoint, or from the start, see `fit`."""
-        return fit(problem, split, session)
+        """Train from the last checkpoint, or from the start, to the last step.
+
+        Raises:
+            Interrupted: stopped between two steps; the checkpoint is written.
+            NumericsError: a value that is not finite.
+        """
+        folder, record, config = session.folder, problem.record, problem.settings
+        stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
+        state = None if stored is None else FitState.from_arrays(stored)
+        # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
+        trainer = Trainer(*trained_part(record, split), config, state=state, scene=_scene(problem, split))
+        trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
+        cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
+
+        def on_progress(progress: Progress) -> None:
+            append_log(folder, progress)
+            session.on_progress(session.fold or "training", progress.step / config.steps, progress)
+
+        if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
+            raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
+        receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
+        params, reach = of_all_receivers(*_used(trainer), receivers, without_rows(split))
+        arrays: Arrays = {
+            **keyed(PARAM, params),
+            **trainer.graph.form.arrays(),
+            "tx_antenna": np.asarray(astuple(record.tx_antenna)),
+            **receiver_arrays(receivers),
+        }
+        if reach is not None:
+            # Receivers observe different numbers of transmitters: flat positions and their counts.
+            arrays[REACH], arrays["known_m"] = np.asarray(reach.length_m), np.concatenate(reach.known_m)
+            arrays["known_counts"] = np.array([len(positions_m) for positions_m in reach.known_m])
+        if trainer.state.phase_error:
+            arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
+        fitted = FittedField(arrays, config, problem, folder)
+        fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
+        del trainer
+        release_memory()
+        return fitted
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
-        """The field that `FittedField.arrays` described, see `load`."""
-        return load(arrays, problem, folder)
+        """The field that `FittedField.arrays` described; operators are stored in the folder."""
+        return FittedField(arrays, problem.settings, problem, folder)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
-        """Refuse settings, files and scenes that a training would refuse, see `check`."""
-        check(problem, splits)
+        """Refuse settings, files and scenes that a training would refuse; warn of settings of paths without a scene."""
+        traced, default = problem.settings.traced, TrainConfig().traced
+        if problem.scene is None and traced != default:
+            names = [field.name for field in fields(traced)]
+            changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
+            logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
+        for split in splits:
+            # The first part of a fit, which takes no time: what it refuses is refused before a run folder exists.
+            record, rows = trained_part(problem.record, split)
+            plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
+            drawn = np.random.default_rng([plan.config.seed, 0])
+            placed = replace(record, receivers=plan.graph.receivers)
+            initial_gaussians(plan.config.initial, placed, rows.train, drawn)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
         """Settings with number of steps and scale of transmitters resolved."""

@@ -4,109 +4,147 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Split
+from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
-from ...training.selection import RowDistance
+from ...training.selection import RowDistance, rows_at_receiver
 from ..held_out import predicted_rows
-from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed
-from .parts import PATHS, TRACED, UPLINK_PARTS
-from .paths import by_stage
-from .residuals import Residuals
-from .scene_side import SceneSide
+from ..interpolation.kriging import Kriged, Kriging
+from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed, under
+from .scene_side import SceneSide, by_stage
 
+LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
+LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]
+"""Rows [n] by receiver, and what a model's mean leaves of their observations, [n, ...]."""
+
+
+def left_over(fitted: Fitted, record: Record, split: Split) -> LeftOver:
+    """What a fitted model leaves of the observations of its training rows."""
+    left: dict[int, tuple[IntArray, NDArray[Any]]] = {}
+    for receiver in range(len(record.receivers)):
+        rows = _training_rows(record, split, receiver)
+        if len(rows):
+            observed = record.observation[receiver, rows]
+            left[receiver] = rows, observed - predicted_rows(fitted, record, rows, receiver).mean
+    return left
+
+
+def _training_rows(record: Record, split: Split, receiver: int) -> IntArray:
+    rows = rows_at_receiver(record, split.all_train, receiver)
+    if receiver in split.held_receivers:
+        rows = np.intersect1d(rows, split.left[split.left[:, 0] == receiver, 1])
+    return rows
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Kriging of what the scene's side leaves at the training rows."""
+
+    by_receiver: Mapping[int, Kriged]  # interpolation of each receiver that has enough rows, by its number
+
+    @classmethod
+    def of(cls, left: LeftOver, record: Record, split: Split, seed: int) -> Residuals:
+        """Residuals that a model left, at the training rows of a split that is the model's or holds out more."""
+        by_receiver: dict[int, Kriged] = {}
+        for receiver, (rows, residual) in left.items():
+            known = np.isin(rows, _training_rows(record, split, receiver))
+            if known.sum() >= LEAST_RESIDUALS:
+                residual = residual if known.all() else residual[known]
+                by_receiver[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[rows[known]], residual)
+        return cls(by_receiver)
+
+    def __call__(self, tx_pos_m: FloatArray, receiver: int, shape: tuple[int, ...]) -> NDArray[Any] | float:
+        """Expected residuals of a receiver at positions [m, 3], [m, *shape]; 0 without any rows."""
+        kriged = self.by_receiver.get(receiver)
+        return 0.0 if kriged is None else kriged.predict(tx_pos_m).reshape(len(tx_pos_m), *shape)
+
+    def arrays(self) -> Arrays:
+        """Arrays of a run file."""
+        arrays: Arrays = {}
+        for receiver, kriged in self.by_receiver.items():
+            arrays |= keyed(f"{receiver}/", kriged.arrays())
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays, record: Record) -> Residuals:
+        """The residuals that `arrays` described."""
+        numbers = sorted({int(name.partition("/")[0]) for name in arrays})
+        return cls({k: Kriged.from_arrays(under(f"{k}/", arrays), record.receivers[k]) for k in numbers})
+
+
+PATHS = "paths"
+UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
+"""Models of a downlink, the first of which is the mean that others have to improve on."""
+TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
 STATED, PREDICTED = "stated", "predicted"
 """Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
 
 
+@dataclass(eq=False)
 class FittedHybrid(Fitted):
-    """A fitted hybrid.
+    """A fitted hybrid."""
 
-    Args:
-        problem: problem of the hybrid.
-        known: training rows that determine distances [n].
-        parts: fitted parts with a weight, by name.
-        mixture: weights of these parts, and, if there are ``residuals``, of the scene's side with them as the last.
-        residuals: what the scene's side leaves; None: it has no weight.
-        intervals: standard deviations; None: none are stated.
-        facts: further entries of ``metrics.json``.
-    """
+    problem: Problem  # problem of the hybrid
+    known: IntArray  # training rows that determine distances [n]
+    parts: dict[str, Fitted]  # fitted parts with a weight, by name
+    mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene's side with them as the last
+    residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
+    intervals: Intervals | None  # standard deviations; None: none are stated
+    stated: dict[str, Any]  # further entries of ``metrics.json``
 
-    def __init__(
-        self,
-        problem: Problem,
-        known: IntArray,
-        parts: Mapping[str, Fitted],
-        mixture: Mixture,
-        residuals: Residuals | None,
-        intervals: Intervals | None,
-        facts: dict[str, Any],
-    ) -> None:
-        self._problem, self._known, self._facts = problem, known, facts
-        self._distance = RowDistance.of_rows(problem.record, known)
-        self.parts, self.mixture, self.residuals, self.intervals = dict(parts), mixture, residuals, intervals
+    def __post_init__(self) -> None:
+        self._distance = RowDistance.of_rows(self.problem.record, self.known)
 
     @property
     def _states_sizes(self) -> bool:
-        return bool(self._facts["sizes"] == STATED)
+        return bool(self.stated["sizes"] == STATED)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
-        self._check(inputs)
-
-        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
-            if self._states_sizes:
-                return Decomposition(part.predict(inputs.rows(rows), receiver))
-            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
-
-        return self._mixed(inputs.tx_pos_m, receiver, predicted).whole
+        return self._of_inputs(inputs, receiver, Fitted.decompose).whole
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`, by parts that save time without standard deviations."""
-        self._check(inputs)
-
-        def predicted(part: Fitted, rows: IntArray) -> Decomposition:
-            return Decomposition(Prediction(part.predict_mean(inputs.rows(rows), receiver)))
-
-        return self._mixed(inputs.tx_pos_m, receiver, predicted, std=False).whole.mean
+        return self._of_inputs(inputs, receiver, Fitted.decompose, std=False).whole.mean
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; parts use what they have stored."""
-        record = self._problem.record
-
-        def stored(part: Fitted, places: IntArray) -> Decomposition:
-            return Decomposition(predicted_rows(part, record, rows[places], receiver))
-
-        return self._mixed(record.tx_pos_m[rows], receiver, stored).whole
+        record = self.problem.record
+        return self._mixed(
+            record.tx_pos_m[rows],
+            receiver,
+            lambda part, places: Decomposition(predicted_rows(part, record, rows[places], receiver)),
+        ).whole
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """The prediction; what the scene's side and the others predict by themselves, NaN where they have no weight;
-        and the traced paths.
-        """
-        self._check(inputs)
-
-        def decomposed(part: Fitted, rows: IntArray) -> Decomposition:
-            return part.decompose(inputs.rows(rows), receiver, std and self._states_sizes)
-
-        return self._mixed(inputs.tx_pos_m, receiver, decomposed, std)
+        """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths."""
+        return self._of_inputs(inputs, receiver, lambda part, *of_part: part.decompose(*of_part), std)
 
     @property
     def depends_on_heading(self) -> bool:
         """Whether the predictions of a part depend on the heading of the transmitter."""
         return any(part.depends_on_heading for part in self.parts.values())
 
-    def _check(self, inputs: Inputs) -> None:
+    def _of_inputs(
+        self, inputs: Inputs, receiver: int, decompose: Callable[..., Decomposition], std: bool = True
+    ) -> Decomposition:
+        """Mixed results of ``decompose(part, inputs, receiver, std)``; that of `Fitted` computes no sides."""
         needed = [name for name in self.parts if name.partition("-")[0] in UPLINK_PARTS]
         if needed and inputs.uplink is None:
             raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
+        of_parts = std and self._states_sizes
+        return self._mixed(
+            inputs.tx_pos_m, receiver, lambda part, rows: decompose(part, inputs.rows(rows), receiver, of_parts), std
+        )
 
     def _mixed(
         self,
@@ -118,7 +156,7 @@ class FittedHybrid(Fitted):
         """Weighted mean of the parts' ``predict(part, rows)`` and of the residuals, and both sides of it."""
         if not np.isfinite(tx_pos_m).all():
             raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
-        distance_m, observed = self._distance(tx_pos_m, receiver), self._problem.record.observation
+        distance_m, observed = self._distance(tx_pos_m, receiver), self.problem.record.observation
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self._weights(distance_m)
         residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
@@ -143,7 +181,7 @@ class FittedHybrid(Fitted):
         if len(rows) and self.residuals is not None:
             residual = self.residuals(tx_pos_m[rows], receiver, shape)
             mean[rows] += _spread(residual_weight[rows], shape) * residual
-        if task_of(self._problem.record).image:
+        if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
         if not (totals[0].any() and totals[1].any()):
@@ -165,12 +203,12 @@ class FittedHybrid(Fitted):
         if self._states_sizes:
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
             return Prediction(mean, np.maximum(size * factor, LEAST))
-        return self.intervals(mean, expected_size(task_of(self._problem.record), Prediction(mean)), distance_m)
+        return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
 
     def arrays(self) -> Arrays:
         """Weights, residuals, intervals, training rows, and the arrays of the parts."""
-        arrays: Arrays = {"known": self._known, "names": np.asarray(list(self.parts))}
-        arrays["facts"] = np.asarray(json.dumps(self._facts))
+        arrays: Arrays = {"known": self.known, "names": np.asarray(list(self.parts))}
+        arrays["facts"] = np.asarray(json.dumps(self.stated))
         arrays |= field_arrays(self.mixture, "mixture/")
         if self.intervals is not None:
             arrays |= field_arrays(self.intervals, "intervals/")
@@ -182,14 +220,13 @@ class FittedHybrid(Fitted):
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
-        side, used = self.parts.get(PATHS), [report["stage"] for report in self._facts["stages"] if report["kept"]]
-        return by_stage(self._problem, split, side, used) if isinstance(side, SceneSide) and used else {}
+        side, used = self.parts.get(PATHS), [report["stage"] for report in self.stated["stages"] if report["kept"]]
+        return by_stage(self.problem, split, side, used) if isinstance(side, SceneSide) and used else {}
 
     def facts(self) -> dict[str, Any]:
         """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
-        return self._facts
+        return self.stated
 
 
 def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Values [m] with an axis of length one for each of an observation."""
     return values.reshape(-1, *[1] * len(shape))

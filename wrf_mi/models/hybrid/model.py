@@ -1,7 +1,7 @@
 """The model ``hybrid``: one fit in stages, from a scene's paths to interpolation of what they leave.
 
-Stages 1 to 5 (`wrf_mi.models.hybrid.paths`) predict from the scene, the last one interpolates: their residuals and the
-observations themselves, weighted by the distance to the nearest training row. One hold-out
+Stages 1 to 5 (`wrf_mi.models.hybrid.scene_side`) predict from the scene, the last one interpolates: their residuals and
+the observations themselves, weighted by the distance to the nearest training row. One hold-out
 (`wrf_mi.training.selection.hold_out`) chooses stages, weights and standard deviations.
 
 parts/  in the run folder: files of the parts
@@ -10,35 +10,112 @@ parts/  in the run folder: files of the parts
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from ...core import InputError, Prediction, Split
+from ...core import InputError, Prediction, Record, Split
+from ...core.settings import CheckedSettings
 from ...tasks import task_of
-from ...training.by_distance import (
-    GAPS,
-    HeldOutScores,
-    Intervals,
-    Mixture,
-    choose_weights,
-    constant,
-    expected_size,
-    fit_intervals,
-)
+from ...training import by_distance
+from ...training.by_distance import Intervals, Mixture
 from ...training.selection import HeldOut, hold_out
 from .. import MODELS
+from ..checks import check_held_receivers, check_record
 from ..held_out import fit_model, held_out_predictions, labelled
-from ..model import Arrays, Fitted, Model, Problem, Session, from_field_arrays, known_positions, under
-from .fitted import NEGLIGIBLE, PREDICTED, STATED, FittedHybrid
-from .parts import KRIGING, PATHS, UPLINK_PARTS, HybridSettings, parts_of, scene_side, stored_parts
-from .residuals import Residuals, left_over
-from .scene_side import RESIDUAL, SceneSide, StageReport, inside, stated_reports
+from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions, under
+from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
+from .scene_side import FIELD, RESIDUAL, STAGES, InScene, Paths, SceneSide, StageReport, inside, stated_reports
+from .strengths import StrengthsInScene, TracedStrengths
 
-FOLDER = "parts"
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HybridSettings(CheckedSettings):
+    """Settings of the hybrid."""
+
+    #: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and residual;
+    #: null: all that the data allow; without a scene the field, which takes minutes and which interpolation surpasses
+    #: near measurements, is used where it is named
+    stages: str | None = None
+    #: optimiser steps of the graph of paths and Gaussians; null: the default of `TrainConfig` for the task
+    steps: Annotated[int | None, Field(ge=1, description="1 or more")] = None
+    deterministic: bool = False  #: bit-identical results from run to run, on one thread of the CPU
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if unknown := [stage for stage in self.wanted if stage not in STAGES]:
+            raise InputError(f"stages: {unknown[0]!r} is unknown; choose of {', '.join(STAGES)}")
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Stages that may be used."""
+        return STAGES if self.stages is None else tuple(stage.strip() for stage in self.stages.split(","))
+
+
+def scene_side(record: Record) -> tuple[Model, Model]:
+    """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
+    if task_of(record).in_decibel and record.frequencies_hz is not None:
+        return TracedStrengths(), StrengthsInScene()
+    return Paths(), InScene()
+
+
+def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
+    """Entry and problem of each part that serves the data, the trusted one first (InputError: none does)."""
+    settings: HybridSettings = problem.settings
+    record, task, wanted = problem.record, task_of(problem.record), settings.wanted
+    parts: dict[str, tuple[Model, Problem]] = {}
+    if record.uplink is not None:
+        names = (("r2f2-scene", True),) if problem.scene is not None else ()
+        for name, scene in (*names, *((name, False) for name in UPLINK_PARTS)):
+            _add(parts, name, problem, split, scene)
+    elif problem.scene is not None and task.receiver_with_scene and any(stage != RESIDUAL for stage in wanted):
+        _add(parts, PATHS, problem, split, True)
+    if problem.scene is None and settings.stages is not None and FIELD in wanted:
+        _add(parts, FIELD, problem, split, False)
+    if RESIDUAL in wanted or not parts:
+        _add(parts, KRIGING, problem, split, False)
+    if not parts:
+        raise InputError(f"{record.name}: no stage serves these data; choose another model")
+    return parts
+
+
+def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
+    """Entry and problem of a part, with or without the scene."""
+    if name == PATHS:
+        return scene_side(problem.record)[0], problem
+    model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
+    entry = MODELS[model].serving(problem.record.task, scene)
+    arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
+    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
+    return entry, inner if scene else replace(inner, scene=None, material=None)
+
+
+def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, split: Split, scene: bool) -> None:
+    """Add a part that the data allow; others are left out with a line in the log, but not one with the scene."""
+    try:
+        entry, inner = _part(problem, name, scene)
+        check_record(entry, problem.record)
+        check_held_receivers(problem.record, split, entry, MODELS.values())
+        entry.check(inner, [split])
+    except InputError as error:
+        if scene:
+            raise
+        logger.info("hybrid without %s: %s", name, error)
+    else:
+        parts[name] = entry, inner
+
+
+FOLDER, KRIGING = "parts", "kriging"
 
 
 class _Fit:
@@ -48,7 +125,7 @@ class _Fit:
         self.problem, self.split, self.session = problem, split, session
         self.record, self.task, self.begun = problem.record, task_of(problem.record), time.perf_counter()
         self.fold = hold_out(self.record, split)
-        self.held = None if self.fold is None else HeldOut.of(self.record, self.fold, problem.seed)
+        self.held_out = None if self.fold is None else HeldOut.of(self.record, self.fold, problem.seed)
         self.parts = parts_of(problem, split)
         self.fitted: dict[str, Fitted] = {}
         self.predictions: dict[str, Prediction] = {}
@@ -62,10 +139,10 @@ class _Fit:
             self._judge(name)
         names = [*self.predictions] or [*self.parts]
         form, sizes, intervals, scores = "alone", PREDICTED, None, dict[str, float]()
-        mixture = constant(np.eye(len(names))[0])
-        if self.held is not None and len(self.held) and self.predictions:
-            form, mixture, scores = self._weights(self.held)
-            sizes, intervals = self._intervals(self.held, mixture)
+        mixture = by_distance.constant(np.eye(len(names))[0])
+        if self.held_out is not None and len(self.held_out) and self.predictions:
+            form, mixture, scores = self._weights(self.held_out)
+            sizes, intervals = self._intervals(self.held_out, mixture)
         used = _used(names, mixture)
         for name in set(self.parts) - set(used):
             shutil.rmtree(self.session.folder / FOLDER / name, ignore_errors=True)
@@ -75,19 +152,17 @@ class _Fit:
             seconds = time.perf_counter() - self.begun - self.scene_seconds
             self.reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), seconds))
         mixture = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
-        stated = {
-            "stages": stated_reports(self.reports),
-            "form": form,
-            "sizes": sizes,
-            "held_out": scores,
-            "weights": _stated(mixture, used),
-        }
+        weights = [
+            {"distance_m": float(distance), **dict(zip(used, map(float, row), strict=True))}
+            for distance, row in zip(mixture.distance_m, mixture.weights, strict=True)
+        ]
+        stated = {"stages": stated_reports(self.reports), "form": form, "sizes": sizes, "held_out": scores}
+        stated |= {"weights": weights}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
         return FittedHybrid(self.problem, self.problem.rows(self.split), parts, mixture, residuals, intervals, stated)
 
     def _part(self, name: str) -> Fitted:
-        """A part that is fitted to all training rows."""
         if name not in self.fitted:
             place = inside(self.session, FOLDER, name)
             place.folder.mkdir(parents=True, exist_ok=True)
@@ -105,17 +180,17 @@ class _Fit:
             assert isinstance(side, SceneSide)
             self.reports += side.stages
             model, problem = scene_side(self.record)[1], side.problem  # the scene is corrected once
-            unseen = None if self.held is None else side.held_out_at(self.held)
-        if self.fold is None or self.held is None:
+            unseen = None if self.held_out is None else side.held_out_at(self.held_out)
+        if self.fold is None or self.held_out is None:
             return
         if unseen is None:
             place = inside(self.session, FOLDER, name, "held")
-            unseen = held_out_predictions(model, problem, self.fold, self.held, place, name)
+            unseen = held_out_predictions(model, problem, self.fold, self.held_out, place, name)
         self.predictions[name] = unseen
         # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
         one_carrier = self.record.carriers_hz is None
         if name == PATHS and RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier:
-            self._krige_residuals(self.fold, self.held)
+            self._krige_residuals(self.fold, self.held_out)
 
     def _krige_residuals(self, fold: Split, held_out: HeldOut) -> None:
         """Residuals of the training rows, and predictions of held-out rows with those of the others.
@@ -139,12 +214,10 @@ class _Fit:
         score, every = self.task.mixtures(means, held_out.observed(self.record)), np.arange(len(held_out))
         # Errors are independent between rows, or where receivers are held out, between these.
         unit = held_out.receiver if self.split.held_receivers else held_out.row
-
-        def on_group(share: float) -> None:
-            self.session.report("choosing weights", share)
-
-        scores_of = HeldOutScores(score, held_out.distance_m, unit, len(means))
-        form, mixture = choose_weights(scores_of, held_out.group, on_group, trusted=0)
+        scores_of = by_distance.HeldOutScores(score, held_out.distance_m, unit, len(means))
+        form, mixture = by_distance.choose_weights(
+            scores_of, held_out.group, partial(self.session.report, "choosing weights"), trusted=0
+        )
         sign = 1 if self.task.higher_is_better else -1
         scores = {
             name: sign * float(score(np.broadcast_to(alone, (len(held_out), len(means))), every).mean())
@@ -158,14 +231,14 @@ class _Fit:
         weights, observed = mixture(held_out.distance_m), held_out.observed(self.record)
         mean = np.einsum("qk,kq...->q...", weights, np.stack([each.mean for each in self.predictions.values()]))
         stds = [each.std for each in self.predictions.values() if each.std is not None]
+        sizes, size, unit = PREDICTED, by_distance.expected_size(self.task, Prediction(mean)), np.ones((), np.float32)
         if len(stds) == len(self.predictions):
             std = np.einsum("qk,kq...->q...", weights, np.stack(stds))
             if (std > 0).all():  # kriging of two or three rows may pass through all of them
                 # Few rows tell a factor of stated deviations, not how errors depend on them.
-                size = np.ones(mean.shape)
-                return STATED, fit_intervals(mean / std, observed / std, size, held_out.distance_m, held_out.row)
-        size = expected_size(self.task, Prediction(mean))
-        return PREDICTED, fit_intervals(mean, observed, size, held_out.distance_m, held_out.row)
+                sizes, size, unit = STATED, np.ones(mean.shape), std
+        of_rows = held_out.distance_m, held_out.row
+        return sizes, by_distance.fit_intervals(mean / unit, observed / unit, size, *of_rows)
 
 
 def _used(names: Sequence[str], mixture: Mixture) -> list[str]:
@@ -175,14 +248,6 @@ def _used(names: Sequence[str], mixture: Mixture) -> list[str]:
         used.remove(RESIDUAL)
         used = [*(() if PATHS in used else (PATHS,)), *used, RESIDUAL]
     return used
-
-
-def _stated(mixture: Mixture, names: Sequence[str]) -> list[dict[str, float]]:
-    rows = zip(mixture.distance_m, mixture.weights, strict=True)
-    return [
-        {"distance_m": float(distance), **dict(zip(names, map(float, weights), strict=True))}
-        for distance, weights in rows
-    ]
 
 
 class Hybrid(Model):
@@ -202,7 +267,7 @@ class Hybrid(Model):
         """The hybrid, whose arrays have the gaps of its parts' arrays."""
         parts = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
         gaps = {name for part in parts for name in part.serving(task, with_scene).gaps}
-        return Hybrid((*GAPS, *sorted(gaps)))
+        return Hybrid((*by_distance.GAPS, *sorted(gaps)))
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedHybrid:
         """Fit all parts, and choose weights and standard deviations by held-out rows.
@@ -220,7 +285,8 @@ class Hybrid(Model):
         if "sizes" not in facts:
             raise InputError(f"{folder}: a hybrid of an earlier version, which mixed other models; train the run anew")
         parts: dict[str, Fitted] = {}
-        for name, (entry, inner) in stored_parts(problem, [str(name) for name in arrays["names"]]).items():
+        for name in map(str, arrays["names"]):
+            entry, inner = _part(problem, name, name in TRACED)
             parts[name] = entry.load(under(f"{name}/", arrays), inner, folder / FOLDER / name)
         mixture = from_field_arrays(Mixture, under("mixture/", arrays))
         stored, left = under("intervals/", arrays), under("residuals/", arrays)

@@ -50,26 +50,19 @@ MOMENTUM = 0.5  # Adam's decay of the first moment (Radford et al.)
 
 @dataclass(frozen=True)
 class DcganSettings(NetworkSettings):
-    """Settings of the adversarial network and of the training loop.
-
-    Attributes:
-        noise: number of inputs that are drawn from -1 to 1.
-        hidden: neurons before the coarse grid.
-        channels: channels of the coarse grid; halved at each finer grid.
-        octaves: octaves of the position's encoding.
-        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.network`).
-    """
+    """Settings of the adversarial network and of the training loop."""
 
     steps: int = 1875
     batch: int = 8
     validate_every: int = 188
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
     FIXED: ClassVar[Mapping[str, float]] = {"adversary_rate": ADVERSARY_RATE, "l1": L1}
-    noise: Count = 8
-    hidden: Count = 64
+    noise: Count = 8  #: number of inputs that are drawn from -1 to 1
+    hidden: Count = 64  #: neurons before the coarse grid
+    #: channels of the coarse grid; halved at each finer grid
     channels: Annotated[int, Field(ge=2**LEVELS, description=f"{2**LEVELS} or more")] = 32
-    octaves: int = 4
-    scale_m: Positive = 1.0
+    octaves: int = 4  #: octaves of the position's encoding
+    scale_m: Positive = 1.0  #: unit of encoded positions, metres (`wrf_mi.gaussians.network`)
 
 
 @dataclass(frozen=True)

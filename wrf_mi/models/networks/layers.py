@@ -42,23 +42,19 @@ class Module:
         changed: Self = _mapped(self, "", lambda path, _: weights[path])
         return changed
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """All weights by path, as NumPy arrays."""
-        return {path: np.asarray(weight) for path, weight in self.state().items()}
+    def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
+        """All weights by prefix and path, as NumPy arrays."""
+        return {f"{prefix}{path}": np.asarray(weight) for path, weight in self.state().items()}
 
-    def on_device(self, weights: Mapping[str, NDArray[Any]]) -> Self:
-        """The same network with other weights, as single-precision tensors; errors as `check`."""
-        self.check(weights)
-        return self.with_state({path: to_tensor(values) for path, values in weights.items()})
+    def on_device(self, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Self:
+        """The same network with the weights of `arrays`, as single-precision tensors; errors as `check`."""
+        self.check(arrays, prefix)
+        return self.with_state({path: to_tensor(arrays[f"{prefix}{path}"]) for path in self.state()})
 
-    def check(self, weights: Mapping[str, NDArray[Any]]) -> None:
-        """Refuse other weights than those of this network: the backend ends the process on other shapes.
-
-        Raises:
-            InputError: a weight that is missing, of another shape, or not finite.
-        """
+    def check(self, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> None:
+        """Refuse weights that are missing, of another shape, or not finite: the backend would end the process."""
         for path, like in self.state().items():
-            weight = weights.get(path)
+            weight = arrays.get(f"{prefix}{path}")
             if weight is None or weight.shape != tuple(like.shape) or not np.isfinite(weight).all():
                 text = "missing" if weight is None else f"of shape {weight.shape}, or not finite"
                 raise InputError(f"weight {path} is {text}, where the settings need {tuple(like.shape)}")
@@ -81,13 +77,9 @@ def _mapped(value: Any, path: str, change: Callable[[str, Any], Any]) -> Any:
 class Linear(Module):
     """Affine map of one input, or of the concatenation of named inputs with a matrix each.
 
-    Weights are normal with deviation gain / sqrt(inputs) (He et al. 2015), the bias [outputs, 1] is zero.
-
-    Args:
-        inputs: number of inputs, or numbers by name. The matrix of a single input is ``hidden``.
-        outputs: number of outputs.
-        rng: source of the weights.
-        gain: `GAIN` before a rectifier, 1 before no activation.
+    Weights are normal with deviation gain / sqrt(inputs) (He et al. 2015), the bias [outputs, 1] is zero. ``inputs`` is
+    the number of inputs, or numbers by name; the matrix of a single input is ``hidden``. ``gain`` is `GAIN` before a
+    rectifier, 1 before no activation.
     """
 
     bias: Any
@@ -102,7 +94,6 @@ class Linear(Module):
         self.bias = np.zeros((outputs, 1), np.float32)
 
     def __getattr__(self, name: str) -> Any:
-        """The matrix of a named input."""
         raise AttributeError(f"layer without an input {name}")
 
     def __call__(self, *hidden: Any, **parts: Any) -> Any:

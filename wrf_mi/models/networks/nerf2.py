@@ -35,36 +35,11 @@ from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import IntArray
 from ...receivers.reports import SQUARED_MAGNITUDE_EPS
-from ...tasks import Task, task_of
-from ...tasks.conditions import (
-    channel_scales,
-    channels_from,
-    conditions_of,
-    known_uplink,
-    normalised_uplink,
-    outputs_of,
-    placed_receivers,
-    truth_of,
-)
+from ...tasks import Task, conditions, task_of
 from ...training.config import AdamConfig
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Fitted,
-    Inputs,
-    Model,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    inputs_of,
-    keyed,
-    known_positions,
-    received_rows,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
 from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
 from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
@@ -77,36 +52,24 @@ PAIRS_PER_CHUNK = 1 << 18
 
 @dataclass(frozen=True)
 class Nerf2Settings(NetworkSettings):
-    """Settings of NeRF2 and of the training loop.
-
-    Attributes:
-        batch: spectra of a step, at most.
-        networks: sizes of the networks.
-        rays: pixels of a spectrum in a step.
-        sphere_rays: rays over the full sphere, for signal strengths and channels.
-        sphere_batch: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of
-            transmitters.
-        samples: points along a ray.
-        near_m: distance from the receiver at which rays start, metres.
-        far_m: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions
-            are not known.
-        tx_octaves: octaves of the encoding of transmitter positions.
-        shared: whether all receivers share a pair of networks.
-    """
+    """Settings of NeRF2 and of the training loop."""
 
     steps: int = 5000
-    batch: int = 16
+    batch: int = 16  #: spectra of a step, at most
     validate_every: int = 500
     optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
-    networks: Networks = dataclasses.field(default_factory=Networks)
-    rays: Count = 256
-    sphere_rays: Count = 64
+    networks: Networks = dataclasses.field(default_factory=Networks)  #: sizes of the networks
+    rays: Count = 256  #: pixels of a spectrum in a step
+    sphere_rays: Count = 64  #: rays over the full sphere, for signal strengths and channels
+    #: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of transmitters
     sphere_batch: Count = 128
-    samples: Count = 4
-    near_m: float = 0.0
+    samples: Count = 4  #: points along a ray
+    near_m: float = 0.0  #: distance from the receiver at which rays start, metres
+    #: distance at which rays end, metres; 0: that of the farthest training transmitter, or 10 m where positions are not
+    #: known
     far_m: float = 0.0
-    tx_octaves: int = 4
-    shared: bool = True
+    tx_octaves: int = 4  #: octaves of the encoding of transmitter positions
+    shared: bool = True  #: whether all receivers share a pair of networks
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,10 +122,11 @@ class Field(Fitted):
         self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
     ) -> None:
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
-        self.outputs, self.task, self._shape = outputs_of(record), task_of(record), record.observation.shape[2:]
+        self.outputs, self.task = conditions.outputs_of(record), task_of(record)
+        self._shape = record.observation.shape[2:]
         self.networks: list[Nerf2Network] = []
         self._points: tuple[int, list[RayPoints]] | None = None
-        receivers = placed_receivers(record, self.outputs.by_uplink)
+        receivers = conditions.placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
         self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
         if self.task.image:
@@ -173,11 +137,9 @@ class Field(Fitted):
         self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
         origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
         extent_m, frequencies_hz = float(np.abs(origins).max()) + far_m, self.outputs.frequencies_hz
-        parts = {
-            **constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz),
-            "origin": origins.T,
-            "direction": np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T,
-        }
+        parts = dict(constant_parts(extent_m, settings.near_m, far_m, settings.samples, frequencies_hz))
+        parts["origin"] = origins.T
+        parts["direction"] = np.concatenate([rays @ receiver.to_world.T for receiver in receivers]).T
         self.data = {name: to_tensor(values) for name, values in parts.items()}
         dr.make_opaque(self.data)  # literals would be compiled into the kernels of each receiver anew
         self.network = self.initial(np.random.default_rng(0))
@@ -203,29 +165,23 @@ class Field(Fitted):
         return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers].
-
-        Raises:
-            InputError: fitted to uplink channels, and there are none.
-        """
+        """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers]."""
         network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
         if self._points is None or self._points[0] != receiver:
             # One receiver's at a time: 270 MB for a spectrum of 32,400 pixels.
             self._points = receiver, self.look(network, receiver)
         condition, divisor = self.condition_of(inputs, receiver)
         values, shape = self.march(network, self._points[1], condition, receiver), (len(inputs), *self._shape)
-        return Prediction(channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape))
+        return Prediction(
+            conditions.channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape)
+        )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
-        arrays = {
-            "settings": settings_array(self.settings),
-            "far_m": np.asarray(self.far_m),
-            "scales": self.scales,
-            **field_arrays(self.coordinates, "frame/"),
-        }
+        arrays = {"settings": model.settings_array(self.settings), "far_m": np.asarray(self.far_m)}
+        arrays |= {"scales": self.scales, **model.field_arrays(self.coordinates, "frame/")}
         for g, network in enumerate(self.networks):
-            arrays |= keyed(f"group{g}/", network.arrays())
+            arrays |= network.arrays(f"group{g}/")
         return arrays
 
     def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[RayPoints]:
@@ -251,13 +207,9 @@ class Field(Fitted):
         return np.concatenate(blocks)
 
     def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
-        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels.
-
-        Raises:
-            InputError: no uplink, where one is needed.
-        """
+        """Features of transmitters for the radiance network [features, m], and the factor of predicted channels."""
         if self.outputs.by_uplink:
-            features, divisor = normalised_uplink(known_uplink(inputs.uplink))
+            features, divisor = conditions.normalised_uplink(inputs.uplink)
             return to_tensor(features.T), divisor
         s = self.settings
         where = self.coordinates.features(inputs.tx_pos_m, s.tx_octaves, s.networks.scale_m)
@@ -299,12 +251,13 @@ def _fit_group(
     s, outputs = field.settings, field.outputs
     known = split.all_train
     # From here on rows count within the training rows.
-    rows = {
-        r: tuple(np.searchsorted(known, part) for part in received_rows(record, split, r, "nerf2")) for r in members
-    }
+    received = {r: received_rows(record, split, r, "nerf2") for r in members}
+    rows = {r: tuple(np.searchsorted(known, part) for part in parts) for r, parts in received.items()}
     rng = np.random.default_rng([seed, *members])
-    condition, _ = field.condition_of(inputs_of(record, known), members[0])
-    truth = np.concatenate([truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))])
+    condition, _ = field.condition_of(record.inputs(known), members[0])
+    truth = np.concatenate(
+        [conditions.truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))]
+    )
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
     initial = field.initial(rng)
@@ -326,7 +279,7 @@ def _fit_group(
     def score(network: Nerf2Network) -> float:
         errors = []
         for r in members:
-            validation = conditions_of(rows[r][1], outputs)
+            validation = conditions.conditions_of(rows[r][1], outputs)
             if len(validation):
                 points = field.look(network, r, scored if spectrum else None)
                 predicted = field.march(network, points, columns(condition, opaque_rows(validation)), r)
@@ -334,8 +287,8 @@ def _fit_group(
                 errors.append(np.square(predicted - (wanted[:, scored] if spectrum else wanted)).mean(axis=1))
         return float(np.mean(np.concatenate(errors)))
 
-    train = [conditions_of(rows[r][0], outputs) for r in members]
-    everything = [conditions_of(np.concatenate(rows[r]), outputs) for r in members]
+    train = [conditions.conditions_of(rows[r][0], outputs) for r in members]
+    everything = [conditions.conditions_of(np.concatenate(rows[r]), outputs) for r in members]
     able = any(len(rows[r][1]) for r in members)
     name = "nerf2" if s.shared else f"nerf2 {record.receivers[members[0]].name}"
     rows_of = draw, train, everything, score if able else None
@@ -354,31 +307,27 @@ class Nerf2Model(Model):
     uplink, headings = "optional", True
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Field:
-        """Fit the networks.
-
-        Raises:
-            InputError: unknown positions or poses, a receiver without training rows, or an uplink of other antennas.
-        """
+        """Fit the networks (InputError: unknown positions or poses, or a receiver without training rows)."""
         record, known = problem.record, split.all_train
-        outputs, settings = outputs_of(record), problem.settings
+        outputs, settings = conditions.outputs_of(record), problem.settings
         where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
         known_rx = np.stack([receiver.position_m for receiver in record.receivers])
-        rx = np.stack([receiver.position_m for receiver in placed_receivers(record, outputs.by_uplink)])
+        rx = np.stack([receiver.position_m for receiver in conditions.placed_receivers(record, outputs.by_uplink)])
         if np.isfinite(where).all() and np.isfinite(known_rx).all():
             farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
         else:
             where, farthest = rx, FAR_M
-        scales = channel_scales(record, known)
+        scales = conditions.channel_scales(record, known)
         field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
         field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
         return field
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Field:
         """The fields that `Field.arrays` described."""
-        settings = stored_settings(Nerf2Settings, arrays, "nerf2")
-        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        settings = model.stored_settings(Nerf2Settings, arrays, "nerf2")
+        coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
         field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-        field.networks = [field.network.on_device(under(f"group{g}/", arrays)) for g in range(len(field.groups))]
+        field.networks = [field.network.on_device(arrays, f"group{g}/") for g in range(len(field.groups))]
         return field
 
 

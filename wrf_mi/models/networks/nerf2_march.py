@@ -39,23 +39,15 @@ LEAK = 0.01  # slope of the leaky ReLU below zero, PyTorch's default
 
 @dataclass(frozen=True)
 class Networks:
-    """Sizes of the two networks.
+    """Sizes of the two networks."""
 
-    Attributes:
-        layers: hidden layers of the attenuation network.
-        width: neurons of these layers; the radiance network has layers of this and half of this width.
-        skip: hidden layers before the encoded point enters again; 0: it does not.
-        point_octaves: octaves of the encoding of points.
-        view_octaves: octaves of the encoding of directions.
-        scale_m: unit of encoded points and transmitters, metres (`wrf_mi.gaussians.network`).
-    """
-
-    layers: Count = 8
+    layers: Count = 8  #: hidden layers of the attenuation network
+    #: neurons of these layers; the radiance network has layers of this and half of this width
     width: Annotated[int, Field(ge=2, description="2 or more")] = 128
-    skip: int = 5
-    point_octaves: int = 3
-    view_octaves: int = 3
-    scale_m: Positive = 1.0
+    skip: int = 5  #: hidden layers before the encoded point enters again; 0: it does not
+    point_octaves: int = 3  #: octaves of the encoding of points
+    view_octaves: int = 3  #: octaves of the encoding of directions
+    scale_m: Positive = 1.0  #: unit of encoded points and transmitters, metres (`wrf_mi.gaussians.network`)
 
 
 class Nerf2Network(Module):

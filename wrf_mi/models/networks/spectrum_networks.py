@@ -16,22 +16,8 @@ from ...core import Prediction, Split
 from ...tasks import TASKS
 from ...tasks.losses import ssim
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Fitted,
-    Inputs,
-    Model,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    keyed,
-    known_positions,
-    received_rows,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
 from .layers import Coordinates
 from .training import Network, train_network
 
@@ -78,11 +64,7 @@ class SpectrumNetwork(Model):
         return Network(name, module, loss, data, draw, *samples, SPECTRUM.label, SPECTRUM.higher_is_better)
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedNetworks:
-        """Train the networks of all receivers in turn.
-
-        Raises:
-            InputError: unknown positions, or a receiver with fewer than two rows.
-        """
+        """Train the networks of all receivers in turn (InputError: unknown positions, or fewer than two rows)."""
         record, settings, seed = problem.record, problem.settings, problem.seed
         coordinates = Coordinates.of(known_positions(record, split.all_train, self.name))
         generators = []
@@ -98,12 +80,12 @@ class SpectrumNetwork(Model):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
         """The networks that `FittedNetworks.arrays` described."""
-        settings: Any = stored_settings(self.settings, arrays, self.name)
+        settings: Any = model.stored_settings(self.settings, arrays, self.name)
         height, width = (int(side) for side in arrays["shape"])
         initial = self.generator_class(settings, (height, width), np.random.default_rng(0))
-        prefixes = (f"receiver{r}/{self.generator}." for r in range(len(problem.record.receivers)))
-        generators = [initial.on_device(under(prefix, arrays)) for prefix in prefixes]
-        coordinates = from_field_arrays(Coordinates, arrays, "frame/")
+        receivers = range(len(problem.record.receivers))
+        generators = [initial.on_device(arrays, f"receiver{r}/{self.generator}.") for r in receivers]
+        coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
         return FittedNetworks(self, settings, coordinates, generators, (height, width))
 
 
@@ -128,8 +110,8 @@ class FittedNetworks(Fitted):
 
     def arrays(self) -> Arrays:
         """Settings, frame and weights."""
-        arrays = {"settings": settings_array(self.settings), "shape": np.asarray(self.shape)}
-        arrays |= field_arrays(self.coordinates, "frame/")
+        arrays = {"settings": model.settings_array(self.settings), "shape": np.asarray(self.shape)}
+        arrays |= model.field_arrays(self.coordinates, "frame/")
         for r, generator in enumerate(self.generators):
-            arrays |= keyed(f"receiver{r}/{self.model.generator}.", generator.arrays())
+            arrays |= generator.arrays(f"receiver{r}/{self.model.generator}.")
         return arrays

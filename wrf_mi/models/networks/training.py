@@ -19,14 +19,12 @@ from drjit.opt import Adam
 from ...backend.device import Recorded
 from ...core import InputError
 from ...core.types import IntArray
-from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params
+from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, plan, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.config import AdamConfig, LoopConfig
-from ...training.loop import Progress, TrainingLoop
-from ...training.schedule import plan
+from ...training.loop import FitState, Progress, TrainingLoop
 from ...training.session import FitSession
-from ...training.state import FitState
-from ..model import keyed, under
+from ..model import keyed
 from .layers import Module
 
 HOLD_OUT = 0.8  # share of the steps with a constant rate and validation rows kept out of training
@@ -75,11 +73,7 @@ class Network:
 
 
 class NetworkTrainer(TrainingLoop):
-    """Training loop of a network, from its initial weights or from the ``state`` of an interrupted training.
-
-    Raises:
-        InputError: no sample that trains.
-    """
+    """Training loop of a network, from its initial weights or from the ``state`` of an interrupted training."""
 
     def __init__(
         self, network: Network, config: LoopConfig, seed: Sequence[int], state: FitState | None = None
@@ -114,13 +108,9 @@ class NetworkTrainer(TrainingLoop):
         state, schedule, t = self.state, self.schedule, self.state.step
         # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
-        state.mean, trouble, loss = self._step(
-            state.adam,
-            state.mean,
-            self.network.data,
-            self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng),
-            ScheduledStep.of(schedule, t, trouble),
-        )
+        drawn = self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng)
+        at = ScheduledStep.of(schedule, t, trouble)
+        state.mean, trouble, loss = self._step(state.adam, state.mean, self.network.data, drawn, at)
         return loss, trouble
 
     def validate(self) -> float:
@@ -146,13 +136,13 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     folder, finished = session.folder, f"{FINISHED}{network.name}"
     stored = read_checkpoint(folder) if folder is not None and (folder / CHECKPOINT).exists() else {}
     if f"{finished}/score" in stored:
-        return network.module.on_device(under(f"{finished}/mean/", stored)), float(stored[f"{finished}/score"])
+        return network.module.on_device(stored, f"{finished}/mean/"), float(stored[f"{finished}/score"])
     beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
     beside["network"] = np.asarray(network.name)
     # A checkpoint of another network of this fit says which have finished, and nothing of this one.
     begun = "network" in stored and str(stored["network"]) == network.name
     if begun:
-        network.module.check(under("param/", stored))
+        network.module.check(stored, "param/")
     state = FitState.from_arrays(stored, network.momentum) if begun else None
     trainer = NetworkTrainer(network, config, seed, state)
     trainer.seconds = float(stored.get("seconds", 0.0))

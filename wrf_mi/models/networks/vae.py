@@ -33,32 +33,23 @@ from .training import Network, NetworkSettings, opaque_rows
 POOL = 6  # largest side of the blocks of pixels whose means the encoder sees
 NOISE = 0.1  # standard deviation of the likelihood, in grey levels from 0 to 1
 BETA = 3e-2  # weight of the divergence against the mean over pixels, which are far from independent (Higgins et al.)
-PRIOR_SHARE = (
-    0.8  # share of the reconstruction whose z is drawn from the prior, so that it learns the position's effect
-)
+PRIOR_SHARE = 0.8  # share of the reconstruction with z from the prior, which teaches the position's effect
 
 
 @dataclass(frozen=True)
 class VaeSettings(NetworkSettings):
-    """Settings of the variational autoencoder and of the training loop.
-
-    Attributes:
-        latent: size of z.
-        width: neurons of the hidden layers.
-        last: neurons of the decoder's second hidden layer, which precedes the pixels: most weights lie behind it.
-        octaves: octaves of the position's encoding.
-        scale_m: unit of encoded positions, metres (`wrf_mi.gaussians.network`).
-    """
+    """Settings of the variational autoencoder and of the training loop."""
 
     steps: int = 3750
     batch: int = 16
     validate_every: int = 375
     FIXED: ClassVar[Mapping[str, float]] = {"pool": POOL, "noise": NOISE, "beta": BETA, "prior_share": PRIOR_SHARE}
-    latent: Count = 16
-    width: Count = 256
+    latent: Count = 16  #: size of z
+    width: Count = 256  #: neurons of the hidden layers
+    #: neurons of the decoder's second hidden layer, which precedes the pixels: most weights lie behind it
     last: Count = 64
-    octaves: int = 4
-    scale_m: Positive = 1.0
+    octaves: int = 4  #: octaves of the position's encoding
+    scale_m: Positive = 1.0  #: unit of encoded positions, metres (`wrf_mi.gaussians.network`)
 
 
 def pooled(spectra: NDArray[Any], pool: int) -> NDArray[np.float32]:

@@ -31,24 +31,14 @@ from ...backend.device import to_tensor
 from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
+from ...tasks.conditions import real_parts
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Fitted,
-    Inputs,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    keyed,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Fitted, Inputs, Problem, slices
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .csi_bands import Bands, UplinkModel, bands_of, relative_error
+from .uplink_waves import Bands, UplinkModel, bands_of, relative_error
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
@@ -60,23 +50,17 @@ WEAK = 0.3  # share of the root mean square below which a sum over subcarriers h
 
 @dataclass(frozen=True)
 class FireSettings(NetworkSettings):
-    """Settings of FIRE and of the training loop.
-
-    Attributes:
-        batch: antennas of a step, at most, where a sample is an antenna.
-        sample: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows.
-        latent: number of latent variables.
-        width: neurons of the hidden layers.
-        spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
-    """
+    """Settings of FIRE and of the training loop."""
 
     steps: int = 5000
-    batch: int = 256
+    batch: int = 256  #: antennas of a step, at most, where a sample is an antenna
     validate_every: int = 500
+    #: input of the network: one ``antenna``, a whole ``row``, or ``auto``, chosen on validation rows
     sample: Sample = "auto"
     FIXED: ClassVar[Mapping[str, float]] = {"row_batch": ROW_BATCH, "beta": BETA}
-    latent: Count = 32
-    width: Count = 256
+    latent: Count = 32  #: number of latent variables
+    width: Count = 256  #: neurons of the hidden layers
+    #: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz
     spacing_hz: Positive = 312.5e3
 
 
@@ -98,12 +82,6 @@ def units_of(uplink: NDArray[np.complex128]) -> NDArray[np.complex128]:
     return np.asarray(np.where(scale > 0, scale, 1.0) * phase)
 
 
-def parts(h: NDArray[np.complex128]) -> NDArray[np.float32]:
-    """Real and imaginary parts, [values, m]: columns as samples."""
-    flat = h.reshape(len(h), -1)
-    return np.concatenate([flat.real, flat.imag], axis=1).T.astype(np.float32)
-
-
 class Encoder(Mlp):
     """Mean and logarithm of the variance of the latent variables, each [latent, batch], of uplinks [values, batch]."""
 
@@ -115,7 +93,7 @@ class Encoder(Mlp):
         self.spread.bias -= 4
 
     def __call__(self, uplink: Any) -> tuple[Any, Any]:
-        """Both of uplinks."""
+        """Mean and logarithm of the variance for uplinks."""
         hidden = super().__call__(uplink)
         return self.mean(hidden), self.spread(hidden)
 
@@ -161,15 +139,15 @@ class FittedFire(Fitted):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Kind of sample, settings, bands and weights."""
-        arrays = {"sample": np.asarray(self.sample), "settings": settings_array(self.settings)}
-        return arrays | field_arrays(self.bands) | keyed("network/", self.network.arrays())
+        arrays = {"sample": np.asarray(self.sample), "settings": model.settings_array(self.settings)}
+        return arrays | model.field_arrays(self.bands) | self.network.arrays("network/")
 
 
 def predict_samples(
     fire: Fire, samples: NDArray[np.complex128], unit: NDArray[np.complex128], subcarriers: int
 ) -> NDArray[np.complex128]:
     """Downlink [m, antennas of a sample, subcarriers] of uplink samples with their units."""
-    scaled = parts(samples / unit[:, None, None])
+    scaled = real_parts(samples / unit[:, None, None]).T
     out = np.empty((len(samples), samples.shape[1] * subcarriers), complex)
     for chunk in slices(len(samples), CHUNK_SIZE):
         values = fire.p(fire.q(to_tensor(scaled[:, chunk]))[0]).numpy().T
@@ -187,7 +165,7 @@ def _fit(
     known = np.concatenate([train, validation])
     uplink, downlink = samples_of(record.uplink[known], sample), samples_of(record.observation[0, known], sample)
     unit = units_of(uplink)
-    x, y = parts(uplink / unit[:, None, None]), parts(downlink / unit[:, None, None])
+    x, y = (real_parts(coefficients / unit[:, None, None]).T for coefficients in (uplink, downlink))
     per_row = uplink.shape[0] // len(known)
     # Samples are in units of their uplink; errors count in units of their row.
     energy = np.square(np.abs(downlink)).sum(axis=(1, 2)).reshape(-1, per_row).mean(axis=1).repeat(per_row)
@@ -240,10 +218,9 @@ class FireModel(UplinkModel):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
         """The network that `FittedFire.arrays` described."""
-        settings, bands = stored_settings(FireSettings, arrays, "fire"), from_field_arrays(Bands, arrays)
-        weights = under("network/", arrays)
-        sizes = weights["q.0.hidden"].shape[1], len(weights["p.out.bias"])
-        fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(weights)
+        settings, bands = model.stored_settings(FireSettings, arrays, "fire"), model.from_field_arrays(Bands, arrays)
+        sizes = arrays["network/q.0.hidden"].shape[1], len(arrays["network/p.out.bias"])
+        fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(arrays, "network/")
         return FittedFire(str(arrays["sample"]), fire, bands, settings)
 
 

@@ -15,6 +15,7 @@ Source: Kay, "Fundamentals of statistical signal processing: estimation theory" 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,7 +29,7 @@ from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
-from .csi_bands import UplinkModel, relative_error
+from .uplink_waves import UplinkModel, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
 """Penalties to choose from: from the resolution of float64 in normal equations to a map of nearly zero."""
@@ -38,12 +39,9 @@ CHUNK_SIZE = 256  # rows whose products are added together: bounds the memory be
 
 @dataclass(frozen=True)
 class LinearSettings(CheckedSettings):
-    """Settings of the linear map.
+    """Settings of the linear map."""
 
-    Attributes:
-        penalty: in units of the mean energy of an uplink coefficient; None: chosen on validation rows.
-    """
-
+    #: in units of the mean energy of an uplink coefficient; None: chosen on validation rows
     penalty: Annotated[float | None, Field(gt=0, description="more than 0")] = None
 
 
@@ -64,53 +62,42 @@ class LinearMap(Fitted):
         return field_arrays(self)
 
 
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations: sums over rows and antennas of weighted products."""
+def ridge(record: Record, rows: IntArray) -> Callable[[float], NDArray[np.complex128]]:
+    """The map [f, g] of some rows (InputError: rows without downlink energy) by penalty in units of mean eigenvalue."""
+    assert record.uplink is not None
+    up, down = record.uplink.shape[2], record.observation.shape[3]
+    # Normal equations: sums over rows and antennas of weighted products.
+    left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
+    for part in slices(len(rows), CHUNK_SIZE):
+        chunk = rows[part]
+        x, y = record.uplink[chunk].astype(complex), record.observation[0, chunk].astype(complex)
+        energy = np.square(np.abs(y)).sum(axis=(1, 2))
+        # A row without energy has no relative error.
+        scale = np.where(energy > 0, 1 / np.sqrt(np.where(energy > 0, energy, 1)), 0)[:, None, None]
+        x, y = (x * scale).reshape(-1, up), (y * scale).reshape(-1, down)
+        left += x.conj().T @ x
+        right += x.conj().T @ y
+    if not np.trace(left).real > 0:
+        raise InputError(f"{record.name}: no training row's downlink has any energy; use other rows")
+    values, vectors = np.linalg.eigh(left)
 
-    values: NDArray[np.float64]  # eigenvalues of the uplink's products x^H x, [f]
-    vectors: NDArray[np.complex128]  # their eigenvectors, [f, f]
-    right: NDArray[np.complex128]  # products of uplink and downlink, x^H y, [f, g]
-
-    @classmethod
-    def of(cls, record: Record, rows: IntArray) -> Normal:
-        """The normal equations of some rows.
-
-        Raises:
-            InputError: rows without any downlink energy.
-        """
-        assert record.uplink is not None
-        up, down = record.uplink.shape[2], record.observation.shape[3]
-        left, right = np.zeros((up, up), complex), np.zeros((up, down), complex)
-        for part in slices(len(rows), CHUNK_SIZE):
-            chunk = rows[part]
-            x, y = record.uplink[chunk].astype(complex), record.observation[0, chunk].astype(complex)
-            energy = np.square(np.abs(y)).sum(axis=(1, 2))
-            # A row without energy has no relative error.
-            scale = np.where(energy > 0, 1 / np.sqrt(np.where(energy > 0, energy, 1)), 0)[:, None, None]
-            x, y = (x * scale).reshape(-1, up), (y * scale).reshape(-1, down)
-            left += x.conj().T @ x
-            right += x.conj().T @ y
-        if not np.trace(left).real > 0:
-            raise InputError(f"{record.name}: no training row's downlink has any energy; use other rows")
-        return cls(*np.linalg.eigh(left), right)
-
-    def matrix(self, penalty: float) -> NDArray[np.complex128]:
-        """The map [f, g] that solves them with a penalty in units of the mean eigenvalue."""
+    def matrix(penalty: float) -> NDArray[np.complex128]:
         # Ridge regression by eigenvectors: each penalty costs one product. Rounding leaves values below 0.
-        damped = np.maximum(self.values, 0) + penalty * self.values.mean()
-        return np.asarray(self.vectors @ ((self.vectors.conj().T @ self.right) / damped[:, None]))
+        damped = np.maximum(values, 0) + penalty * values.mean()
+        return np.asarray(vectors @ ((vectors.conj().T @ right) / damped[:, None]))
+
+    return matrix
 
 
 def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnProgress) -> float:
     """The penalty of the best median relative error of the rows that judge, from a fit to the others."""
     assert record.uplink is not None
-    normal = Normal.of(record, train)
+    matrix = ridge(record, train)
     uplink = record.uplink[judges].astype(complex)
     truth = record.observation[0, judges].reshape(len(judges), -1)
     errors = []
     for number, penalty in enumerate(PENALTIES):
-        predicted = (uplink @ normal.matrix(penalty)).reshape(len(judges), -1)
+        predicted = (uplink @ matrix(penalty)).reshape(len(judges), -1)
         errors.append(float(np.median(relative_error(predicted, truth))))
         on_progress("linear: choosing the penalty", (number + 1) / (len(PENALTIES) + 1))
     return PENALTIES[int(np.argmin(errors))]
@@ -132,7 +119,7 @@ class LinearModel(UplinkModel):
             picked = np.arange(len(train)) % JUDGES == 0
             train, validation = train[~picked], train[picked]
         penalty = settings.penalty or choose(record, train, validation, session.report)
-        matrix = Normal.of(record, known).matrix(penalty)
+        matrix = ridge(record, known)(penalty)
         session.report(f"linear: penalty {penalty:.2g}", 1.0)
         return LinearMap(matrix, record.observation.shape[2], penalty)
 

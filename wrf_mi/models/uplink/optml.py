@@ -32,27 +32,15 @@ from ...backend.device import to_tensor, to_uint
 from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
-from ...core.types import IntArray
 from ...training.config import AdamConfig
 from ...training.session import FitSession
-from ..model import (
-    Arrays,
-    Inputs,
-    Problem,
-    field_arrays,
-    from_field_arrays,
-    keyed,
-    settings_array,
-    slices,
-    stored_settings,
-    under,
-)
+from .. import model
+from ..model import Arrays, Inputs, Problem, slices
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
-from .csi_bands import Bands, UplinkModel
 from .r2f2 import R2F2, PathSettings, choose
 from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
-from .uplink_waves import ArrayWaves, Complex, Mask, Waves, waves_of
+from .uplink_waves import ArrayWaves, Bands, Complex, Mask, UplinkModel, Waves, waves_of
 
 FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
 BLUR = 1.0  # width of a path in the map to be learned, in cells
@@ -61,19 +49,12 @@ CHUNK_SIZE = 256  # maps that are made together: bounds the memory
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated channels.
+    """Simulated channels."""
 
-    Attributes:
-        channels: number of channels; a tenth validates.
-        paths: most paths of a channel.
-        decay_db: range of path powers below the strongest, dB.
-        noise_db: least and greatest ratio of signal to noise, dB.
-    """
-
-    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  # to learn from and to validate
-    paths: Count = 12
-    decay_db: float = 25.0
-    noise_db: tuple[float, float] = (5.0, 30.0)
+    channels: Annotated[int, Field(ge=2, description="2 or more")] = 3000  #: number of channels; a tenth validates
+    paths: Count = 12  #: most paths of a channel
+    decay_db: float = 25.0  #: range of path powers below the strongest, dB
+    noise_db: tuple[float, float] = (5.0, 30.0)  #: least and greatest ratio of signal to noise, dB
 
 
 def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
@@ -90,18 +71,15 @@ def maps_of(waves: Waves, h: Complex) -> NDArray[np.float32]:
 def simulate(
     waves: Waves, simulation: Simulation, bands: Bands, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Maps of simulated channels and of their paths, each [n, distances, cells].
-
-    The number of paths, their directions, phases and powers in decibels are uniform; so are distances, or with
-    spherical waves their logarithms.
-    """
+    """Maps of simulated channels and of their paths, each [n, distances, cells]."""
+    # The number of paths, their directions, phases and powers in decibels are uniform; so are distances, or with
+    # spherical waves their logarithms.
     filtered, truth = [], []
-    axes = waves.cosines.shape[1]
-    near = max(float(waves.grid[0]), 0.0)
+    axes, k = waves.cosines.shape[1], simulation.paths
+    near, far = max(float(waves.grid[0]), 0.0), float(waves.grid[-1])
     for chunk in slices(simulation.channels, CHUNK_SIZE):
-        n, k = chunk.stop - chunk.start, simulation.paths
+        n = chunk.stop - chunk.start
         present = np.arange(k) < rng.integers(1, k + 1, (n, 1))
-        far = float(waves.grid[-1])
         d = near * (far / near) ** rng.random((n, k)) if waves.spherical else rng.uniform(near, far, (n, k))
         cosines = rng.standard_normal((n, k, axes))
         if axes:
@@ -110,9 +88,8 @@ def simulate(
         theta = np.concatenate([d[..., None], cosines], axis=2)
         level = -simulation.decay_db * rng.random((n, k))
         level[:, 0] = 0
-        gains = 10 ** (level / 20) * np.exp(2j * np.pi * rng.random((n, k))) * present
+        gains = (10 ** (level / 20) * np.exp(2j * np.pi * rng.random((n, k))) * present)[..., None]
         h = np.empty((n, bands.antennas, len(bands.uplink_hz)), complex)
-        gains = gains[..., None]
         if not isinstance(waves, ArrayWaves):
             gains = gains * (rng.standard_normal((n, k, bands.antennas, 2)) @ np.array([1, 1j]) / np.sqrt(2))
         for row in range(n):
@@ -155,7 +132,8 @@ class PathMap(Module):
     def __call__(self, x: Any, around: Any) -> Any:
         """Maps of paths; ``around`` is `Waves.around` on the device."""
         for layer in self.layers:
-            x = _elu(layer(_patches(x, around, len(self.waves.cosines))))
+            x = layer(_patches(x, around, len(self.waves.cosines)))
+            x = dr.select(x > 0, x, dr.exp(dr.minimum(x, 0)) - 1)  # exponential linear unit
         return self.out(x)
 
     def propose(self, h: Complex, count: int, threshold: float) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -175,10 +153,6 @@ class PathMap(Module):
         at, direction = np.unravel_index(best, (channels, cells))
         theta = np.concatenate([waves.grid[at][..., None], waves.cosines[direction]], axis=2)
         return theta, np.isfinite(np.take_along_axis(peaks, best, axis=1))
-
-
-def _elu(x: Any) -> Any:
-    return dr.select(x > 0, x, dr.exp(dr.minimum(x, 0)) - 1)
 
 
 def _patches(x: Any, around: Any, cells: int) -> Any:
@@ -205,21 +179,15 @@ MAX_VALIDATION = 100  # most maps that validate
 
 @dataclass(frozen=True)
 class OptMLSettings(PathSettings, NetworkSettings):
-    """Settings of OptML, of the training loop, and of the search for paths with fewer steps than R2F2's.
-
-    Attributes:
-        simulation: simulated channels to learn from.
-        width: channels of the network.
-        rounds: maps of the residual.
-    """
+    """Settings of OptML, of the training loop, and of the search for paths with fewer steps than R2F2's."""
 
     steps: int = 1875
     batch: int = 16
     validate_every: int = 300
     optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
-    simulation: Simulation = field(default_factory=Simulation)
-    width: Count = 48
-    rounds: Count = 5
+    simulation: Simulation = field(default_factory=Simulation)  #: simulated channels to learn from
+    width: Count = 48  #: channels of the network
+    rounds: Count = 5  #: maps of the residual
     FIXED: ClassVar[Mapping[str, float]] = {"at_once": AT_ONCE, "threshold": THRESHOLD}
     max_paths: Count = 40
     between: int = 3
@@ -236,10 +204,9 @@ class OptML(R2F2):
 
     def paths(self, h: Complex, inputs: Inputs) -> Paths:
         """Paths of uplinks [m, antennas, f]."""
-        s, waves = self.settings, self.waves
+        s, waves, residual = self.settings, self.waves, h
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))
         present: Mask = np.zeros((len(h), 0), bool)
-        residual = h
 
         def pruned(rows: slice) -> tuple[FloatArray, Mask, Complex]:
             return prune(waves, h[rows], theta[rows], present[rows], s.between, s.max_paths)
@@ -255,8 +222,8 @@ class OptML(R2F2):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, wave model, bands and weights."""
-        settings = {"settings": settings_array(self.settings), "wavefront": np.array(self.kind)}
-        return settings | field_arrays(self.bands) | keyed("network/", self.network.arrays())
+        settings = {"settings": model.settings_array(self.settings), "wavefront": np.array(self.kind)}
+        return settings | model.field_arrays(self.bands) | self.network.arrays("network/")
 
 
 def prune(
@@ -270,9 +237,8 @@ def prune(
     theta, solved = refine(waves, h, theta, present, steps)
     count = h.shape[1] * h.shape[2]
     diagonal = np.arange(present.shape[1])
-    loaded = solved.gram.copy()
-    loaded[:, diagonal, diagonal] += 1e-9 * count  # two equal paths: either is worth nothing beside the other
-    inverse = np.linalg.inv(loaded)[:, diagonal, diagonal].real
+    load = 1e-9 * count * np.eye(len(diagonal))  # two equal paths: either is worth nothing beside the other
+    inverse = np.linalg.inv(solved.gram + load)[:, diagonal, diagonal].real
     strength = np.square(np.abs(solved.gains)).reshape(*present.shape, -1).sum(axis=2)
     rise = strength / np.maximum(inverse, np.finfo(float).tiny)
     energy = np.maximum(solved.energy, np.finfo(float).tiny)[:, None]
@@ -303,14 +269,9 @@ class OptMLModel(UplinkModel):
         judges = int(np.clip(len(filtered) // 10, 1, MAX_VALIDATION))
         around = to_uint(waves.around)
         # One column a map, so that a batch is a choice of columns.
-        flat = {
-            name: to_tensor(maps.reshape(len(maps), -1).T) for name, maps in (("filtered", filtered), ("truth", truth))
-        }
-        data = flat | {"around": around}
+        columns_of = (to_tensor(maps.reshape(len(maps), -1).T) for maps in (filtered, truth))
+        data = dict(zip(("filtered", "truth", "around"), (*columns_of, around), strict=True))
         dr.make_opaque(data)
-
-        def draw(rows: IntArray, receiver: int, rng: np.random.Generator) -> Any:
-            return opaque_rows(rows)
 
         def chosen(maps: Any, rows: Any) -> Any:
             x = dr.moveaxis(dr.reshape(columns(maps, rows), (channels, cells, dr.width(rows))), 1, 2)
@@ -327,15 +288,17 @@ class OptMLModel(UplinkModel):
 
         rows = [np.arange(judges, len(filtered))], [np.arange(len(filtered))]
         initial = PathMap(waves, settings.width, rng)
-        maps = Network("paths", initial, loss, data, draw, *rows, score, "mean squared error")
+        maps = Network(
+            "paths", initial, loss, data, lambda rows, *_: opaque_rows(rows), *rows, score, "mean squared error"
+        )
         return OptML(kind, bands, settings, train_network(maps, settings, (problem.seed,), session)[0])
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> OptML:
         """The model that `OptML.arrays` described."""
-        settings, kind = stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
-        bands = from_field_arrays(Bands, arrays)
+        settings, kind = model.stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
+        bands = model.from_field_arrays(Bands, arrays)
         waves = waves_of(kind, bands, settings.max_distance_m)
-        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(under("network/", arrays))
+        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(arrays, "network/")
         return OptML(kind, bands, settings, network)
 
 

@@ -39,9 +39,8 @@ from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
-from .csi_bands import Bands, UplinkModel, bands_of, principal_axes, relative_error
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
-from .uplink_waves import Complex, Waves, waves_of
+from .uplink_waves import Bands, Complex, UplinkModel, Waves, bands_of, principal_axes, relative_error, waves_of
 
 CHUNK_SIZE = 256  # positions that are traced together
 LENGTH_SD_M, COSINE_SD = 0.3, 0.03
@@ -138,25 +137,17 @@ BOTH_GAPS = (1, 2)  # spacings between the last uplink and the first downlink su
 
 @dataclass(frozen=True)
 class PathSettings(SpecularOptions, CheckedSettings):
-    """Settings of the search for paths.
+    """Settings of the search for paths."""
 
-    Attributes:
-        wavefront: ``spherical``, ``plane``, ``free`` (a gain for each antenna) or ``auto``, chosen on validation rows.
-        max_paths: most paths of a row.
-        max_distance_m: longest path, metres.
-        between: steps of refinement of all paths after each addition.
-        final: steps of refinement after the last addition.
-        spacing_hz: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz.
-        choice_rows: validation rows that choose the wave model.
-    """
-
+    #: ``spherical``, ``plane``, ``free`` (a gain for each antenna) or ``auto``, chosen on validation rows
     wavefront: Kind = "auto"
-    max_paths: Count = 100
-    max_distance_m: Positive = 100.0
-    between: int = 1
-    final: int = 15
+    max_paths: Count = 100  #: most paths of a row
+    max_distance_m: Positive = 100.0  #: longest path, metres
+    between: int = 1  #: steps of refinement of all paths after each addition
+    final: int = 15  #: steps of refinement after the last addition
+    #: distance of subcarriers where the data have no frequencies; that of 802.11 at 20 MHz
     spacing_hz: Positive = 312.5e3
-    choice_rows: Count = 16
+    choice_rows: Count = 16  #: validation rows that choose the wave model
     depth: Count = 5
     reflections: int = 3
     rays: int = 1 << 17
@@ -169,10 +160,10 @@ def choose(
     on_progress: OnProgress,
     directions: bool = False,
 ) -> tuple[str, Bands]:
-    """The wave model and the bands whose extrapolation fits the downlink of validation rows best.
+    """The wave model and the bands whose extrapolation fits the downlink of validation rows best in the median.
 
-    The criterion is the median over rows and antennas. Of ``rows`` that train and that validate, the latter decide
-    where there are any. ``directions``: among the wave models whose paths have a direction.
+    Of ``rows`` that train and that validate, the latter decide where there are any. ``directions``: among the wave
+    models whose paths have a direction.
 
     Raises:
         InputError: as `bands_of`, or a wave front that needs elements where there are none.
@@ -182,21 +173,13 @@ def choose(
     if directions and (first.elements_m is None or settings.wavefront == "free"):
         text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
         raise InputError(f"{record.name}: {text}; give them or omit the scene")
-    if first.elements_m is None:
-        if settings.wavefront in ("spherical", "plane"):
-            raise InputError(
-                f"{record.name}: {settings.wavefront} waves need the array's elements and the frequencies; "
-                "give both or choose wavefront=free"
-            )
-        kinds: tuple[str, ...] = ("free",)
-    else:
-        kinds = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
-    kinds = tuple(kind for kind in kinds if not directions or kind != "free")
-    options = [
-        (kind, bands)
-        for bands in ([first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS])
-        for kind in kinds
-    ]
+    if first.elements_m is None and settings.wavefront in ("spherical", "plane"):
+        text = "waves need the array's elements and the frequencies; give both or choose wavefront=free"
+        raise InputError(f"{record.name}: {settings.wavefront} {text}")
+    every = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
+    kinds = [kind for kind in every if not directions or kind != "free"] if first.elements_m is not None else ["free"]
+    known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
+    options = [(kind, bands) for bands in known for kind in kinds]
     if len(options) == 1:  # nothing to choose, and no row needs a downlink
         return options[0]
     judges = validation if len(validation) else train

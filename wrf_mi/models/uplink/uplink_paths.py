@@ -57,7 +57,6 @@ class Start:
         return cls(np.zeros((rows, 0, parameters)), np.zeros((rows, 0), bool), np.zeros((rows, 0, parameters)))
 
     def __getitem__(self, rows: slice | IntArray) -> Start:
-        """The paths of some rows."""
         return Start(self.theta[rows], self.present[rows], self.precision[rows])
 
     def joined(self, theta: FloatArray) -> Start:
@@ -166,9 +165,8 @@ def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> t
     power = np.where(present, mean_power[:, None], 0.0)
     for _ in range(PASSES):
         ridge = np.where(present, np.minimum(noise[:, None] / np.maximum(power, tiny), count / ACCURACY), 0.0)
-        loaded = solved.gram.copy()
-        loaded[:, diagonal, diagonal] += ridge + SINGULAR * solved.atoms.shape[2]
-        inverse = np.linalg.inv(loaded)
+        load = (ridge + SINGULAR * solved.atoms.shape[2])[:, :, None] * np.eye(len(diagonal))
+        inverse = np.linalg.inv(solved.gram + load)
         gains = inverse @ right
         # Expectation: the gains' posterior mean and variance; maximisation: a power of their expected square.
         variance = noise[:, None] * inverse[:, diagonal, diagonal].real

@@ -1,4 +1,4 @@
-"""Wave models of an uplink: coefficients of a propagation path at every antenna and subcarrier.
+"""Bands and array of an uplink, and wave models: coefficients of a propagation path at every antenna and subcarrier.
 
 With f0 the middle of the uplink, p_a the elements and g_k complex gains,
 
@@ -15,13 +15,101 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
+from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
-from .csi_bands import Bands
+from ...core.types import IntArray
+from ..model import Model, received_rows
+
+# Share of an array's largest extent along an axis below which phases of a few degrees do not resolve the direction.
+FLAT = 0.01
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Two bands and the array that observes them."""
+
+    uplink_hz: FloatArray  # frequency of each uplink subcarrier [f]
+    downlink_hz: FloatArray  # frequency of each downlink subcarrier [g]
+    antennas: int
+    known: bool  # whether the frequencies come with the data
+    # Positions of the antennas about the centre of the array, along its q principal axes [antennas, q], metres; None:
+    # unknown
+    elements_m: FloatArray | None = None
+
+    @property
+    def reference_hz(self) -> float:
+        """Middle of the uplink, the reference of phases over frequency."""
+        return float(self.uplink_hz.mean())
+
+    @property
+    def spacing_hz(self) -> float:
+        """Smallest distance of two uplink subcarriers; infinite with a single subcarrier."""
+        return float(np.diff(np.sort(self.uplink_hz)).min(initial=np.inf))
+
+
+def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
+    """The bands of a record.
+
+    Without known frequencies, subcarriers are taken to be ``spacing_hz`` apart around 0 Hz, the downlink ``gap``
+    spacings above the uplink, and the array's elements are not used, since the wavelength is unknown.
+
+    Raises:
+        InputError: a single uplink subcarrier, or an array of another size.
+    """
+    assert record.uplink is not None
+    (antennas, up), down = record.uplink.shape[1:], record.observation.shape[3]
+    if up < 2:
+        raise InputError(f"{record.name}: {up} uplink subcarrier; delays show in two or more")
+    known = record.uplink_hz is not None and record.frequencies_hz is not None
+    if known:
+        uplink_hz, downlink_hz = np.asarray(record.uplink_hz, float), np.asarray(record.frequencies_hz, float)
+    else:
+        uplink_hz = spacing_hz * (np.arange(up) - up - (gap - 1) / 2 + 0.5)
+        downlink_hz = spacing_hz * (np.arange(down) + (gap - 1) / 2 + 0.5)
+    array_m = record.receivers[0].array_m
+    elements = None if array_m is None or not known else np.asarray(array_m, float)
+    if elements is not None:
+        if elements.shape != (antennas, 3):
+            raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
+        elements = (elements - elements.mean(axis=0)) @ principal_axes(elements).T
+    return Bands(uplink_hz, downlink_hz, antennas, known, elements)
+
+
+def principal_axes(elements_m: FloatArray) -> FloatArray:
+    """Unit vectors [q, 3] of the principal axes along which an array is not flat (`FLAT`): a plane array has two."""
+    _, extent, axes = np.linalg.svd(elements_m - elements_m.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[extent > FLAT * max(float(extent[0]), np.finfo(float).tiny)])
+
+
+class UplinkModel(Model):
+    """A model of the downlink from the uplink of an array."""
+
+    tasks = ("csi",)
+    uplink, headings = "required", True
+
+    def known_rows(self, record: Record, split: Split) -> tuple[IntArray, IntArray]:
+        """Rows that train, and rows that choose settings (`received_rows`); InputError: not one array of antennas."""
+        shape = record.observation.shape
+        if len(shape) != 4 or shape[0] != 1:
+            raise InputError(
+                f"{record.name}: channel coefficients {list(shape)}; {self.name} needs one receiver with the antennas "
+                "that the uplink has, [1, rows, antennas, subcarriers]"
+            )
+        return received_rows(record, split, 0, self.name)
+
+
+def relative_error(prediction: NDArray[Any], truth: NDArray[Any]) -> FloatArray:
+    """Squared error over energy of coefficients, summed over the last axis: CEA in linear units."""
+    power = np.square(np.abs(truth)).sum(axis=-1)
+    error = np.square(np.abs(prediction - truth)).sum(axis=-1)
+    return np.asarray(error / np.maximum(power, np.finfo(np.float32).tiny))
+
 
 Complex = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
@@ -63,14 +151,10 @@ def products(atoms: Complex, h: Complex) -> Complex:
 
 
 def _solve(gram: Complex, right: Complex, size: float) -> Complex:
-    loaded = gram.copy()
-    diagonal = np.arange(gram.shape[-1])
-    loaded[:, diagonal, diagonal] += SINGULAR * size
-    return np.asarray(np.linalg.solve(loaded, right))
+    return np.asarray(np.linalg.solve(gram + SINGULAR * size * np.eye(gram.shape[-1]), right))
 
 
-def _turn(angle: FloatArray) -> Complex:
-    """exp(-j angle): twice as fast as the exponential of complex numbers."""
+def _turn(angle: FloatArray) -> Complex:  # exp(-j angle), twice as fast as the exponential of complex numbers
     turned = np.empty(angle.shape, complex)
     np.cos(angle, out=turned.real)
     np.sin(-angle, out=turned.imag)
@@ -81,16 +165,9 @@ class Waves:
     """Paths with a delay that all antennas share and a gain for each antenna; base of waves at known elements.
 
     Parameters of paths are [n, paths, p], present paths marked in [n, paths].
-
-    Attributes:
-        freedom: real numbers that describe a path, gains included.
-        grid: distances of the grid, ascending, metres.
-        cosines: directions of the grid [cells, p - 1].
-        lattice: indices of these on the lattice of directions, [cells, p - 1].
-        spherical: whether waves are spherical.
     """
 
-    spherical = False
+    spherical = False  # whether waves are spherical
 
     def __init__(self, bands: Bands, max_distance_m: float) -> None:
         self.slope = -2j * np.pi / speed_of_light * (bands.uplink_hz - bands.reference_hz)
@@ -100,9 +177,10 @@ class Waves:
         reach = min(max_distance_m, speed_of_light / bands.spacing_hz / 2)
         count = max(int(np.ceil(reach / (speed_of_light / width / FINE))), 1)
         self.grid = np.linspace(-reach, reach, 2 * count + 1)
+        # Directions of the grid [cells, p - 1], and their indices on the lattice of directions.
         self.cosines, self.lattice = np.zeros((1, 0)), np.zeros((1, 0), np.int64)
         self.steering = np.exp(self.grid[:, None] * self.slope)
-        self.freedom = 1 + 2 * bands.antennas
+        self.freedom = 1 + 2 * bands.antennas  # real numbers that describe a path, gains included
 
     @cached_property
     def around(self) -> NDArray[np.int64]:
@@ -164,10 +242,8 @@ class ArrayWaves(Waves):
         # An image source inside the array would make the distance's slope infinite.
         self.near = 0.6 * 2 * float(np.sqrt(self.square.max(initial=0.0)))
         wavelength = speed_of_light / self.reference_hz
-        points = []
-        for axis in range(axes):
-            half_cells = 2 * float(np.ptp(self.elements[:, axis])) / wavelength
-            points.append(np.linspace(-1, 1, int(min(2 * np.ceil(half_cells) + 1, AXIS_POINTS))))
+        half_cells = 2 * np.ptp(self.elements, axis=0) / wavelength
+        points = [np.linspace(-1, 1, int(min(2 * np.ceil(half) + 1, AXIS_POINTS))) for half in half_cells]
         where = np.array(list(np.ndindex(*(len(p) for p in points))), np.int64).reshape(-1, axes)
         cosines = np.stack([p[where[:, axis]] for axis, p in enumerate(points)], axis=-1) if axes else np.zeros((1, 0))
         visible = np.square(cosines).sum(axis=1) <= 1.01  # directions of real angles, those of the grid's rim included
@@ -176,13 +252,11 @@ class ArrayWaves(Waves):
             # Curvature changes with 1 / d near the array, delay with d far from it.
             bends = 1 / np.linspace(1 / max_distance_m, 1 / max(self.near, 1e-3), 9)[1:]
             self.grid = np.sort(np.concatenate([self.grid[self.grid > max(self.near, 1e-3)], bends]))
-        self._steering = [self._towards(d) for d in (self.grid if spherical else self.grid[:1])]
-
-    def _towards(self, distance_m: float) -> Complex:
-        """Matched filters at one distance in all directions, [antennas, directions], of unit length."""
-        theta = np.concatenate([np.full((1, len(self.cosines), 1), distance_m), self.cosines[None]], axis=-1)
-        steering = self.atoms(theta, np.array([self.reference_hz]))[0, :, :, 0].conj().T
-        return np.asarray(steering / np.linalg.norm(steering, axis=0))
+        self._steering = []  # matched filters at each distance in all directions, [antennas, directions], of length 1
+        for distance_m in self.grid if spherical else self.grid[:1]:
+            theta = np.concatenate([np.full((1, len(self.cosines), 1), distance_m), self.cosines[None]], axis=-1)
+            steering = self.atoms(theta, np.array([self.reference_hz]))[0, :, :, 0].conj().T
+            self._steering.append(np.asarray(steering / np.linalg.norm(steering, axis=0)))
 
     def _phase(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Distance, projections p . psi [n, k, a] and, of spherical waves, distances s from the elements."""
@@ -237,10 +311,8 @@ class ArrayWaves(Waves):
         return constant, factor
 
     def power(self, residual: Complex) -> FloatArray:
-        """Power of a residual in each cell of the grid, [n, distances, cells].
-
-        Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
-        """
+        """Power of a residual in each cell of the grid, [n, distances, cells]."""
+        # Excess lengths over the array are short: they turn the carrier, and not the subcarriers against each other.
         k = 2 * np.pi / speed_of_light
         beat = np.exp(-1j * k * self.grid[:, None] * (self.frequencies - self.reference_hz))
         combined = residual @ beat.conj().T
