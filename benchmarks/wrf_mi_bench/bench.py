@@ -128,14 +128,7 @@ _OWN: Mapping[str, Check] = {
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "sentinels": _here(
-        "figures kept",
-        "sentinels:main",
-        RFID,
-        FLAT,
-        CONFERENCE,
-        OFFICE,
-        resumes=True,
-        table="sentinels:table",
+        "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"
     ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)

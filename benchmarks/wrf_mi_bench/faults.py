@@ -126,11 +126,7 @@ class Trial:
         shutil.rmtree(folder / "again")
 
     def run(
-        self,
-        place: Path,
-        before: Callable[[], Any] = lambda: None,
-        signals: Signals = (),
-        children: bool = False,
+        self, place: Path, before: Callable[[], Any] = lambda: None, signals: Signals = (), children: bool = False
     ) -> int:
         """Status of the command with its results in a folder, where it goes on if it was begun.
 

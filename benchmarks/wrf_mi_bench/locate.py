@@ -62,10 +62,7 @@ class Cell:
 HYBRID = partial(Cell, "hybrid, knows walls", "hybrid")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
 SEEDS = (0, 1, 2)
-CELLS = (
-    *(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS),
-    HYBRID(None),
-)
+CELLS = (*(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS), HYBRID(None))
 
 
 def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
@@ -169,10 +166,7 @@ def main() -> dict[str, Any]:
         measured[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
         row = row_of(cell, [measured[cell]])
         print(f"locate: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
-    return {
-        "calibration": {cell.name: result["calibration"] for cell, result in measured.items()},
-        **summary(measured),
-    }
+    return {"calibration": {cell.name: result["calibration"] for cell, result in measured.items()}, **summary(measured)}
 
 
 def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:

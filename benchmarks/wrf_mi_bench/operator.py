@@ -155,10 +155,7 @@ def main() -> dict[str, Any]:
         rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [
         line("building: pixels", f"{built} ms, {built_mb:.0f} MB beside its result"),
-        line(
-            "size: pixels",
-            f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB",
-        ),
+        line("size: pixels", f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB"),
         line("size: pixels, composed", f"{images.table.nbytes / 1e6:.2g} MB"),
     ]
     for name, kind, values in (

@@ -34,10 +34,7 @@ SEEDS = range(12)
 RUNS = Path("runs/bench/rooms")
 LIMITS_DB = 0.0, 40.0
 SCAN, CORRECTED = "trace, scan", "trace, corrected"
-MODELS: Mapping[str, tuple[str, str]] = {
-    "kriging": ("kriging", ""),
-    "hybrid, scan": ("hybrid", "scan"),
-}
+MODELS: Mapping[str, tuple[str, str]] = {"kriging": ("kriging", ""), "hybrid, scan": ("hybrid", "scan")}
 """Model, and the scene that it is given or "", by the column of the table."""
 COLUMNS = (SCAN, CORRECTED, *MODELS)
 ASKED_DB = 3.0  # least median gain of the corrected scene

@@ -29,11 +29,7 @@ from .table_plan import SEEDS
 
 RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")
 """Kept results, and the picture, which is written only in a checkout of the project."""
-ROWS: Mapping[str, Sequence[int]] = {
-    LAB: (20, 40, 80, 160),
-    ROOM: (50, 100, 200, 400),
-    FLAT: (50, 100, 200, 400),
-}
+ROWS: Mapping[str, Sequence[int]] = {LAB: (20, 40, 80, 160), ROOM: (50, 100, 200, 400), FLAT: (50, 100, 200, 400)}
 STEPS = 3000
 RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
 PATHS, IDW = "paths alone", "IDW"

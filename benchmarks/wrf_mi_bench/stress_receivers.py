@@ -26,17 +26,7 @@ from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.receivers.device_paths import Ports, TracedPaths, path_sum
 from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
-from .stress_fields import (
-    HARD,
-    SIZE,
-    Family,
-    cases,
-    gradient_row,
-    on_device,
-    ordinary,
-    pose,
-    reference,
-)
+from .stress_fields import HARD, SIZE, Family, cases, gradient_row, on_device, ordinary, pose, reference
 from .stress_oracle import ReportOracle, report_error
 from .stress_rows import DOUBLE, IMAGE, Row, Worst
 

@@ -47,9 +47,7 @@ def write_tables(place: Path, quick: bool = False) -> None:
         first = {method: rows[0] for (share, method), rows in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
-            {part.entries[method].label: row["quantiles"] for method, row in first.items()},
-            {},
-            TASKS[part.task].label,
+            {part.entries[method].label: row["quantiles"] for method, row in first.items()}, {}, TASKS[part.task].label
         )
         write_figure(place / picture, figure)
         text.append(f"![Distribution of the scores of each method]({picture})")

@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..backend import init
 from ..core import AntennaOptions, InputError
 from ..core.yaml_files import read_yaml
-from .options import (
-    DATASET,
-    Arguments,
-    Parser,
-    add_command,
-    add_n_train,
-    add_scheduler,
-    add_tracing,
-    add_training,
-)
+from .options import DATASET, Arguments, Parser, add_command, add_n_train, add_scheduler, add_tracing, add_training
 from .output import Watch, show, show_metrics
 
 if TYPE_CHECKING:

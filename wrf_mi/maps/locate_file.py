@@ -100,11 +100,7 @@ def write_positions_file(out: Path, located: Positions, true_m: FloatArray | Non
     ``true_x``, ``true_y``, ``error_m`` and ``inside``, 1 where the region holds the true position.
     """
     columns: dict[str, Any] = dict(zip("xyz", located.tx_pos_m.T, strict=True))
-    columns |= {
-        "radius_m": located.radius_m,
-        "area_m2": located.area_m2,
-        "level": np.full(len(located), located.level),
-    }
+    columns |= {"radius_m": located.radius_m, "area_m2": located.area_m2, "level": np.full(len(located), located.level)}
     if located.neighbours_m is not None:
         columns |= {"knn_x": located.neighbours_m[:, 0], "knn_y": located.neighbours_m[:, 1]}
     if true_m is not None:

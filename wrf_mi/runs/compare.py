@@ -105,10 +105,7 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         task.label,
     )
     samples = _spectra(runs) if task.image else _maps(runs)
-    drawn: list[Picture] = [
-        (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
-        (f"{slug}-samples.png", *samples),
-    ]
+    drawn: list[Picture] = [(f"{slug}-cdf.png", f"{task.label} over test rows", cdf), (f"{slug}-samples.png", *samples)]
     better = "higher" if task.higher_is_better else "lower"
     medians = {run.name: run.metrics[task.block]["median"] for run in runs}
     times = {"ms per sample": "ms_per_sample", "training time (s)": "train_seconds"}
