@@ -91,10 +91,8 @@ def render(state: dict[str, Any]) -> str:
 def install_llvm() -> None:
     """Install an LLVM that works, with apt, dnf or brew, unless a backend works already.
 
-    Runs as root, or with a ``sudo`` that asks for no password. The package manager prints its output.
-
-    Raises:
-        BackendError: no permission, or no working LLVM afterwards: one line with the command to run by hand.
+    Runs as root, or with a ``sudo`` that asks for no password. The package manager prints its output. `BackendError`:
+    no permission, or no working LLVM afterwards: one line with the command to run by hand.
     """
     try:
         choose()

@@ -110,8 +110,7 @@ def add_operator(parser: argparse.ArgumentParser) -> None:
 def check_operator(a: Arguments) -> None:
     """Refuse ``--no-operator`` for a run that predicts without one.
 
-    Raises:
-        InputError: the run's model is no learned field, or the folder is no run.
+    `InputError`: the run's model is no learned field, or the folder is no run.
     """
     if not a.no_operator:
         return

@@ -137,8 +137,7 @@ class AntennaOptions:
     def replaced(self, antenna: Antenna, end: Literal["rx", "tx"]) -> Antenna:
         """An antenna of the data, of a receiver or a transmitter, with the attributes that are stated for this end.
 
-        Raises:
-            InputError: names that `Antenna` refuses.
+        `InputError`: names that `Antenna` refuses.
         """
         stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
         return replace(antenna, **{name: value for name, value in stated.items() if value is not None})

@@ -29,10 +29,7 @@ REMEDY = "read it on a machine with more memory"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
-    """Write an ``.npz`` file of plain arrays atomically.
-
-    `stored_arrays` compares the checksum.
-    """
+    """Write an ``.npz`` file of plain arrays atomically. `stored_arrays` compares the checksum."""
     stored = dict(arrays)
     if checksum:
         stored = {name: np.asarray(values) for name, values in arrays.items()}

@@ -75,8 +75,7 @@ MOST_NAME = 1024
 def inside(folder: Path, name: object, source: str | Path) -> Path:
     """The path in a folder of the file that another file, the ``source``, names.
 
-    Raises:
-        InputError: no name, or one that leaves the folder.
+    `InputError`: no name, or one that leaves the folder.
     """
     if not isinstance(name, str) or not name or "\0" in name or len(name) > MOST_NAME:
         raise DataFault(source, f"{one_line(repr(name))[:60]} is no name of a file; correct it")
@@ -89,8 +88,7 @@ def inside(folder: Path, name: object, source: str | Path) -> Path:
 def text_lines(path: Path) -> list[str]:
     """The lines of a UTF-8 text file without line ends and trailing blank lines.
 
-    Raises:
-        InputError: the file is missing or not text.
+    `InputError`: the file is missing or not text.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -107,8 +105,7 @@ def text_lines(path: Path) -> list[str]:
 def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[None]:
     """Turn any error of a block that reads a file into one line: ``missing``, or for a damaged file the ``remedy``.
 
-    Raises:
-        InputError: naming the file.
+    `InputError`: naming the file.
     """
     try:
         yield
@@ -167,8 +164,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its name if the block succeeds and is removed otherwise.
 
-    Raises:
-        InputError: ``path`` exists and may not be replaced, or cannot be written.
+    `InputError`: ``path`` exists and may not be replaced, or cannot be written.
     """
     remove_leftovers(path.parent, path.name)
     if path.exists() and not replace:

@@ -24,10 +24,8 @@ _fitting = threading.RLock()
 def locked_folder(folder: Path) -> Iterator[None]:
     """A block that alone writes into a folder, without the temporary files of processes that ended in theirs.
 
-    The lock file remains where `KeyboardInterrupt` ends the block.
-
-    Raises:
-        InputError: another process, or another block of this process, writes into it.
+    The lock file remains where `KeyboardInterrupt` ends the block. `InputError`: another process, or another block of
+    this process, writes into it.
     """
     file = folder / LOCK
     lock = FileLock(file, timeout=0, thread_local=False)
@@ -66,9 +64,7 @@ def alone_in_process() -> Iterator[None]:
     """A block that no other thread of this process may be in.
 
     Dr.Jit's threads, flags and recorded kernels belong to the process: two fits at a time would change each other.
-
-    Raises:
-        InputError: another thread is in such a block.
+    `InputError`: another thread is in such a block.
     """
     if not _fitting.acquire(blocking=False):
         text = "another thread of this process fits or scores a model"

@@ -59,8 +59,7 @@ def _cgroup_bytes() -> Iterator[int]:
 def require_memory(needed: float, what: str, remedy: str) -> None:
     """Refuse an allocation of ``needed`` bytes for ``what`` (the file or setting) that does not fit.
 
-    Raises:
-        InputError: more than is free.
+    `InputError`: more than is free.
     """
     if needed > SMALL_BYTES and needed > (free := free_bytes()):
         gib = f"{needed / 2**30:,.3g}" if needed < 2**40 else f"{needed / 2**30:,.0f}"

@@ -95,11 +95,7 @@ def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None =
 
 
 def load_paths(file: str | Path) -> Paths:
-    """Read a file of `save_paths`.
-
-    Raises:
-        InputError: missing, damaged, or of another format version.
-    """
+    """Read a file of `save_paths`; `InputError`: missing, damaged, or of another format version."""
     return read_paths_file(file)[0]
 
 

@@ -18,9 +18,8 @@ PICTURE_ERRORS = (MemoryError, OSError, SyntaxError, ValueError, struct.error, z
 def open_picture(path: Path, most_pixels: int) -> Iterator[Image.Image]:
     """Open a PNG or PGM picture, whose pixels are decoded when they are first used.
 
-    Raises:
-        ValueError: more pixels than ``most_pixels``: a small file may state any size.
-        Exception: one of `PICTURE_ERRORS` for a damaged file, also where pixels are used.
+    `ValueError`: more pixels than ``most_pixels``: a small file may state any size; `Exception`: one of
+    `PICTURE_ERRORS` for a damaged file, also where pixels are used.
     """
     with Image.open(path, formats=("PNG", "PPM")) as picture:
         width, height = picture.size

@@ -74,9 +74,7 @@ def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
 def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]:
     """Receivers from the arrays of `receiver_arrays`.
 
-    Raises:
-        KeyError: an array is missing.
-        InputError: an invalid antenna.
+    `KeyError`: an array is missing; `InputError`: an invalid antenna.
     """
     counts = arrays["receiver_elements"]
     split = np.split(arrays["receiver_elements_m"], np.cumsum(np.maximum(counts, 0))[:-1])

@@ -34,11 +34,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         self._modules = {name: entry.partition(":")[0] for name, entry in builtin.items() if isinstance(entry, str)}
 
     def add(self, name: str, entry: Entry) -> None:
-        """Add an entry for this process.
-
-        Raises:
-            InputError: the name is taken.
-        """
+        """Add an entry for this process; `InputError`: the name is taken."""
         if name in self:
             raise InputError(f"{self._what} {name!r}: there is one of that name; choose another")
         self._known[name] = entry

@@ -62,8 +62,7 @@ def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
 def check(settings: Any, prefix: str = "") -> None:
     """Refuse numbers of settings that are not finite or out of their range, and unknown words; nested ones included.
 
-    Raises:
-        InputError: naming the setting, its value and the range.
+    `InputError`: naming the setting, its value and the range.
     """
     kind: Any = type(settings)
     hints = typing.get_type_hints(kind)
@@ -95,10 +94,8 @@ def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) 
 
     Settings of earlier versions that are constants now, in the mapping ``FIXED`` of the class, must have that value.
 
-    ``source`` names the file or option in messages.
-
-    Raises:
-        InputError: an unknown name, or a value of the wrong type or out of its range.
+    ``source`` names the file or option in messages. `InputError`: an unknown name, or a value of the wrong type or out
+    of its range.
     """
     return cast(Settings, _build(kind, values, source, ""))
 

@@ -35,11 +35,7 @@ class Prediction:
 
     @property
     def stated_std(self) -> FloatArray:
-        """The standard deviation of a model that states one.
-
-        Raises:
-            ValueError: the model states none.
-        """
+        """The standard deviation of a model that states one; `ValueError`: the model states none."""
         if self.std is None:
             raise ValueError("Prediction: the model states no standard deviation")
         return self.std
@@ -191,8 +187,7 @@ class Record:
     def with_antennas(self, options: AntennaOptions) -> Record:
         """The record with antennas whose attributes are those that the options state.
 
-        Raises:
-            InputError: names that `Antenna` refuses.
+        `InputError`: names that `Antenna` refuses.
         """
         if not options:
             return self

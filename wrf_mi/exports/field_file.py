@@ -26,10 +26,8 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
 
     Keys: ``param/<name>``, the parameters in single precision, [k, n] each; ``form/*``, the form of the observations;
     ``receiver_*`` and ``tx_antenna``; ``split/*`` and ``run/*`` of the run's ``split.npz`` and ``model.npz``; the texts
-    ``export/config`` and ``export/metrics``. ``docs/export.md`` has the parameters' shapes.
-
-    Raises:
-        InputError: no Gaussians, or an unfinished run.
+    ``export/config`` and ``export/metrics``. ``docs/export.md`` has the parameters' shapes. `InputError`: no Gaussians,
+    or an unfinished run.
     """
     run = source.run
     field = field_of(run)

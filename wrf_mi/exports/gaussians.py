@@ -28,8 +28,7 @@ OPAQUE = 1e-6  # least distance of an opacity from 0 and 1, whose logits are inf
 def field_of(run: Run) -> FittedField:
     """The trained field of Gaussians of a run, of spectra or other observations.
 
-    Raises:
-        InputError: a run of another model, or an unfinished one.
+    `InputError`: a run of another model, or an unfinished one.
     """
     fitted = run.fitted
     if not isinstance(fitted, FittedField) or fitted.field is None:
@@ -80,8 +79,7 @@ def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:
 def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
     """Write the Gaussians of a run for one transmitter (`wrf_mi.exports.source.Write`).
 
-    Raises:
-        InputError: no Gaussians, a field that is trained on the uplink, or not one transmitter.
+    `InputError`: no Gaussians, a field that is trained on the uplink, or not one transmitter.
     """
     run = source.run
     field, tx_pos_m = field_of(run), options.tx_pos_m

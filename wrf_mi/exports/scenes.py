@@ -47,10 +47,8 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     ``scene.xml`` opens with ``sionna.rt.load_scene``: materials of ITU-R P.2040 follow the frequency and have the
     scene's thicknesses; materials with constants, and those that are not in the range of ITU-R P.2040, have the
     constants of the carrier. ``mitsuba.xml`` has colours alone, for ``mi.load_file`` in any variant. ``materials.json``
-    lists the constants at the carrier, and exponents of conductivities.
-
-    Raises:
-        InputError: an unknown carrier, a material that is neither slab nor absorber, or a folder that exists.
+    lists the constants at the carrier, and exponents of conductivities. `InputError`: an unknown carrier, a material
+    that is neither slab nor absorber, or a folder that exists.
     """
     frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
     if frequency_hz is None:

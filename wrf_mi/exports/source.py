@@ -50,8 +50,7 @@ class Source:
     def scene(self) -> tuple[str, str | None]:
         """Scene file, folder or name, and the material of a bare mesh where a run states it.
 
-        Raises:
-            InputError: a run without a scene.
+        `InputError`: a run without a scene.
         """
         if self.kind != RUN:
             return self.name, None

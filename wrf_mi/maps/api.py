@@ -203,8 +203,7 @@ def map_values(
     """Variables [receivers, m] of `wrf_mi.maps.dataset.VARIABLES` that a run's model states at positions [m, 3] in
     metres, computed chunk by chunk; NaN inside solid objects of the scene.
 
-    Raises:
-        InputError: inputs that the model does not predict from.
+    `InputError`: inputs that the model does not predict from.
     """
     size = _chunk_size(run, len(conditions.headings_rad))
     variables = dict[str, NDArray[np.float32]]()

@@ -133,9 +133,7 @@ def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:
     """Write a map atomically as NetCDF 4, Zarr (format 2) or CSV, by the suffix of the name.
 
     CSV has a row for each receiver and position, with the name of the best receiver; empty where nothing is known.
-
-    Raises:
-        InputError: another suffix, a missing package, or a file that cannot be written.
+    `InputError`: another suffix, a missing package, or a file that cannot be written.
     """
     path = Path(out)
     check_map_file(path)

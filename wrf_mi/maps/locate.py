@@ -75,9 +75,8 @@ class Positions:
 def located_run(run: str | Path | Run) -> Run:
     """The run of a folder, checked to be one that positions can be found with.
 
-    Raises:
-        InputError: not a finished run of a model of powers in decibels at one carrier for receivers that it was trained
-            on, or a run of several folds.
+    `InputError`: not a finished run of a model of powers in decibels at one carrier for receivers that it was trained
+    on, or a run of several folds.
     """
     opened = open_run(run) if not isinstance(run, Run) else run
     record = opened.problem.record

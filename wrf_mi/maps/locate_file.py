@@ -40,10 +40,8 @@ def read_observations(
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
     needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
     true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
-
-    Raises:
-        InputError: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver,
-            a field that is no number, or a row without any strength.
+    `InputError`: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver, a
+    field that is no number, or a row without any strength.
     """
     table = read_csv(Path(path), skip_blank=True)
     names = [receiver.name for receiver in receivers]

@@ -68,9 +68,7 @@ def run_part(
 
     A worker with several threads still computes one part at a time: Dr.Jit traces one program per process, and the
     working directory belongs to the process. The result of ``opener`` is kept until a call with another ``token``.
-
-    Raises:
-        InputError: the environment differs from the client's; or raised by ``opener`` or ``function``.
+    `InputError`: the environment differs from the client's; or raised by ``opener`` or ``function``.
     """
     global _opened
     with _one_at_a_time:

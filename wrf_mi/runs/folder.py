@@ -180,8 +180,7 @@ def check_format(folder: Path) -> None:
 def check_new(folder: Path) -> None:
     """Refuse a file, or a folder that is neither empty nor that of a run killed before its configuration was written.
 
-    Raises:
-        InputError: naming the folder.
+    `InputError`: naming the folder.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not _is_begun(folder):
         remedy = f"choose another --out, or go on with train --resume {folder}"
@@ -255,8 +254,7 @@ def write_fitted(folder: Path, arrays: Arrays, seconds: float) -> Path:
 def read_fitted(folder: Path, entry: Model) -> tuple[Arrays, float]:
     """Arrays of ``model.npz`` of a model, and the training time in seconds.
 
-    Raises:
-        InputError: missing, damaged, of another format, or NaN or infinity where the model has no `Model.gaps`.
+    `InputError`: missing, damaged, of another format, or NaN or infinity where the model has no `Model.gaps`.
     """
     path = folder / FITTED
     missing = f"{path}: missing, the fit was stopped; finish it with train --resume"

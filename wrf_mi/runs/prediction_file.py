@@ -36,9 +36,7 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
 
     A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
     [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
-
-    Raises:
-        InputError: the file is missing, or a row is not made of finite numbers.
+    `InputError`: the file is missing, or a row is not made of finite numbers.
     """
     path = Path(csv_file if csv_file is not None else npz_file or "")
     if not path.is_file():

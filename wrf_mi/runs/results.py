@@ -91,8 +91,7 @@ class Results:
 def read_run(path: str | Path, name: str | None = None) -> Results:
     """Read a run folder (with folds, the pooled scores); ``name`` is for tables, by default that of the folder.
 
-    Raises:
-        InputError: not a run folder, or a file in it that is missing or damaged.
+    `InputError`: not a run folder, or a file in it that is missing or damaged.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -125,8 +124,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
 def read_runs(paths: Sequence[str | Path]) -> list[Results]:
     """Read several run folders; where names coincide, parent folders are added to tell them apart.
 
-    Raises:
-        InputError: no folder, a folder given twice, or a folder that is not a run.
+    `InputError`: no folder, a folder given twice, or a folder that is not a run.
     """
     resolved = [Path(p).resolve() for p in paths]
     if not resolved:

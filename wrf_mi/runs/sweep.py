@@ -235,8 +235,7 @@ def dataset_files(name_or_folder: str) -> list[Path]:
 def scene_files(scene: str | Path) -> list[Path]:
     """Folder or file of a scene, with the files that a Mitsuba XML names; empty for the name of an embedded scene.
 
-    Raises:
-        InputError: an XML that cannot be read.
+    `InputError`: an XML that cannot be read.
     """
     path = Path(scene)
     if not path.exists():
