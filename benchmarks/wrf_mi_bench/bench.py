@@ -3,8 +3,6 @@
 A case is a run of ``wrf-mi`` with a run folder; a check is a function that compares a part with a reference.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

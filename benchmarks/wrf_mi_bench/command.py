@@ -1,7 +1,5 @@
 """Command ``wrf-mi bench``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rows of the benchmarks' tables, and data that they need."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterable, Mapping

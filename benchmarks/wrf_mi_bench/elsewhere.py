@@ -5,8 +5,6 @@ the LLVM and NumPy of this process. LLVM libraries are those that `wrf_mi.backen
 versions of NumPy are folders in the environment variable `NUMPY_FOLDERS`, made by ``pip install --target``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -3,8 +3,6 @@
 Each measurement returns lines of a table (`wrf_mi_bench.comparison.line`) and what is wrong.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import subprocess

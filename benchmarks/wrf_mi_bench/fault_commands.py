@@ -1,7 +1,5 @@
 """Commands on small data that are tried under faults: trainings, the correction of a scene, and the tables."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -9,8 +9,6 @@ One loop over the Gaussians, no tiles, no culling. It fixes choices that the WRF
 * equal depths are ordered by the centre's world coordinates, not by storage order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A run folder whose name holds the key of a fit is used again. Other settings, ro
 key, and so another folder.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Times of one backend for `wrf_mi_bench.gpu`: ``python -m wrf_mi_bench.gpu_job FILE BACKEND``."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

@@ -4,8 +4,6 @@ The readers run in a child process (``python -m wrf_mi_bench.hostile_files FOLDE
 or hang without harm; it goes on with the next input. Inputs follow from their number: each can be made again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

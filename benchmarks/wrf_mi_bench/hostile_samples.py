@@ -1,7 +1,5 @@
 """Small valid files of every format that is read, and their readers, for `wrf_mi_bench.hostile_files`."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Figures of ``docs/limits.md``, as a Markdown table: ``python -m wrf_mi_bench.limits``."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 import time

@@ -5,8 +5,6 @@ likelihood and k are chosen by training rows held out in space (`wrf_mi.maps.loc
 run share their errors, so that intervals resample stretches of the run.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Prediction by operator compared with direct evaluation: time, memory and difference; times of networks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Run time against error: the tables' rows of all training rows, and their Pareto fronts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,7 @@ COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("t
 """Key, title and unit of each cost."""
 LEAST = 1e-3  # smallest cost on the logarithmic axes
 
-Points = Mapping[str, Mapping[str, float]]
-"""Score and costs of each method by name."""
+Points = Mapping[str, Mapping[str, float]]  # score and costs of each method by name
 
 
 def points_of(part: Part, stored: Mapping[str, Mapping[str, Any]]) -> Points:

@@ -4,8 +4,6 @@ A mesh from a scan knows the powers of paths better than their phases. No other
 figure uses the seeds of these rooms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Walls found in a robot's map and LiDAR returns of a furnished flat, compared with walls measured by hand."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

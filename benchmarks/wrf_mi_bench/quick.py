@@ -5,8 +5,6 @@ as those of elapsed times on two threads varied nine times more. A larger ratio 
 where the whole 95 % interval of a ratio lies above `WORSE` times the stored one.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Hard to break: faults of commands, long use, and damaged and hostile files, counted (``wrf-mi bench robustness``)."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence

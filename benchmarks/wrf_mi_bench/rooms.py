@@ -5,8 +5,6 @@ prediction is worse than none, and above, errors do not matter to a receiver. Ro
 nothing was tuned on them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -4,8 +4,6 @@ the paths alone with trained gain and materials.
 The *rows saved* are the share of the rows of a random start that joint training needs for the same score.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial

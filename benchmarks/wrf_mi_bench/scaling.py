@@ -1,7 +1,5 @@
 """Growth of time and memory with the size of the work, and exponents of the growth."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import tempfile

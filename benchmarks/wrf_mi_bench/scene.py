@@ -1,7 +1,5 @@
 """Specular paths of scenes made from simulated scans of two CAD rooms (the NeWRF data)."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from pathlib import Path

@@ -12,8 +12,6 @@ Results are kept by the content of the packages' files (`wrf_mi_bench.fit_key.so
 resumed, and changed code is measured again.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -4,8 +4,6 @@ A result depends on the module of its benchmark, on what this module names for s
 project that these import. A digest is that of syntax trees without docstrings: comments and layout do not count.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 from collections.abc import Iterable, Mapping

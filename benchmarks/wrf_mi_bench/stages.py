@@ -9,8 +9,6 @@ of errors on training rows that are held out in space: the hybrid has its own, o
 ``wrf-mi train --intervals`` does.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ A result states digests of its source (`wrf_mi_bench.sources`). One that states 
 commit that stored it, in a git repository, and is unknown elsewhere.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Numerical stress tests: float32 against float64, values and derivatives, on ill-conditioned cases."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

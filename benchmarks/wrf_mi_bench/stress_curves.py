@@ -1,7 +1,5 @@
 """Errors of float32 against the quantity that causes them: axis ratio, layers, distance, path length and contrast."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -8,8 +8,6 @@ are relative to the sum of the waves' magnitudes, those of spectra to their norm
 step of each parameter: 1 / k for metres, 1 for rad and logarithms.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ no device code. The direction of a leg is that from an image of the transmitter 
 Airy sums, patterns SciPy's spherical harmonics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,8 +28,7 @@ from .stress_rows import relative
 
 ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
-Planes = tuple[FloatArray, FloatArray]
-"""Unit normals [q, 3] and offsets [q] of planes."""
+Planes = tuple[FloatArray, FloatArray]  # unit normals [q, 3] and offsets [q] of planes
 ACROSS = 1e-6  # sine of the angle to a wall's normal below which the polarisation basis is arbitrary
 
 

@@ -5,8 +5,6 @@ over directions (RSSI, CSI) is relative to the sum of magnitudes, as waves may c
 spectra is relative to their norm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Rows of the stress benchmark: number of cases, worst error and bound; and their summary for the README."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Pages and pictures of the tables of all methods, from stored rows."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence

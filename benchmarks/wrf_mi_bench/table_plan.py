@@ -1,7 +1,5 @@
 """Runs of the tables of all methods: tasks, data sets, splits, methods, shares of the training rows, seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

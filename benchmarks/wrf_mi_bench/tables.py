@@ -6,8 +6,6 @@ changed, or its file is deleted; rows of other versions of packages are kept and
 a key of command, source, data, scene and versions (`wrf_mi_bench.fit_key`).
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

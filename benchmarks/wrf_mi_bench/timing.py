@@ -7,8 +7,6 @@ Memory is the largest resident memory during a call less that before it, after t
 are emptied. Linux resets its peak on request; elsewhere the process is sampled every millisecond.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import sys

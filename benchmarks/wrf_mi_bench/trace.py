@@ -1,7 +1,5 @@
 """Ray tracing compared with MATLAB's image method in two CAD rooms (the NeWRF data)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

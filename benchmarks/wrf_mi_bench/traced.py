@@ -9,8 +9,6 @@ and recovered by subtracting the third, as the blending is linear. The integrato
 64 Gaussians, absorbs at most 0.9999, and makes ellipsoids of low opacity smaller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial

@@ -4,8 +4,6 @@ Each fit runs in a subprocess. Steps have as many Gaussians as the fit ended wit
 large matrix product and of memory; operations and bytes of a step are counted from the shapes of its arrays.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections import Counter

@@ -6,8 +6,6 @@ intervals are 95 % bootstrap intervals over rows. Each fold of each seed is stor
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Calls of parts of the package at a given size, for the benchmarks of time and memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

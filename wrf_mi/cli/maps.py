@@ -71,10 +71,8 @@ def _add_locate(commands: Any) -> None:
     parser = add_command(commands, "locate", locate_command, "position of a transmitter from what receivers received")
     add = parser.add_argument
     add("run", metavar="RUN", help="run folder of a model of signal strengths that states standard deviations")
-    text = (
-        "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was received, "
-    )
-    text += "and true positions x, y in metres if known (default: the test rows of the run)"
+    text = "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was "
+    text += "received, and true positions x, y in metres if known (default: the test rows of the run)"
     add("--input", metavar="FILE.csv", help=text)
     text = "file to write: estimate x, y, z, radius and area of the region, nearest neighbours; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
@@ -100,11 +98,10 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    strengths_dbm, true_m = (
-        files.test_observations(run)
-        if a.input is None
-        else files.read_observations(a.input, run.receivers, run.config.left_out)
-    )
+    if a.input is None:
+        strengths_dbm, true_m = files.test_observations(run)
+    else:
+        strengths_dbm, true_m = files.read_observations(a.input, run.receivers, run.config.left_out)
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
         located = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +41,7 @@ def _add_train(commands: Any) -> None:
 def train_command(a: Arguments) -> int:
     """Fit any model, or continue a stopped fit."""
     if a.help_settings:
-        print(_settings_text())
-        return 0
+        return _show_settings()
     if a.resume:
         values = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
         if any(value is not None and value is not False and value != [] for value in values):
@@ -66,21 +66,14 @@ def run_training(a: Arguments, **more: Any) -> int:
 
 
 def _resume(a: Arguments) -> int:
-    if _is_deterministic(Path(a.resume)):
-        init("llvm", threads=1)
+    with suppress(InputError):  # `read_config`, which chooses a backend, reports the error
+        if read_yaml(Path(a.resume) / "config.yaml").get("deterministic"):
+            init("llvm", threads=1)
     from ..runs.api import resume
 
     with Watch(resumable=True) as watch:
         run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
-
-
-def _is_deterministic(folder: Path) -> bool:
-    """Whether a run's settings ask for determinism; read as plain YAML, since `read_config` chooses a backend."""
-    try:
-        return bool(read_yaml(folder / "config.yaml").get("deterministic"))
-    except InputError:
-        return False  # `read_config` reports the error
 
 
 def training_request(a: Arguments) -> RunRequest:
@@ -159,7 +152,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in stated.items()]
 
 
-def _settings_text() -> str:
+def _show_settings() -> int:
     from ..core.settings import describe
     from ..models import MODELS
 
@@ -167,7 +160,8 @@ def _settings_text() -> str:
     for name, model in MODELS.items():
         for data, kind in model.settings_by_data().items():
             names.setdefault(kind, []).append(f"{name}, {data}" if data else name)
-    return "\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items())
+    print("\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items()))
+    return 0
 
 
 def _add_trace(commands: Any) -> None:
@@ -198,7 +192,11 @@ def trace_command(a: Arguments) -> int:
     if a.calibrate is not None and a.scheduler is not None:
         raise InputError("trace: --calibrate trains in one process; omit --scheduler")
     if a.deepmimo is not None:
-        _check_deepmimo(a)
+        from ..tracing.deepmimo import check_deepmimo_folder
+
+        if a.calibrate is not None:
+            raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
+        check_deepmimo_folder(a.deepmimo)
     with open_scheduler(a.scheduler) as scheduler:
         status = run_training(a, scheduler=scheduler if a.scheduler else None)
     if a.deepmimo is not None:
@@ -207,14 +205,6 @@ def trace_command(a: Arguments) -> int:
 
         write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS))
     return status
-
-
-def _check_deepmimo(a: Arguments) -> None:
-    from ..tracing.deepmimo import check_deepmimo_folder
-
-    if a.calibrate is not None:
-        raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
-    check_deepmimo_folder(a.deepmimo)
 
 
 def _add_sweep(commands: Any) -> None:

@@ -32,7 +32,10 @@ def locked_folder(folder: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        who = f"process {pid}" if (pid := _holder(file)) else "another process"
+        who = "another process"
+        with suppress(OSError, UnicodeDecodeError):
+            if (text := file.read_text().strip()).isdecimal():
+                who = f"process {text}"
         raise InputError(f"{folder}: {who} writes into it; wait for its end, or stop it") from None
     remains = False
     try:
@@ -48,15 +51,6 @@ def locked_folder(folder: Path) -> Iterator[None]:
             file.unlink(missing_ok=True)
         with suppress(OSError):
             lock.release()
-
-
-def _holder(file: Path) -> str:
-    """Number of the process that holds a lock file; empty where it is not known."""
-    try:
-        text = file.read_text().strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
-    return text if text.isdecimal() else ""
 
 
 @contextmanager

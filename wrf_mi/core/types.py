@@ -185,10 +185,7 @@ class Record:
         return replace(self, receivers=tuple(replace(receiver, array_m=array_m) for receiver in self.receivers))
 
     def with_antennas(self, options: AntennaOptions) -> Record:
-        """The record with antennas whose attributes are those that the options state.
-
-        `InputError`: names that `Antenna` refuses.
-        """
+        """The record with the antennas' attributes that options state; `InputError`: names that `Antenna` refuses."""
         if not options:
             return self
         receivers = (replace(each, antenna=options.replaced(each.antenna, "rx")) for each in self.receivers)
@@ -209,7 +206,7 @@ class Record:
         return replace(self, **self._of_receivers(hidden))
 
     def _of_receivers(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
-        """Results of a function of the arrays whose first axis counts receivers, by the names of the attributes."""
+        # Of the arrays whose first axis counts receivers, by the names of the attributes.
         arrays = {name: getattr(self, name) for name in ("observation", "truth", "std", "n_readings")}
         return {name: None if values is None else function(values) for name, values in arrays.items()}
 

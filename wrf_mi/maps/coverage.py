@@ -82,12 +82,8 @@ def reliability(
 def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) -> Reliability:
     """Reliability of probabilities of coverage on the test rows of a run, those of all its folds.
 
-    Args:
-        folder: run folder of a model that states standard deviations.
-        threshold_db: thresholds in the unit of `wrf_mi.tasks.Task.level`; None: quantiles of the measured levels.
-
-    Raises:
-        InputError: not a finished run, or its model states no standard deviation.
+    Thresholds are in the unit of `wrf_mi.tasks.Task.level`; None: quantiles of the measured levels. `InputError`: not a
+    finished run, or its model states no standard deviation.
     """
     results = read_run(folder)
     if results.std is None:

@@ -133,12 +133,8 @@ def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
     """Median height of positions [n, 3], metres; that of the middle of the run's area where none is known."""
-    heights = tx_pos_m[:, 2]
-    heights = heights[np.isfinite(heights)]
-    if len(heights):
-        return float(np.median(heights))
-    low, high = area_of(run, tx_pos_m)
-    return float(low[2] + high[2]) / 2
+    heights = tx_pos_m[np.isfinite(tx_pos_m[:, 2]), 2]
+    return float(np.median(heights) if len(heights) else np.mean([corner[2] for corner in area_of(run, tx_pos_m)]))
 
 
 def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
@@ -163,8 +159,14 @@ def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
             *(height_m, low + MARGIN_M, high - MARGIN_M),
         )
         return
+    import mitsuba as mi
+
     text = f"height {height_m:g} m: outside of the scene, which spans z = {low:.2f} to {high:.2f} m"
-    if _hidden(scene, [receiver.position_m for receiver in run.receivers], height_m > high):
+    up = 1 if height_m > high else -1
+    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.search.devices.before_surfaces`).
+    start = np.stack([receiver.position_m for receiver in run.receivers]) - np.array([0.0, 0.0, up * MOUNTED_M])
+    ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
+    if np.all(np.array(scene.mi_scene.ray_test(ray), bool)):
         raise InputError(f"{run.folder}: {text}; give a height in between")
     logger.warning("%s", text)  # as above the roofs of a city
 
@@ -176,17 +178,6 @@ def warn_of_points_outside(run: Run, positions_m: FloatArray, tx_pos_m: FloatArr
     if outside:
         what = "data, so values are extrapolated" if run.problem.opened_scene is None else "scene"
         logger.warning("%d of %d points of the surface lie outside of the %s", outside, len(positions_m), what)
-
-
-def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
-    """Whether a surface lies above, or below, every one of some positions [3], metres."""
-    import mitsuba as mi
-
-    up = 1 if above else -1
-    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.search.devices.before_surfaces`).
-    start = np.stack(positions_m) - np.array([0.0, 0.0, up * MOUNTED_M])
-    ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
-    return bool(np.all(np.array(scene.mi_scene.ray_test(ray), bool)))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -70,7 +69,9 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     columns = min(COLUMNS, len(panels))
     width = PANEL_IN * columns + 1
     heading = _heading(dataset, measured, int(width * LETTERS_PER_INCH))
-    height = PANEL_IN * _aspect(dataset) * lines + 0.7 + LINE_IN * heading.count("\n")
+    x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
+    aspect = np.clip(y_m / x_m, 0.3, 1.6) if flat else 0.9
+    height = PANEL_IN * float(aspect) * lines + 0.7 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
@@ -78,8 +79,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     strongest = np.fmax.reduce(power, axis=0)
     for place, (axes, (name, number)) in enumerate(zip(grid.flat, panels, strict=False)):
         values = strongest if number is None else power[number]
-        draw = _draw_plan if flat else _draw_mesh
-        draw(axes, dataset, values, colours, walls)
+        _draw_plan(axes, dataset, values, colours, walls) if flat else _draw_mesh(axes, dataset, values, colours)
         _draw_points(axes, dataset, None if number is None else measured[number], number, colours)
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=6)
@@ -124,34 +124,21 @@ def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
     return float(np.min(ends)), float(np.max(ends))
 
 
-def _aspect(dataset: xarray.Dataset) -> float:
-    if "point" in dataset.sizes:
-        return 0.9
-    x, y = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
-    return float(np.clip(y / x, 0.3, 1.6))
-
-
 def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
     """Lines [n, 2, 2] in which a height cuts each surface of a run's scene, metres; empty without a scene."""
     scene = run.problem.opened_scene
     return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
 
 
-def _draw_plan(
-    axes: Axes, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Sequence[FloatArray]
-) -> None:
-    x, y = dataset["x"].values, dataset["y"].values
+def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
     shades: Any = {"cmap": colours.cmap, "norm": colours.norm}
-    axes.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
+    axes.pcolormesh(dataset["x"].values, dataset["y"].values, values, shading="nearest", rasterized=True, **shades)
     for lines in walls:
-        if len(lines):
-            axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
+        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
     axes.set_aspect("equal")
 
 
-def _draw_mesh(
-    axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Sequence[FloatArray]
-) -> None:
+def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable) -> None:
     triangles = dataset["triangle"].values
     area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     largest = np.argsort(-area, kind="stable")[:MOST_FACES]

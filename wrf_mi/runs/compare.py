@@ -26,8 +26,7 @@ from .scene_view import scene_view
 INDEX = "index.html"
 QUANTILES = (0.1, 0.5, 0.9)  # quantiles of the first run's score at which spectra of test rows are shown
 
-Picture = tuple[str, str, Figure]
-"""File name, heading, figure."""
+Picture = tuple[str, str, Figure]  # file name, heading, figure
 
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProgress = quiet) -> Path:

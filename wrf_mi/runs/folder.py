@@ -50,8 +50,7 @@ CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
 
 
-Settings = Iterable[str] | object
-"""``key=value`` of the model's settings, or all settings as its dataclass."""
+Settings = Iterable[str] | object  # ``key=value`` of the model's settings, or all settings as its dataclass
 GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # arguments of `train` that may be settings, too
 
 

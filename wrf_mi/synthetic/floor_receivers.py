@@ -40,8 +40,7 @@ from .stored import Files, scan_file
 NAME = "traced-floor-receivers"
 CHANNELS = f"{NAME}-csi"
 FORMAT = 3  # version of the files, to be raised when they change for equal parameters
-CANDIDATES = 1000
-"""Free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2."""
+CANDIDATES = 1000  # free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2
 SCANNER_X_M = (1.6, 5.4, 8.2, 11.5, 14.5, 3.65, 14.5, 1.6, 6.2, 10.6, 15.0)
 SCANNER_Y_M = (2.7, 4.85, 0.8, 3.0, 4.8, 6.2, 6.2, 7.7, 7.7, 7.7, 7.7)
 SCANNER_M = tuple((x, y, 1.5) for x, y in zip(SCANNER_X_M, SCANNER_Y_M, strict=True))

@@ -23,8 +23,7 @@ from ..tracing.paths.solve import trace_paths
 from ..tracing.search.devices import solid_around
 from ..tracing.search.surfaces import scene_surfaces
 
-SCATTERING, DIFFRACTION = 2, 8
-"""Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
+SCATTERING, DIFFRACTION = 2, 8  # kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave
 CHUNK_SIZE = 200  # transmitters that are traced together
 
 

@@ -22,13 +22,10 @@ from ..scene.scan import simulate_scan
 
 logger = logging.getLogger(__name__)
 
-RECIPE = "traced.yml"
-"""File with the parameters of a folder's data; other parameters make them anew."""
-SCAN = "lidar/points.npz"
-"""File with the simulated LiDAR scan of the scene."""
+RECIPE = "traced.yml"  # file with the parameters of a folder's data; other parameters make them anew
+SCAN = "lidar/points.npz"  # file with the simulated LiDAR scan of the scene
 SCANNED_RAYS = 60_000
-Files = dict[str, str | bytes]
-"""Content of files by their paths in a folder."""
+Files = dict[str, str | bytes]  # content of files by their paths in a folder
 
 
 def stored(

@@ -41,8 +41,7 @@ PATH_NUMBERS = 1_000_000  # coordinates of all paths of a page, at most: 2.7 MB
 WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9  # limits before logarithms
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
-OnStage = Callable[[str, float], None]
-"""Progress callback: stage and fraction done."""
+OnStage = Callable[[str, float], None]  # progress callback: stage and fraction done
 
 
 def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
