@@ -24,8 +24,7 @@ from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
 from wrf_mi.runs.sweep import dataset_files, markdown_table
 
-from .fit_key import fit_key
-from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
+from .sources import SOURCE, fit_key, modules_of_benchmark, modules_of_command, source_digests
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
 """Public data sets; all others are made on this machine."""
@@ -98,9 +97,9 @@ _OWN: Mapping[str, Check] = {
     "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
-    "flat-plan": _here("mesh of a flat", "plan:flat_plan", FLAT),
+    "flat-plan": _here("mesh of a flat", "scene:flat_plan", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
-    "pareto": _here("run time against error", "pareto:main", resumes=True),
+    "pareto": _here("run time against error", "table_pages:pareto", resumes=True),
     "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main"),
     "training": _here("training", "training:main", RFID),
@@ -121,7 +120,7 @@ _OWN: Mapping[str, Check] = {
     ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
-    "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),
+    "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),

@@ -29,7 +29,7 @@ from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import data_folder, kept, line
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .table_plan import PARTS
 from .tables import scene_of
 

@@ -11,9 +11,9 @@ from . import endurance, faults
 from .bench import BenchFailed
 from .comparison import Row, kept, kept_work, line
 from .fault_commands import COMMANDS
-from .fit_key import fit_key, source_files
 from .hostile_files import run_readers
 from .hostile_samples import READERS
+from .sources import fit_key, source_files
 
 INPUTS, QUICK_INPUTS = 2000, 50  # inputs of each reader
 QUICK_KILLS, TOGETHER = 3, 8

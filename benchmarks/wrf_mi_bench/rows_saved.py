@@ -21,7 +21,7 @@ from wrf_mi.tasks.task import Task
 
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .stages import LAB, Cell, scene_of_cell
 from .table_plan import SEEDS
 

@@ -8,7 +8,7 @@ They take three quarters of an hour on two cores, the tables many hours. Each fi
 | paths that MATLAB's image method has, found again | 95 % Wilson interval of the stored share over these paths |
 | worst errors of `stress` and of the Mitsuba integrator, fewer of the same cases | up to the bound of that benchmark |
 
-Results are kept by the content of the packages' files (`wrf_mi_bench.fit_key.source_files`): a stopped call is
+Results are kept by the content of the packages' files (`wrf_mi_bench.sources.source_files`): a stopped call is
 resumed, and changed code is measured again.
 """
 
@@ -29,7 +29,7 @@ from wrf_mi.runs.sweep import dataset_files, markdown_table
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure

@@ -32,7 +32,7 @@ from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, measured_on, stored_part
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .table_plan import PARTS
 from .tables import meshed_scan, scene_of
 

@@ -3,7 +3,7 @@
 Each row of `wrf_mi_bench.table_plan` is stored as a JSON file when its run is done, so an interrupted measurement can
 be resumed, on another machine too. A row is measured again where its arguments or the content of its data set have
 changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a run folder has
-a key of command, source, data, scene and versions (`wrf_mi_bench.fit_key`).
+a key of command, source, data, scene and versions (`wrf_mi_bench.sources`).
 """
 
 import json
@@ -36,8 +36,7 @@ from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder
-from .fit_key import fit_key, source_files
-from .sources import modules_of_command, source_digests
+from .sources import fit_key, modules_of_command, source_digests, source_files
 from .table_pages import read_rows, write_tables
 from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
 

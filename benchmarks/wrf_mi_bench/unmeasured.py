@@ -29,7 +29,7 @@ from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import MEASURED, data_folder, line, measured_on, stored_part
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .stages import TRANSMISSION
 from .table_plan import PARTS, SEEDS
 from .tables import meshed_scan, scene_of

@@ -98,10 +98,10 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    if a.input is None:
-        strengths_dbm, true_m = files.test_observations(run)
-    else:
+    if a.input is not None:
         strengths_dbm, true_m = files.read_observations(a.input, run.receivers, run.config.left_out)
+    else:
+        strengths_dbm, true_m = files.test_observations(run)
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
         located = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)

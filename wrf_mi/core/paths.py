@@ -101,10 +101,10 @@ def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
     """The paths of a file and the further arrays beside them (`load_paths`)."""
     path = Path(file)
     with readable(path, f"{path}: missing; trace the paths first", "trace the paths anew"):
-        arrays = stored_arrays(path)
+        arrays: dict[str, Any] = stored_arrays(path)
         version = int(arrays.pop("format"))
         if version != FORMAT:
             raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
         facts: dict[str, Any] = {"object_names": tuple(str(name) for name in arrays.pop("object_names"))}
         facts |= {name: int(arrays.pop(name)) for name in ("n_tx", "n_rx")}
-        return Paths(**{name: arrays.pop(name) for name in ARRAYS}, **facts), arrays
+        return Paths(**facts | {name: arrays.pop(name) for name in ARRAYS}), arrays

@@ -111,15 +111,13 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     panels = {words: {run.name: float(run.metrics[key]) for run in runs} for words, key in times.items()}
     scatter = figures.time_scatter(panels, medians, f"median {task.label}\n({better} is better)")
     drawn.append((f"{slug}-time.png", "Time against error", scatter))
-    staged = {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}
-    if staged:
+    if staged := {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}:
         drawn.append((f"{slug}-stages.png", "What each stage contributes", figures.stage_steps(staged, task.label)))
     if np.isfinite(runs[0].tx_pos_m).all():
         drawn += _error_maps(slug, runs)
     if (view := _scene(runs)) is not None:
         drawn.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
-    curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
-    if curves:
+    if curves := {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}:
         drawn.append((f"{slug}-training.png", "Training", figures.training_curves(curves, task.label)))
     return drawn
 
@@ -155,21 +153,18 @@ def _scene(runs: Sequence[Results]) -> Figure | None:
     traced = next((run for run in runs if (run.path / PATHS).exists()), None)
     if traced is None:
         return None
-    learned = (run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists())
-    field = next(learned, None)
+    field = next((run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists()), None)
     row = traced.row[np.argsort(np.nanmean(traced.score, axis=0))[len(traced.row) // 2]]
     try:
         return scene_view(traced.path, int(row), field)
-    except InputError as error:
-        # A run folder outlives the scene that it was traced in.
+    except InputError as error:  # a run folder outlives the scene that it was traced in
         print(f"no picture of the scene of {traced.name}: {error}", file=sys.stderr)
         return None
 
 
 def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
-    first = runs[0]
-    positions = indices(runs)
+    first, positions = runs[0], indices(runs)
     shared = (positions >= 0).all(axis=0)
     candidates = np.flatnonzero(shared if shared.any() else np.ones_like(shared))
     score = first.score[:, candidates]
@@ -179,9 +174,8 @@ def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
         receiver, chosen = np.unravel_index(order[round(quantile * (len(order) - 1))], score.shape)
         m = candidates[chosen]
         name = f"row {first.row[m]}" + (f", {first.receivers[receiver]}" if len(first.truth) > 1 else "")
-        predicted = [
-            None if p < 0 else run.prediction[receiver, p] for run, p in zip(runs, positions[:, m], strict=True)
-        ]
+        columns = zip(runs, positions[:, m], strict=True)
+        predicted = [None if p < 0 else run.prediction[receiver, p] for run, p in columns]
         rows.append((name, [first.truth[receiver, m], *predicted, first.reference[receiver, m]]))
     percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
     heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"

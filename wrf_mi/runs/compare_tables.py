@@ -82,9 +82,7 @@ def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
 def common_means(runs: Sequence[Results]) -> dict[str, float]:
     """Mean score over the observations that all runs score, by the runs' names; empty without any."""
     keys = common(runs)
-    if not keys:
-        return {}
-    return {run.name: float(np.mean([run.score[of[key]] for key in keys])) for run in runs for of in [run.scored]}
+    return {run.name: float(np.mean([run.score[run.scored[key]] for key in keys])) for run in runs if keys}
 
 
 def best_run(runs: Sequence[Results]) -> Results:
@@ -137,9 +135,9 @@ def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
 
 
 def _paired(run: Results, other: Results) -> FloatArray:
-    ours, theirs = run.scored, other.scored
     keys = common([run, other])
-    return _per_row(run, [key[1] for key in keys], [run.score[ours[k]] - other.score[theirs[k]] for k in keys])
+    change = [run.score[run.scored[key]] - other.score[other.scored[key]] for key in keys]
+    return _per_row(run, [row for _, row in keys], change)
 
 
 def _to_reference(run: Results) -> tuple[str, FloatArray]:
@@ -153,9 +151,8 @@ def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatAr
     if not len(row):
         return np.zeros(0)
     _, which = np.unique(row, return_inverse=True)
-    sums = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
-    result: FloatArray = sums if TASKS[run.task].higher_is_better else -sums
-    return result
+    means = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
+    return np.asarray(means if TASKS[run.task].higher_is_better else -means)
 
 
 def _method(run: Results) -> Any:

@@ -143,8 +143,7 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     with readable(path, missing, REMEDY):
         metrics = json.loads(path.read_text())
     needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
-    absent = [key for key in needed if key not in metrics]
-    if absent:
+    if absent := [key for key in needed if key not in metrics]:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     if metrics["task"] not in TASKS:
         raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
@@ -162,8 +161,7 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     observed = ["prediction", "truth", *map(reference_key, references)]
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
-    absent = [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]
-    if absent:
+    if absent := [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     observed += ["std"] if "std" in stored else []
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}

@@ -26,8 +26,9 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import make_splits, read_nerf2_csi, write_nerf2_csi
+from ..receivers.channel import array_channels
 from ..tracing.sionna.scenes import open_scene
-from .searches import Searches, trace_channels
+from .searches import Searches, searched_paths
 from .stored import Files, scene_files, stored
 
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
@@ -46,25 +47,17 @@ ORIENTATION = (0.5, 0.5, 0.5, 0.5)
 
 @dataclass(frozen=True)
 class Walk(Searches):
-    """Parameters of a floor's channels, beside those of `Searches`.
+    """Parameters of a floor's channels, beside those of `Searches`."""
 
-    Attributes:
-        rows, columns: numbers of the base station's antennas.
-        users, places: numbers of users on each route, and of positions of each user.
-        wander_m: largest deviation of users from the route, along x and along y.
-        height_m, sway_m: height of a user's antenna and its largest deviation.
-        snr_db: signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers.
-    """
-
-    rows: int = 8
-    columns: int = 13
-    users: int = 2
-    places: int = 80
+    rows: int = 8  # rows of the base station's array
+    columns: int = 13  # columns of the base station's array
+    users: int = 2  # number of users on each route
+    places: int = 80  # number of positions of each user
     scattered_depth: int | None = 2
-    wander_m: float = 0.12
-    height_m: float = 1.2
-    sway_m: float = 0.15
-    snr_db: float = 25.0
+    wander_m: float = 0.12  # largest deviation of users from the route, along x and along y
+    height_m: float = 1.2  # height of a user's antenna
+    sway_m: float = 0.15  # largest deviation of that height
+    snr_db: float = 25.0  # signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers
 
 
 DEFAULT = Walk()
@@ -93,15 +86,8 @@ def walked_channels(
     if place not in PLACES:
         raise InputError(f"place {place!r}: unknown; give one of {', '.join(PLACES)}")
     name, plan = f"{PREFIX}{place}", PLACES[place]()
-    facts = {
-        "format": FORMAT,
-        "place": place,
-        "station_m": plan.station_m,
-        "routes_m": plan.routes,
-        **asdict(walk),
-        "frequency_hz": CARRIER_HZ,
-        "subcarrier_spacing_hz": SPACING_HZ,
-    }
+    facts = {"format": FORMAT, "place": place, "station_m": plan.station_m, "routes_m": plan.routes, **asdict(walk)}
+    facts |= {"frequency_hz": CARRIER_HZ, "subcarrier_spacing_hz": SPACING_HZ}
 
     def write(folder: Path, scene_folder: Path, extra: Files) -> None:
         write_nerf2_csi(folder, _trace(scene_folder, name, plan, walk, progress), replace=True, extra=extra)
@@ -159,15 +145,16 @@ def with_noise(channel: NDArray[np.complex128], snr_db: float, rng: np.random.Ge
 
 
 def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress: bool) -> Record:
-    scene = open_scene(scene_folder, CARRIER_HZ)
-    rng = np.random.default_rng([walk.seed, 0])
+    scene, rng = open_scene(scene_folder, CARRIER_HZ), np.random.default_rng([walk.seed, 0])
     ways = [users_way(route, walk, rng) for route in plan.routes for _ in range(walk.users)]
     positions = np.concatenate(ways)
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
     receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION), array_m=array_m)
     frequencies, text = np.concatenate([UPLINK_HZ, DOWNLINK_HZ]), f"tracing {name}" if progress else None
-    how: dict[str, Any] = {"chunk_size": CHUNK_SIZE, "progress": text}
-    channel = trace_channels(scene, receiver, positions, frequencies, walk.options(), **how)
+    searched = searched_paths(scene, receiver, positions, walk.options(), chunk_size=CHUNK_SIZE, progress=text)
+    channel = np.zeros((len(positions), len(array_m), len(frequencies)), complex)
+    for rows, traced in searched:
+        channel[rows] += array_channels(traced.paths, receiver, array_m, frequencies)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(

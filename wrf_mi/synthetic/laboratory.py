@@ -62,19 +62,10 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
         progress: show a progress bar on standard error.
     """
     info = scenes()[NAME]
-    facts = {
-        "format": FORMAT,
-        "scene": info.name,
-        "scene_sha256": info.sha256,
-        "frequency_hz": FREQUENCY_HZ,
-        **ARRAY_FACTS,
-        "positions": POSITIONS,
-        "scanner": [list(place) for place in SCANNER_M],
-        "scanned_rays": SCANNED_RAYS,
-        "max_depth": OPTIONS.depth,
-        "rays_per_source": OPTIONS.rays,
-        "seed": OPTIONS.seed,
-    }
+    facts = {"format": FORMAT, "scene": info.name, "scene_sha256": info.sha256, "frequency_hz": FREQUENCY_HZ}
+    facts |= {**ARRAY_FACTS, "positions": POSITIONS, "scanner": [list(place) for place in SCANNER_M]}
+    facts |= {"scanned_rays": SCANNED_RAYS, "max_depth": OPTIONS.depth, "rays_per_source": OPTIONS.rays}
+    facts["seed"] = OPTIONS.seed
 
     def write(folder: Path, recipe: Files) -> None:
         positions, frequency_hz = transmitter_path(), np.array([FREQUENCY_HZ])

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from scipy.spatial import cKDTree
@@ -16,7 +15,6 @@ from scipy.spatial import cKDTree
 from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
-from ..receivers.channel import array_channels
 from ..tracing.options import TraceOptions
 from ..tracing.paths.result import TraceResult
 from ..tracing.paths.solve import trace_paths
@@ -29,34 +27,23 @@ CHUNK_SIZE = 200  # transmitters that are traced together
 
 @dataclass(frozen=True)
 class Searches:
-    """Searches for paths, and parameters that all synthetic data have.
+    """Searches for paths, and parameters that all synthetic data have."""
 
-    Attributes:
-        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
-            scattered path (None: the former).
-        rays, scattered_rays: numbers of rays for specular paths and diffraction, and for diffuse reflection.
-        scattering: share of the reflected amplitude that every surface scatters.
-        mesh_error_m: standard deviation of the measured surfaces' positions along each axis, metres.
-        seed: seed of positions, rays, noise, split and errors of the measured scene.
-    """
-
-    depth: int = 5
-    reflections: int = 3
-    scattered_depth: int | None = None
-    rays: int = 1 << 17
-    scattered_rays: int = 1 << 9
-    scattering: float = 0.3
-    mesh_error_m: float = 0.02
-    seed: int = 1
+    depth: int = 5  # most interactions of a path
+    reflections: int = 3  # most reflections among them
+    scattered_depth: int | None = None  # most interactions of a scattered path; None: ``depth``
+    rays: int = 1 << 17  # number of rays for specular paths and diffraction
+    scattered_rays: int = 1 << 9  # number of rays for diffuse reflection
+    scattering: float = 0.3  # share of the reflected amplitude that every surface scatters
+    mesh_error_m: float = 0.02  # standard deviation of the measured surfaces' positions along each axis, metres
+    seed: int = 1  # seed of positions, rays, noise, split and errors of the measured scene
 
     def options(self, diffraction: bool = False) -> tuple[TraceOptions, TraceOptions]:
         """Options of the search for specular, and perhaps diffracted, paths, and of that for scattered ones."""
         shared: dict[str, Any] = {"transmission": True, "seed": self.seed, "scattering_coefficient": self.scattering}
-        exact = TraceOptions(
-            diffraction=diffraction, depth=self.depth, reflections=self.reflections, rays=self.rays, **shared
-        )
-        shared["depth"] = self.scattered_depth or self.depth
-        return exact, TraceOptions(scattering=True, rays=self.scattered_rays, **shared)
+        specular = {"depth": self.depth, "reflections": self.reflections, "rays": self.rays, "diffraction": diffraction}
+        scattered = {"depth": self.scattered_depth or self.depth, "rays": self.scattered_rays, "scattering": True}
+        return TraceOptions(**specular, **shared), TraceOptions(**scattered, **shared)
 
 
 def free_positions(
@@ -89,28 +76,6 @@ def free_positions(
         free &= solid_around(surfaces, drawn) < 0
         positions = np.concatenate([positions, drawn[free]])
     return positions[:count]
-
-
-def trace_channels(
-    scene: Any,
-    receiver: Receiver,
-    positions: FloatArray,
-    frequencies_hz: FloatArray,
-    options: Sequence[TraceOptions],
-    opaque: Sequence[str] = (),
-    *,
-    chunk_size: int = CHUNK_SIZE,
-    progress: str | None = None,
-) -> NDArray[np.complex128]:
-    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over searches for paths.
-
-    Paths are those of `searched_paths`.
-    """
-    assert receiver.array_m is not None
-    channel = np.zeros((len(positions), len(receiver.array_m), len(frequencies_hz)), complex)
-    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, chunk_size, progress):
-        channel[rows] += array_channels(traced.paths, receiver, receiver.array_m, frequencies_hz)
-    return channel
 
 
 def searched_paths(
