@@ -141,7 +141,7 @@ def main(folder: str, out: str) -> None:
 
     place, lost, errors = Path(folder), list[int](), StringIO()
     prepare_data(place)
-    tables = Tables(place)
+    tables = Tables("tables", place)
     tables.prepare(children=False)  # but in workers, which import the module themselves
     wrong, content = list[str](), list[dict[str, Any]]()
     for name, scheduler in (("whole", []), ("lost", ["--scheduler", "local:2"])):

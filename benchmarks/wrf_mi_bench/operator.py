@@ -116,16 +116,13 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
 
 def main() -> dict[str, Any]:
     """Times, memory and differences, with rows for the table."""
-    rng = np.random.default_rng(0)
-    field = Factorised()
+    rng, field = np.random.default_rng(0), Factorised()
     params = parameters(field, GAUSSIANS, SIZE_DEG)
     direct = Direct(field, params)
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     gaussians = direct.gaussians(direct.parts(tx[0]))
 
-    def build() -> PixelOperator:
-        return direct.operator(gaussians)
-
+    build = partial(direct.operator, gaussians)
     built, built_mb, pixels = bootstrap(interleaved({"": build}, 5)[""]), memory_mb(build), build()
     factors, coefficients = static_signals(field, params)
     assert factors is not None
@@ -145,10 +142,8 @@ def main() -> dict[str, Any]:
     raw, processor = interleaved(alone, REPEATS, most_s=120), interleaved(alone, REPEATS, most_s=60, processor=True)
     each = {name: raw[name] / many for name, (_, many) in calls.items()}
     times = {name: bootstrap(ms) for name, ms in each.items()}
-    rows = [
-        line(name, f"{times[name]} ms; processors {np.median(processor[name]) / many:.3g} ms")
-        for name, (_, many) in calls.items()
-    ]
+    shares = {name: np.median(processor[name]) / many for name, (_, many) in calls.items()}
+    rows = [line(name, f"{times[name]} ms; processors {ms:.3g} ms") for name, ms in shares.items()]
     for what, name in (("pixels", "pixels, one transmitter"), (f"pixels, {BATCH}", f"pixels, each of {BATCH}")):
         rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [
@@ -156,11 +151,8 @@ def main() -> dict[str, Any]:
         line("size: pixels", f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB"),
         line("size: pixels, composed", f"{images.table.nbytes / 1e6:.2g} MB"),
     ]
-    for name, kind, values in (
-        ("alpha", field, params),
-        ("product", WrfGs(), parameters(WrfGs(), GAUSSIANS, SIZE_DEG)),
-    ):
-        error = difference(kind, values, tx[0])
+    for name, kind in (("alpha", field), ("product", WrfGs())):
+        error = difference(kind, parameters(kind, GAUSSIANS, SIZE_DEG), tx[0])
         rows.append(line(f"relative L2 difference from direct, {name} blending", f"pixels {error:.1e}", "1e-4"))
     for name, shares in of_networks(rng).items():
         text = "; ".join(f"{key} {interval}" for key, interval in shares.items())

@@ -71,11 +71,7 @@ def _splatting() -> tuple[Call, Call]:
 
 def _integrator() -> tuple[Call, Call]:
     gaussians, receiver = field(500, 5.0, opacity=0.3)
-    stock = _stock(gaussians, receiver)
-
-    def theirs() -> None:
-        stock.field(gaussians)
-
+    theirs = partial(_stock(gaussians, receiver).field, gaussians)
     return integrator(gaussians, receiver), Within(theirs, rgb_variant)
 
 
@@ -197,11 +193,7 @@ PAIRS: list[Pair] = [
     Pair("integrator", "our Mitsuba integrator over `volprim_rf_basic`, geometry new", _integrator),
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
-    Pair(
-        "paths-alone",
-        f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such",
-        _paths_alone,
-    ),
+    Pair("paths-alone", f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths", _paths_alone),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
 ]
@@ -236,7 +228,8 @@ def worse(measured: Mapping[str, Mapping[str, float]], stored: Mapping[str, Mapp
 
 def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, Any]:
     """Ratios of all pairs, stored in ``out`` or else compared with stored ones (`BenchFailed` where one is worse)."""
-    file = file_of(out)
+    # Ratios of each backend have a file.
+    file = out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
     stored = None if store else read_stored(file)
     start = time.perf_counter()
     with threadpool_limits(1, "blas"):
@@ -257,11 +250,6 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     return result
 
 
-def file_of(out: Path) -> Path:
-    """File of this backend's stored ratios: ``quick.json``, or ``quick-cuda.json``."""
-    return out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
-
-
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
     """Stored ratios."""
     try:
@@ -279,9 +267,9 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
     """Markdown table of measured ratios."""
-    titles = {pair.name: pair.title for pair in PAIRS}
+    titles = {known.name: known.title for known in PAIRS}
     lines = []
-    for name, one in ratios.items():
-        interval = f"**{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g})"
-        lines.append([titles[name], interval, f"{one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms"])
+    for name, pair in ratios.items():
+        interval = f"**{pair['value']:.2g}** ({pair['low']:.2g} to {pair['high']:.2g})"
+        lines.append([titles[name], interval, f"{pair['ours_ms']:.3g} ms, {pair['theirs_ms']:.3g} ms"])
     return markdown_table(["ratio", "measured (95 % interval)", "medians"], lines)

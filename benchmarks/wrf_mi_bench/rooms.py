@@ -21,7 +21,7 @@ from wrf_mi_scenes.random_rooms import random_room
 
 import wrf_mi
 from wrf_mi.core import Receiver, Record
-from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.arrays import planar_array
 from wrf_mi.correction import correct_scene, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import SpectrumInstrument
@@ -91,14 +91,11 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
         scores[column] = clipped_cea_db(np.asarray(predicted), truth, record)
     size = " x ".join(f"{side:.1f}" for side in room.size_m)
     what = f"{seed}: {size} m, {len(room.parts) - 6} pieces, {room.mount}{', perfect' if room.perfect else ''}"
-    chosen = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
-    facts = {"surfaces": len(page["materials"]), "planes": len(page["planes"])}
-    return {
-        **line(what, f"{scores[SCAN]:.1f} to {scores[CORRECTED]:.1f} dB", "-"),
-        "cea_db": scores,
-        "scan": disagreement(traced["true"], traced[SCAN]),
-        "correction": chosen | facts,
-    }
+    row = line(what, f"{scores[SCAN]:.1f} to {scores[CORRECTED]:.1f} dB", "-")
+    facts = {key: page[key] for key in ("kept", "seconds", "rows", "paths")}
+    facts |= {"surfaces": len(page["materials"]), "planes": len(page["planes"])}
+    scan_facts = disagreement(traced["true"], traced[SCAN])
+    return {**row, "cea_db": scores, "scan": scan_facts, "correction": facts}
 
 
 def main() -> dict[str, Any]:
@@ -122,16 +119,13 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     head = [*columns, "paths missing", "wrong", "phase error", "correction"]
     lines = [f"| room | {' | '.join(head)} |", "| --- |" + " ---: |" * len(head)]
     for row in rows:
-        cells = [f"{row['cea_db'][column]:.1f}" for column in columns]
-        name = f"**median**; {row['what']}: {row['value']}"
+        name, more = f"**median**; {row['what']}: {row['value']}", [""] * 4
         if "scan" in row:
-            name = row["what"]
-            cells += [f"{100 * row['scan'][share]:.0f} %" for share in ("missing", "wrong")]
-            cells.append(f"{row['scan']['phase_error_rad']:.1f} rad")
-            cells.append(f"{row['correction']['seconds']:.0f} s")
-        else:
-            cells += [""] * 4
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+            name, scan = row["what"], row["scan"]
+            more = [f"{100 * scan[share]:.0f} %" for share in ("missing", "wrong")]
+            more += [f"{scan['phase_error_rad']:.1f} rad", f"{row['correction']['seconds']:.0f} s"]
+        cells = [f"{row['cea_db'][column]:.1f}" for column in columns]
+        lines.append(f"| {' | '.join([name, *cells, *more])} |")
     return "\n".join(lines)
 
 
@@ -151,11 +145,9 @@ PREDICTION = TraceOptions(transmission=True, depth=3, rays=1 << 16)
 
 def array_at(station: Receiver, carrier_hz: float) -> Receiver:
     """A square array in the place of a single antenna, its boresight vertical."""
-    steps = (np.arange(ELEMENTS) - (ELEMENTS - 1) / 2) * speed_of_light / carrier_hz / 2
-    x, y = np.meshgrid(steps, steps, indexing="ij")
-    elements: FloatArray = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    elements_m = planar_array(ELEMENTS, ELEMENTS, speed_of_light / carrier_hz / 2)
     pose = DOWN if station.position_m[2] > CEILING_M else station.orientation_xyzw
-    return replace(station, array_m=elements, orientation_xyzw=pose)
+    return replace(station, array_m=elements_m, orientation_xyzw=pose)
 
 
 def measure_phase_errors(seed: int, folder: Path) -> list[list[float]]:

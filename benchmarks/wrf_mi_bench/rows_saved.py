@@ -22,8 +22,9 @@ from wrf_mi.tasks.task import Task
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line
 from .sources import fit_key, source_files
-from .stages import LAB, Cell, scene_of_cell
+from .stages import LAB, Cell
 from .table_plan import SEEDS
+from .tables import scene_of_data
 
 RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")
 """Kept results, and the picture, which is written only in a checkout of the project."""
@@ -37,7 +38,7 @@ CALIBRATION = ("calibration=gain,materials", "transmission=true")  # settings of
 
 def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:
     """Median scores of all `CURVES` by name, and of inverse-distance weighting; ``task``."""
-    scene, scores, field = scene_of_cell(cell, folder.parent), dict[str, Any](), (f"steps={steps}",)
+    scene, scores, field = scene_of_data(cell.dataset, folder.parent), dict[str, Any](), (f"steps={steps}",)
     for name, model, field_scene, settings in (
         (RANDOM, "wrf-gs+", None, field),
         (MESH, "wrf-gs+", None, (*field, f"initial.mesh={scene}")),
@@ -72,9 +73,8 @@ def rows_needed(rows: Sequence[int], score: Sequence[float], goal: float, higher
 
 def curves(scores: Sequence[Mapping[str, Any]], dataset: str, name: str) -> np.ndarray:
     """Scores [sizes, seeds] of a data set by a name of `measure`."""
-    return np.array(
-        [[entry[name] for entry in scores if (entry["dataset"], entry["rows"]) == (dataset, n)] for n in ROWS[dataset]]
-    )
+    of_data = [entry for entry in scores if entry["dataset"] == dataset]
+    return np.array([[entry[name] for entry in of_data if entry["rows"] == n] for n in ROWS[dataset]])
 
 
 def saved(scores: Sequence[Mapping[str, Any]]) -> list[Row]:

@@ -13,7 +13,6 @@ resumed, and changed code is measured again.
 """
 
 import json
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,12 +28,13 @@ from wrf_mi.runs.sweep import dataset_files, markdown_table
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
+from .comparison import STORED, say
 from .sources import fit_key, source_files
 from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure
 
-STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
+RUNS = Path("runs/bench/sentinels")
 TABLE_ROWS = (
     *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
@@ -184,11 +184,11 @@ def main() -> dict[str, Any]:
     begun = time.perf_counter()
     for count, group in enumerate(known, 1):
         minutes = (time.perf_counter() - begun) / 60
-        _say(f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
+        say("sentinels", f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
         group_rows = _rows(group, place)
         rows += group_rows
         for row in group_rows:
-            _say(f"{row['what']}: {row['value']}; stored {row['asked']}")
+            say("sentinels", f"{row['what']}: {row['value']}; stored {row['asked']}")
     return {"rows": rows, **_failure(rows)}
 
 
@@ -217,10 +217,6 @@ def _failure(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         return {}
     first = f"{lost[0]['what']}: {lost[0]['value']}, stored {lost[0]['asked']}"
     return {"failed": f"{len(lost)} of {len(rows)} figures got worse or were not measured, first {first}"}
-
-
-def _say(text: str) -> None:
-    print(f"sentinels: {text}", file=sys.stderr, flush=True)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -24,26 +24,8 @@ from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.trainer import Trainer
 
+from . import stress_fields as fields
 from .bench import BenchFailed
-from .stress_fields import (
-    HARD,
-    HARDEST,
-    RECEIVER,
-    SIZE,
-    SMALL,
-    Field,
-    Rng,
-    cases,
-    gradient,
-    gradient_row,
-    image,
-    image_row,
-    layers,
-    made,
-    ordinary,
-    placed,
-    reference,
-)
 from .stress_joint import CANCELLING, COPLANAR, joint, phases
 from .stress_losses import losses
 from .stress_plugins import plugin_gradients, plugin_images
@@ -79,47 +61,51 @@ def curves() -> Curves:
     }
 
 
-def _needles(ratio: float, rng: Rng) -> Field:
-    return made(COUNT, rng, scale_m=np.tile([1.0, 1 / ratio, 1 / ratio], (COUNT, 1)))
+def _needles(ratio: float, rng: fields.Rng) -> fields.Field:
+    return fields.made(COUNT, rng, scale_m=np.tile([1.0, 1 / ratio, 1 / ratio], (COUNT, 1)))
 
 
-def _away(distance_m: float, rng: Rng) -> Field:
+def _away(distance_m: float, rng: fields.Rng) -> fields.Field:
     azimuth, elevation = rng.uniform(0, 2 * np.pi, COUNT), rng.uniform(0, 1.5, COUNT)
-    position_m = placed(azimuth, elevation, rng, (0.5 * distance_m, 1.5 * distance_m))
-    return made(COUNT, rng, position_m=position_m, scale_m=0.1 * distance_m * rng.uniform(0.5, 2, (COUNT, 3)))
+    position_m = fields.placed(azimuth, elevation, rng, (0.5 * distance_m, 1.5 * distance_m))
+    return fields.made(COUNT, rng, position_m=position_m, scale_m=0.1 * distance_m * rng.uniform(0.5, 2, (COUNT, 3)))
 
 
-def _layered(count: float, rng: Rng) -> Field:
-    return layers(rng, int(count), opacity=np.full(int(count), 3 / count))
+def _layered(count: float, rng: fields.Rng) -> fields.Field:
+    return fields.layers(rng, int(count), opacity=np.full(int(count), 3 / count))
 
 
-def _image(field: Field, blending: str, seed: int) -> float:
-    size = SIZE if len(field.signal) < 1000 else SMALL
-    truth, clear = reference(field, blending, size)
-    return relative((image(field, blending, size) - truth)[clear], truth)
+def _image(field: fields.Field, blending: str, seed: int) -> float:
+    size = fields.SIZE if len(field.signal) < 1000 else fields.SMALL
+    truth, clear = fields.reference(field, blending, size)
+    return relative((fields.image(field, blending, size) - truth)[clear], truth)
 
 
-def _derivative(field: Field, blending: str, seed: int) -> float:
-    single, double = (gradient(field, blending, kind, seed)["position"] for kind in (mi.Float, DOUBLE))
+def _derivative(field: fields.Field, blending: str, seed: int) -> float:
+    single, double = (fields.gradient(field, blending, kind, seed)["position"] for kind in (mi.Float, DOUBLE))
     return relative(single - double, double)
 
 
 def _medians(
     values: Sequence[float] | FloatArray,
-    family: Callable[[float, Rng], Field],
-    error: Callable[[Field, str, int], float],
+    family: Callable[[float, fields.Rng], fields.Field],
+    error: Callable[[fields.Field, str, int], float],
 ) -> list[float]:
     families: list[Any] = [{"": lambda rng, x=x: family(float(x), rng)} for x in values]
-    return [float(np.median([error(*case[1:]) for case in cases(family_of_x, SEEDS)])) for family_of_x in families]
+    return [
+        float(np.median([error(*case[1:]) for case in fields.cases(family_of_x, SEEDS)])) for family_of_x in families
+    ]
 
 
 def _similarity(contrast: float) -> float:
     errors = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
-        one, other = (((1 - contrast) * 0.7 + contrast * rng.uniform(size=SIZE)).astype(np.float32) for _ in range(2))
+        one, other = (
+            ((1 - contrast) * 0.7 + contrast * rng.uniform(size=fields.SIZE)).astype(np.float32) for _ in range(2)
+        )
         truth = structural_similarity(one.astype(float), other.astype(float), data_range=1)
-        errors.append(abs(float(similarity(to_float(one), to_float(other), 1, *SIZE)[0]) - truth))
+        errors.append(abs(float(similarity(to_float(one), to_float(other), 1, *fields.SIZE)[0]) - truth))
     return float(np.median(errors))
 
 
@@ -157,16 +143,16 @@ RANDOM = "random fields"
 
 def images(random: int, of_each: int) -> list[Row]:
     """Images of random and of ill-conditioned fields."""
-    rows = [image_row(f"image, {RANDOM}", {RANDOM: ordinary}, random)]
-    rows += [image_row(f"image, {name}", {name: family}, of_each) for name, family in HARD.items()]
-    return [*rows, image_row("image, 50,000 layers", {"layers": layers}, 1, SMALL)]
+    rows = [fields.image_row(f"image, {RANDOM}", {RANDOM: fields.ordinary}, random)]
+    rows += [fields.image_row(f"image, {name}", {name: family}, of_each) for name, family in fields.HARD.items()]
+    return [*rows, fields.image_row("image, 50,000 layers", {"layers": fields.layers}, 1, fields.SMALL)]
 
 
-def gradients(of_each: int, names: Iterable[str] = (RANDOM, *HARD)) -> list[Row]:
+def gradients(of_each: int, names: Iterable[str] = (RANDOM, *fields.HARD)) -> list[Row]:
     """Derivatives of images, worst group of parameters."""
-    families = {RANDOM: lambda rng: made(60, rng), **HARD}
+    families = {RANDOM: lambda rng: fields.made(60, rng), **fields.HARD}
     chosen = {name: families[name] for name in names if name != "none"}
-    return [gradient_row(f"derivatives, {name}", cases({name: chosen[name]}, of_each)) for name in chosen]
+    return [fields.gradient_row(f"derivatives, {name}", fields.cases({name: chosen[name]}, of_each)) for name in chosen]
 
 
 def field_functions(models: Iterable[str] = tuple(FIELDS), tries: int = 9) -> list[Row]:
@@ -176,7 +162,7 @@ def field_functions(models: Iterable[str] = tuple(FIELDS), tries: int = 9) -> li
     for model in models:
         rng = np.random.default_rng(0)
         field = FIELDS[model](encoding=Encoding(1, 1e6, 2, 1.0))  # the encoding of positions is detached
-        weights = field.init(random_gaussians([RECEIVER], 12, rng, opacity=0.4), rng)
+        weights = field.init(random_gaussians([fields.RECEIVER], 12, rng, opacity=0.4), rng)
         params = {name: tensor(np.asarray(value, float)) for name, value in weights.items()}
         tx = tensor(rng.normal(size=(3, 2)))
         of = _functional(field, tx, np.random.default_rng(1))
@@ -226,8 +212,8 @@ def fits(count: int) -> list[Row]:
         "noise",
         "spectrum",
         rng.uniform(-1, 1, (12, 3)),
-        (replace(RECEIVER, position_m=np.zeros(3)),),
-        rng.uniform(0, 1, (1, 12, *SMALL)).astype(np.float32),
+        (replace(fields.RECEIVER, position_m=np.zeros(3)),),
+        rng.uniform(0, 1, (1, 12, *fields.SMALL)).astype(np.float32),
         official=(np.arange(10), np.arange(10, 12)),
     )
     (rows,) = make_splits(record, "official")
@@ -263,16 +249,16 @@ def fits(count: int) -> list[Row]:
 
 PARTS: Sequence[tuple[Callable[..., list[Row]], tuple[Any, ...], tuple[Any, ...]]] = (
     (images, (1000, 25), (5, 1)),
-    (gradients, (10,), (1, HARDEST)),
+    (gradients, (10,), (1, fields.HARDEST)),
     (field_functions, (), (tuple(FIELDS), 3)),
     (of_fields, (50, 5), (2, 1)),
-    (derivatives, (2,), (1, ("spectrum", "RSSI"), ("random", *HARDEST[:1]))),
+    (derivatives, (2,), (1, ("spectrum", "RSSI"), ("random", *fields.HARDEST[:1]))),
     (of_paths, (25,), (1,)),
     (losses, (10,), (2,)),
     (phases, (), (5,)),
     (joint, (), (1, (COPLANAR, CANCELLING), ("RSSI",))),
     (plugin_images, (50, 5), (2, 1, 0)),
-    (plugin_gradients, (2,), (1, HARDEST[:1])),
+    (plugin_gradients, (2,), (1, fields.HARDEST[:1])),
     (fits, (100,), (4,)),
 )
 """Functions that make rows, with their arguments at full size and for few cases within a minute."""

@@ -155,14 +155,11 @@ class _Joint:
         values |= {name: np.asarray(value, float) for name, value in case.values.items()}
         self._values = _rounded(values)
         if case.cancels:
-            self._cancel()
-
-    def _cancel(self) -> None:
-        name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
-        traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
-        factor = -wave / traced_wave * (1 + LEFT)
-        gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
-        self._values = _rounded({**self._values, name: gain})
+            name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
+            traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
+            factor = -wave / traced_wave * (1 + LEFT)
+            gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
+            self._values = _rounded({**self._values, name: gain})
 
     def rows(self, name: str, models: Iterable[str]) -> list[Row]:
         """Values and derivatives of the receiver models."""
@@ -295,15 +292,9 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
     where = f"{frequency_hz / 1e9:g} GHz in {size_m[0]:g} m"
     more = f" rad; with lengths in float32 {wavenumber * single.error:.0e} rad"
-    return [
-        row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more),
-        row(
-            f"Sionna RT's own delays at {where}, {counted} paths",
-            delay.error,
-            DELAY,
-            f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad",
-        ),
-    ]
+    phase = row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more)
+    more = f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad"
+    return [phase, row(f"Sionna RT's own delays at {where}, {counted} paths", delay.error, DELAY, more)]
 
 
 def _sionna_delays(scene: Any, tx_pos_m: FloatArray, rx_pos_m: FloatArray) -> list[FloatArray]:

@@ -166,23 +166,19 @@ def part_table(part: Part, groups: Groups) -> str:
 
     head = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
     lines = []
-    digits, newest = task.digits, newest_data(groups)
+    digits, newest, most = task.digits, newest_data(groups), max(share for share, _ in groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
         rows = groups[share, method]
         each = {key: float(np.mean([row["score"][key] for row in rows])) for key in ("median", "mean", "p10", "p90")}
         medians = [row["score"]["median"] for row in rows]
         spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(rows) > 1 else ""
-        cells = [
-            str(rows[0]["n_train"]),
-            part.entries[method].label + (f" {FORMER}" if is_former(part, rows, newest) else ""),
-            f"**{each['median']:.{digits}f}**{spread}",
-            *(f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")),
-            f"{np.median([row['train_seconds'] for row in rows]):.0f} s",
-            f"{np.median([row['ms_per_sample'] for row in rows]):.2g} ms",
-            f"{max(row['peak_memory_mb'] for row in rows):.0f} MB",
-            part.entries[method].published if share == max(share for share, _ in groups) else "",
-        ]
-        lines.append(cells)
+        label = part.entries[method].label + (f" {FORMER}" if is_former(part, rows, newest) else "")
+        cells = [str(rows[0]["n_train"]), label, f"**{each['median']:.{digits}f}**{spread}"]
+        cells += [f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")]
+        cells.append(f"{np.median([row['train_seconds'] for row in rows]):.0f} s")
+        cells.append(f"{np.median([row['ms_per_sample'] for row in rows]):.2g} ms")
+        cells.append(f"{max(row['peak_memory_mb'] for row in rows):.0f} MB")
+        lines.append([*cells, part.entries[method].published if share == most else ""])
     return markdown_table([*head, "paper, other data"], [*lines, *_reference_rows(part, groups)])
 
 

@@ -223,22 +223,12 @@ def plan(quick: bool = False) -> list[Row]:
         return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
     first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
     first.sort(key=lambda row: row.method not in CHEAP)
-    few = [
-        Row(part, name, share, 0)
-        for part in PARTS
-        if part.few
-        for share in SHARES[1:]
-        for name in part.entries
-        if name in FEW
-    ]
+    known = [(part, share) for part in PARTS if part.few for share in SHARES[1:]]
+    few = [Row(part, name, share, 0) for part, share in known for name in part.entries if name in FEW]
     few.sort(key=lambda row: row.method not in CHEAP)
-    again = [
-        Row(row.part, row.method, row.share, seed)
-        for row in first
-        if row.method not in row.part.once
-        for seed in row.entry.seeds[1:]
-    ]
-    again += [Row(row.part, row.method, row.share, seed) for row in few for seed in row.entry.few_seeds[1:]]
+    quickly = [row for row in first if row.method not in row.part.once]
+    again = [replace(row, seed=seed) for row in quickly for seed in row.entry.seeds[1:]]
+    again += [replace(row, seed=seed) for row in few for seed in row.entry.few_seeds[1:]]
     return [*first, *few, *again]
 
 

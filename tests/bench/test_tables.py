@@ -143,11 +143,10 @@ def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_pa
     monkeypatch.setattr(tables, "data_folder", lambda name: flat_folder)
     for name in ("flat-ble", "rfid-lab"):
         part = next(part for part in PARTS if part.dataset == name)
-        (flag, path) = tables.scene_of(part, tmp_path)
-        assert flag == "--scene"
+        path = tables.scene_of(part, tmp_path)
         assert len(open_scene(path, 2.4e9).objects) > 0
         before = {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")}
-        assert tables.scene_of(part, tmp_path) == [flag, path]
+        assert tables.scene_of(part, tmp_path) == path
         assert {one: one.stat().st_mtime_ns for one in Path(path).rglob("*")} == before
 
 
@@ -247,7 +246,7 @@ def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeyp
     assert tables.measure(tmp_path, row)["train_seconds"] == 43
     assert tables.measure(tmp_path, row)["train_seconds"] == 43
     assert [words[0] for words in calls] == ["correct", "train", "train"]  # the run is not finished: no metrics
-    stated = tables.scene_of(part, tmp_path / "scenes")[1]
-    assert calls[0] == ["correct", stated, "flat-ble", "--split", "official", "--seed", "0"]
+    stated = tables.scene_of(part, tmp_path / "scenes")
+    assert calls[0] == ["correct", str(stated), "flat-ble", "--split", "official", "--seed", "0"]
     corrected = calls[1][calls[1].index("--scene") + 1]
     assert Path(corrected).name.startswith("corrected-flat-ble-")

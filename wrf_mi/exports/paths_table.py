@@ -123,9 +123,8 @@ def read_paths(file: str | Path) -> Paths:
                 interactions[path, k], objects[path, k] = codes[kind], names.index(name)
                 vertices[path, k] = [float(number) for number in point.split()]
         except (ValueError, KeyError):
-            raise InputError(
-                f"{file}, row {path + 1}: interactions, vertices and objects do not fit; restore it"
-            ) from None
+            text = "interactions, vertices and objects do not fit"
+            raise InputError(f"{file}, row {path + 1}: {text}; restore it") from None
     gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
     directions = _directions(table, "departure"), _directions(table, "arrival")
     bounces: Any = (interactions, vertices, objects, tuple(names))

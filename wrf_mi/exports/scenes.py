@@ -24,6 +24,7 @@ from .format import ExportOptions
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
+GLTF_LOOKS: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
 
 
 def _parts(scene: Any) -> list[tuple[Surface, str]]:
@@ -106,11 +107,7 @@ def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, An
     parts = _parts(_loaded(source, options)[0])
     materials = {
         name: trimesh.visual.material.PBRMaterial(
-            name=name,
-            baseColorFactor=[*_colour_bytes(name).tolist(), 255],
-            metallicFactor=0.0,
-            roughnessFactor=1.0,
-            doubleSided=True,
+            name=name, baseColorFactor=[*_colour_bytes(name).tolist(), 255], **GLTF_LOOKS
         )
         for name in dict.fromkeys(material for _, material in parts)
     }
@@ -151,8 +148,5 @@ def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, A
 
 
 def _counts(parts: list[tuple[Surface, str]]) -> dict[str, Any]:
-    return {
-        "surfaces": len(parts),
-        "faces": sum(len(surface.faces) for surface, _ in parts),
-        "materials": len({material for _, material in parts}),
-    }
+    faces, materials = sum(len(surface.faces) for surface, _ in parts), {material for _, material in parts}
+    return {"surfaces": len(parts), "faces": faces, "materials": len(materials)}

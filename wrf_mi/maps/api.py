@@ -47,20 +47,9 @@ from ..receivers.spreads import PathStatistics
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
+from . import grid
 from .coverage import coverage_probability
 from .dataset import map_dataset, maps_package
-from .grid import (
-    HEADINGS,
-    Grid,
-    SurfaceMesh,
-    area_of,
-    check_height,
-    grid_over,
-    outside_solids,
-    surface_of,
-    usual_height,
-    warn_of_points_outside,
-)
 
 if TYPE_CHECKING:
     import xarray
@@ -144,19 +133,21 @@ def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
         if heading_deg is not None:
             raise InputError(f"{run.folder}: its predictions do not depend on the heading; omit it")
         return ()
-    turns = np.arange(HEADINGS) / HEADINGS * 2 * np.pi if heading_deg is None else [np.radians(heading_deg)]
+    turns = np.arange(grid.HEADINGS) / grid.HEADINGS * 2 * np.pi if heading_deg is None else [np.radians(heading_deg)]
     return tuple(map(float, turns))
 
 
-def _places(run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None) -> Grid | SurfaceMesh:
+def _places(
+    run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None
+) -> grid.Grid | grid.SurfaceMesh:
     known = run.problem.record.tx_pos_m
     if surface is not None:
-        mesh = surface_of(surface, step_m)
-        warn_of_points_outside(run, mesh.positions_m, known)
+        mesh = grid.surface_of(surface, step_m)
+        grid.warn_of_points_outside(run, mesh.positions_m, known)
         return mesh
-    height = usual_height(run, known) if height_m is None else height_m
-    check_height(run, height, known)
-    return grid_over(*area_of(run, known), STEP_M if step_m is None else step_m, height)
+    height = grid.usual_height(run, known) if height_m is None else height_m
+    grid.check_height(run, height, known)
+    return grid.grid_over(*grid.area_of(run, known), STEP_M if step_m is None else step_m, height)
 
 
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
@@ -216,7 +207,7 @@ def map_values(
     size = max(1, size // max(len(conditions.headings_rad), 1))
     variables = dict[str, NDArray[np.float32]]()
     scene = run.problem.opened_scene
-    outside = np.ones(len(positions_m), bool) if scene is None else outside_solids(scene, positions_m)
+    outside = np.ones(len(positions_m), bool) if scene is None else grid.outside_solids(scene, positions_m)
     with _each_warning_once():
         for start in range(0, len(positions_m), size):
             rows = start + np.flatnonzero(outside[start : start + size])

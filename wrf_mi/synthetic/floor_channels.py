@@ -26,9 +26,8 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import make_splits, read_nerf2_csi, write_nerf2_csi
-from ..receivers.channel import array_channels
 from ..tracing.sionna.scenes import open_scene
-from .searches import Searches, searched_paths
+from .searches import Searches, trace_channels
 from .stored import Files, scene_files, stored
 
 PLACES = {"flat": floor_plans.flat, "office": floor_plans.office}
@@ -151,10 +150,8 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)
     receiver = Receiver("base-station", np.array(plan.station_m), np.array(ORIENTATION), array_m=array_m)
     frequencies, text = np.concatenate([UPLINK_HZ, DOWNLINK_HZ]), f"tracing {name}" if progress else None
-    searched = searched_paths(scene, receiver, positions, walk.options(), chunk_size=CHUNK_SIZE, progress=text)
-    channel = np.zeros((len(positions), len(array_m), len(frequencies)), complex)
-    for rows, traced in searched:
-        channel[rows] += array_channels(traced.paths, receiver, array_m, frequencies)
+    how: dict[str, Any] = {"chunk_size": CHUNK_SIZE, "progress": text}
+    channel = trace_channels(scene, receiver, positions, frequencies, walk.options(), **how)
     noise = np.random.default_rng([walk.seed, 1])
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(

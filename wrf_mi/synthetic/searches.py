@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from scipy.spatial import cKDTree
@@ -15,6 +16,7 @@ from scipy.spatial import cKDTree
 from ..core import Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
+from ..receivers.channel import array_channels
 from ..tracing.options import TraceOptions
 from ..tracing.paths.result import TraceResult
 from ..tracing.paths.solve import trace_paths
@@ -41,8 +43,9 @@ class Searches:
     def options(self, diffraction: bool = False) -> tuple[TraceOptions, TraceOptions]:
         """Options of the search for specular, and perhaps diffracted, paths, and of that for scattered ones."""
         shared: dict[str, Any] = {"transmission": True, "seed": self.seed, "scattering_coefficient": self.scattering}
-        specular = {"depth": self.depth, "reflections": self.reflections, "rays": self.rays, "diffraction": diffraction}
-        scattered = {"depth": self.scattered_depth or self.depth, "rays": self.scattered_rays, "scattering": True}
+        specular: dict[str, Any] = {"depth": self.depth, "reflections": self.reflections, "diffraction": diffraction}
+        scattered: dict[str, Any] = {"depth": self.scattered_depth or self.depth, "scattering": True}
+        specular["rays"], scattered["rays"] = self.rays, self.scattered_rays
         return TraceOptions(**specular, **shared), TraceOptions(**scattered, **shared)
 
 
@@ -76,6 +79,23 @@ def free_positions(
         free &= solid_around(surfaces, drawn) < 0
         positions = np.concatenate([positions, drawn[free]])
     return positions[:count]
+
+
+def trace_channels(
+    scene: Any,
+    receiver: Receiver,
+    positions: FloatArray,
+    frequencies_hz: FloatArray,
+    options: Sequence[TraceOptions],
+    opaque: Sequence[str] = (),
+    **how: Any,
+) -> NDArray[np.complex128]:
+    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over `searched_paths`."""
+    assert receiver.array_m is not None
+    channel = np.zeros((len(positions), len(receiver.array_m), len(frequencies_hz)), complex)
+    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, **how):
+        channel[rows] += array_channels(traced.paths, receiver, receiver.array_m, frequencies_hz)
+    return channel
 
 
 def searched_paths(
