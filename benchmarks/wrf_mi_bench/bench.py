@@ -86,12 +86,13 @@ def _here(title: str, function: str, *data: str, quick: str = "", table: str = "
 CASES: Mapping[str, Case] = {
     "wrf-gs+-paper": Case(
         "WRF-GS+, L = 9 as the paper",
-        ("train", RFID, "--model", "wrf-gs+", "--preset", "paper", "--set", "steps=15000"),
+        ("train", RFID, *("--model", "wrf-gs+", "--preset", "paper"), "--set", "steps=15000"),
     ),
     "demo": Case("the demo (WRF-GS+, short)", ("demo",), (RFID, FLAT)),
 }
 """Runs that are not rows of the tables (`wrf_mi_bench.table_plan`)."""
 
+_STORED: Any = {"resumes": True}  # of checks that keep their parts
 _OWN: Mapping[str, Check] = {
     "traced-and-splatted": _here("Mitsuba integrator", "traced:main"),
     "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
@@ -108,15 +109,13 @@ _OWN: Mapping[str, Check] = {
         "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
     ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
-    "new-carriers": _here(
-        "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
-    ),
+    "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(
         "receivers without measurements, and with few",
         "unmeasured:receivers",
         FLAT,
-        resumes=True,
         table="unmeasured:table",
+        **_STORED,
     ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
@@ -258,20 +257,11 @@ def provenance(*modules: str) -> dict[str, Any]:
     ``modules`` made the result; what they import counts too.
     """
     count, known = worker_threads(), versions()
-    machine = {
-        "processor": known["device"],
-        "cores": os.cpu_count(),
-        "memory_gb": round(psutil.virtual_memory().total / 1e9),
-        "system": f"{platform.system()} {platform.machine()}",
-    }
-    threads = {} if count is None else {"worker_threads": count}
-    return {
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine,
-        "versions": known,
-        SOURCE: source_digests(*modules),
-        **threads,
-    }
+    machine = {"processor": known["device"], "cores": os.cpu_count()}
+    machine["memory_gb"] = round(psutil.virtual_memory().total / 1e9)
+    machine["system"] = f"{platform.system()} {platform.machine()}"
+    facts = {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": known}
+    return facts | {SOURCE: source_digests(*modules)} | ({} if count is None else {"worker_threads": count})
 
 
 def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

@@ -80,7 +80,11 @@ def _whole(kind: str, *files: str) -> dict[str, Reader]:
 
 def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "files") -> dict[str, Reader]:
     """Files that a reader reads one by one."""
-    return {f"{kind}: {file}": Reader(group, file, lambda folder, file=file: reader(folder / file)) for file in files}
+
+    def read(file: str, folder: Path) -> Any:
+        return reader(folder / file)
+
+    return {f"{kind}: {file}": Reader(group, file, partial(read, file)) for file in files}
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
@@ -203,9 +207,8 @@ def prepare(folder: Path) -> None:
         np.savetxt(folder / "nerf2-ble" / f"{name}.csv", table, delimiter=",", header=header, comments="")
     _write_deepmimo(folder / "deepmimo", rng)
     corners, faces = np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    surfaces = [
-        Surface(kind, kind, corners + np.array([0, 0, z]), faces) for kind, z in (("floor", 0.0), ("ceiling", 3.0))
-    ]
+    above = Surface("ceiling", "ceiling", corners + np.array([0.0, 0, 3]), faces)
+    surfaces = [Surface("floor", "floor", corners, faces), above]
     write_scene(folder / "scene", surfaces, frame="z upwards", source="made here")
     _write_files(folder / "files", positions, rng)
     _write_runs(folder)
@@ -258,8 +261,9 @@ def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None
         stored.create_dataset("Pilot_Samples", data=samples, compression="gzip")
         stored.attrs.update({"num_mob_ant": 2, "samples_per_user": 224, "measured_noise": 0})
     rows, ones = np.arange(2), np.ones((2, 3)) / np.sqrt(3)
-    bounces: Any = (np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3)), np.zeros((2, 0), np.int32), ())
-    save_paths(folder / "paths.npz", Paths(rows, rows * 0, rows + 1j, rows + 1.0, ones, ones, *bounces, 2, 1))
+    bounces = np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3)), np.zeros((2, 0), np.int32)
+    arrays: Any = (rows, rows * 0, rows + 1j, rows + 1.0, ones, ones, *bounces, (), 2, 1)
+    save_paths(folder / "paths.npz", Paths(*arrays))
     (folder / "heard.csv").write_text("x,y,rssi_one,other_dbm\n1,2,-60.5,-71\n2,2,,-70\n")
     save_split(folder / "split.npz", Split("own", 0, np.arange(6), np.arange(6, 8), np.arange(8, 12)))
     np.savetxt(folder / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")

@@ -74,7 +74,8 @@ def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
     ways = [Neighbours(count, metric) for metric in METRICS for count in COUNTS]
     near_m = (way.locate(record, rows, strengths_dbm)[:, :2] for way in ways)
     best = min((np.linalg.norm(at - true_m, axis=1) for at in near_m), key=lambda error: float(error.mean()))
-    arrays = {"error_m": located.error_m(true_m), "neighbours_error_m": located.neighbours_error_m(true_m)}
+    arrays: dict[str, Any] = {"error_m": located.error_m(true_m)}
+    arrays["neighbours_error_m"] = located.neighbours_error_m(true_m)
     arrays |= {"best_neighbours_error_m": best, "inside": located.covers(true_m)}
     arrays |= {"area_m2": located.area_m2, "radius_m": located.radius_m}
     lists = {name: np.asarray(values).tolist() for name, values in arrays.items()}

@@ -159,14 +159,11 @@ def _clearance(triangles: FloatArray) -> Any:
 def scans() -> dict[str, Any]:
     """Scans of both rooms of the NeWRF data, at 200 receivers, for the benchmark."""
     figures = {name: scan_to_paths(room_file(name), receivers=200) for name in ROOMS}
-    rows = [
-        line(
-            f"{name}, received power on specular paths found again (of that predicted, right)",
-            f"{100 * shares['recall']['power']:.1f} % ({100 * shares['precision']['power']:.1f} %)",
-            "80 %, aim 90 %",
-        )
-        for name, shares in figures.items()
-    ]
+    rows = []
+    for name, shares in figures.items():
+        value = f"{100 * shares['recall']['power']:.1f} % ({100 * shares['precision']['power']:.1f} %)"
+        what = f"{name}, received power on specular paths found again (of that predicted, right)"
+        rows.append(line(what, value, "80 %, aim 90 %"))
     return {"rows": rows, "rooms": figures}
 
 
@@ -224,14 +221,11 @@ def flat_plan() -> dict[str, Any]:
         # In the layout's frame by the robot's poses; too blurred for a fit to be accepted.
         "points without alignment": _measured_plan(grid_from_points(returns.xy_m), true, register=False),
     }
-    rows = [
-        line(
-            f"{name}: layout within {NEAR_M} m of a wall made, and the reverse",
-            f"{f['layout_found']:.2f} and {f['walls_right']:.2f} (seen at all: {f['layout_seen']:.2f})",
-            ASKED if name == "gridmap" else "-",
-        )
-        for name, f in figures.items()
-    ]
+    rows = []
+    for name, shares in figures.items():
+        what = f"{name}: layout within {NEAR_M} m of a wall made, and the reverse"
+        value = "{layout_found:.2f} and {walls_right:.2f} (seen at all: {layout_seen:.2f})".format_map(shares)
+        rows.append(line(what, value, ASKED if name == "gridmap" else "-"))
     return {"rows": rows, **figures}
 
 

@@ -47,12 +47,9 @@ def curves() -> Curves:
         for hz in FREQUENCIES_HZ
         for name, kind in (("float32", np.float32), ("float64", np.float64))
     }
+    needles = {"image": _medians(ratios, _needles, _image), "derivative": _medians(ratios, _needles, _derivative)}
     return {
-        "ratio": {
-            "x": ratios.tolist(),
-            "image": _medians(ratios, _needles, _image),
-            "derivative": _medians(ratios, _needles, _derivative),
-        },
+        "ratio": {"x": ratios.tolist(), **needles},
         "distance": {"x": distances.tolist(), "image": _medians(distances, _away, _image)},
         "layers": {"x": counts.tolist(), "image": _medians(counts, _layered, _image)},
         # Half a unit in the last digit of a path's length.
@@ -222,10 +219,8 @@ def fits(count: int) -> list[Row]:
         draw = np.random.default_rng(seed)
         groups = ("network", "position", "scale", "rotation", "opacity", "signal")
         settings = [f"optimiser.{group}={10 ** draw.uniform(-3, 38):.3e}" for group in groups if draw.random() < 0.5]
-        settings += [
-            f"initial.signal={10 ** draw.uniform(-10, 20):.3e}",
-            f"initial.size_deg={draw.uniform(0.01, 80):g}",
-        ]
+        settings.append(f"initial.signal={10 ** draw.uniform(-10, 20):.3e}")
+        settings.append(f"initial.size_deg={draw.uniform(0.01, 80):g}")
         model = str(draw.choice(list(FIELDS)))
         config = with_settings(TrainConfig(model=model, seed=seed), [*SHORT, *settings])
         trainer = Trainer(record, rows, config)

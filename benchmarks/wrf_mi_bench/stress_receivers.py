@@ -99,8 +99,8 @@ def of_paths(count: int, each: int = 50) -> list[Row]:
         directions = [DOUBLE(np.ascontiguousarray(column)) for column in arrival.T]
         traced = TracedPaths(gains, DOUBLE(length), directions, 1, each)
         first = np.zeros(each, np.int64)
-        none: Any = (np.zeros((each, 0), np.uint8), np.zeros((each, 0, 3)), np.zeros((each, 0), np.int32), ())
-        known = Paths(first, first, gain, length, -arrival, arrival, *none, n_tx=1, n_rx=1)
+        none: Any = (np.zeros((each, 0), np.uint8), np.zeros((each, 0, 3)), np.zeros((each, 0), np.int32), (), 1, 1)
+        known = Paths(first, first, gain, length, -arrival, arrival, *none)
         for ports, truth in (
             (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, array, elements, carrier_hz)[..., 0]),
             (Ports(np.zeros((16, 3)), tones), csi(known, tones)),
