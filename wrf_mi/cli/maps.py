@@ -127,16 +127,14 @@ def _summary(figures: dict[str, Any]) -> str:
         share = f"{held['inside']:.0%} inside their 90 % regions"
         what = f"{held['rows']} predictions of held-out training rows"
         text += f", chosen by {what}: {share}, mean error {held['error_m']:.2f} m"
-    known = {
-        f"area of the {figures['level']:.0%} region (m2)": figures["area_m2"],
-        f"radius of {figures['level']:.0%} (m)": figures["radius_m"],
-        "error (m)": figures.get("error_m"),
-    }
+    level = f"{figures['level']:.0%}"
+    known = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
+    known["error (m)"] = figures.get("error_m")
     if "neighbours" in figures:
         known[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
     text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
-        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {figures['level']:.0%} regions"
+        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
     return text
 
 

@@ -87,20 +87,14 @@ def training_request(a: Arguments) -> RunRequest:
     if model == RAY_TRACING:
         settings = [*_tracing_settings(a), *settings]
     elif any(getattr(a, name) is not None for name in TRACING):
-        raise InputError(
-            f"--paths, --depth, --reflections, --rays, --phase-error and --calibrate belong to --model {RAY_TRACING}"
-        )
+        listed = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate"
+        raise InputError(f"{listed} belong to --model {RAY_TRACING}")
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
     names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
-    return RunRequest(
-        model,
-        settings=settings,
-        antennas=AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
-        split="official" if a.split is None else a.split,
-        seed=a.seed or 0,
-        **{name: getattr(a, name) for name in names},
-    )
+    stated = {name: getattr(a, name) for name in names} | {"split": a.split or "official", "seed": a.seed or 0}
+    antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
+    return RunRequest(model, settings=settings, antennas=antennas, **stated)
 
 
 def _stages(a: Arguments, model: str) -> list[str]:

@@ -96,11 +96,9 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
         gaussians = field.predictor.gaussians(tx_pos_m, log_carrier)
     columns = splat_columns(gaussians)
     where = " ".join(f"{x:.9g}" for x in tx_pos_m[0])
-    comments = [
-        f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up",
-        f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest",
-        "signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)",
-    ]
+    comments = [f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up"]
+    comments.append(f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest")
+    comments.append("signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)")
     # G. Turk, "The PLY polygon file format" (1994)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {one_line(text)}" for text in comments)]
     header += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header", ""]
@@ -121,13 +119,9 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     field = field_of(run)
     form = {key: values for key, values in field.arrays().items() if not key.startswith(PARAM)}
     model = stored_arrays(run.folder / FITTED)
-    arrays: dict[str, Any] = {
-        VERSION: FORMAT,
-        **keyed(PARAM, field.params),
-        **form,
-        **{key: values for key, values in model.items() if key.startswith(FITTED_ARRAYS)},
-        **keyed(SPLIT_ARRAYS, stored_arrays(run.folder / SPLIT)),
-    }
+    arrays: dict[str, Any] = {VERSION: FORMAT, **keyed(PARAM, field.params), **form}
+    arrays |= {key: values for key, values in model.items() if key.startswith(FITTED_ARRAYS)}
+    arrays |= keyed(SPLIT_ARRAYS, stored_arrays(run.folder / SPLIT))
     for name, key in TEXTS.items():
         if (run.folder / name).exists():
             arrays[key] = (run.folder / name).read_text(encoding="utf-8")

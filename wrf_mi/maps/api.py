@@ -154,15 +154,10 @@ def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float
     """Attributes of the whole dataset."""
     config, headings, name = run.config, conditions.headings_rad, run.problem.record.name
     absolute = task.level_kind != "relative"
-    attributes: dict[str, Any] = {
-        "title": f"Radio map of {name} by {config.model}",
-        "source": f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}",
-        "dataset": name,
-        "model": config.model,
-        "task": task.name,
-        "level": task.level_note or task.quantity,
-        "level_is_absolute": int(absolute),
-    }
+    attributes: dict[str, Any] = {"title": f"Radio map of {name} by {config.model}"}
+    attributes["source"] = f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}"
+    attributes |= {"dataset": name, "model": config.model, "task": task.name}
+    attributes |= {"level": task.level_note or task.quantity, "level_is_absolute": int(absolute)}
     if absolute:
         attributes["transmit_power_dbm"] = conditions.transmit_dbm
     if conditions.threshold_db is not None:

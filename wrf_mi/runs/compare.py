@@ -98,11 +98,8 @@ def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
 def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     """Pictures of the runs of a data set; ``slug`` begins the names of their files."""
     task = TASKS[runs[0].task]
-    cdf = figures.score_cdf(
-        {run.name: run.score for run in runs},
-        {name: run.reference_scores[key] for name, (run, key) in references(runs).items()},
-        task.label,
-    )
+    of_references = {name: run.reference_scores[key] for name, (run, key) in references(runs).items()}
+    cdf = figures.score_cdf({run.name: run.score for run in runs}, of_references, task.label)
     samples = _spectra(runs) if task.image else _maps(runs)
     drawn: list[Picture] = [(f"{slug}-cdf.png", f"{task.label} over test rows", cdf), (f"{slug}-samples.png", *samples)]
     better = "higher" if task.higher_is_better else "lower"

@@ -81,11 +81,8 @@ def _section(section: Section) -> str:
     gains = _table(DIFFERENCES, difference_rows(section.differences), frozenset(("rows", "difference", "low", "high")))
     images = "\n".join(_image(path, title) for path, title in section.pictures)
     best = best_run(section.runs).name
-    configs = [known_config(run.path) for run in section.runs]
-    commands = "\n".join(
-        f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path)
-        for run, config in zip(section.runs, configs, strict=True)
-    )
+    configs = [(run, known_config(run.path)) for run in section.runs]
+    lines = [f"# {run.name}: config.yaml is missing" if c is None else command(c, run.path) for run, c in configs]
     rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
     return f"""
 <h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
@@ -103,7 +100,7 @@ narrow.</p>
 {gains}
 {images}
 <h3>Commands</h3>
-<pre>{_text(commands)}</pre>
+<pre>{_text(chr(10).join(lines))}</pre>
 """
 
 
@@ -166,10 +163,8 @@ def _versions(runs: Sequence[Results]) -> str:
 def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
     """Table that sorts by a click on a heading; columns without a value are left out."""
     filled = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
-    head = "".join(
-        f'<th scope="col"{_class(key, numeric)}><button type="button">{_text(title)}</button></th>'
-        for key, title in filled.items()
-    )
+    buttons = {key: f'<button type="button">{_text(title)}</button>' for key, title in filled.items()}
+    head = "".join(f'<th scope="col"{_class(key, numeric)}>{button}</th>' for key, button in buttons.items())
     body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in filled) + "</tr>" for row in rows)
     table = f'<table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>'
     return f'<div class="scroll">{table}</div>'
@@ -209,11 +204,8 @@ def changed_settings(config: RunConfig) -> dict[str, Any]:
     entry = config.entry
     stated = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
     standard = dict(flat(asdict(default_settings(entry, (), stated))))
-    return {
-        name: value
-        for name, value in flat(asdict(config.settings))
-        if value != standard[name] and name not in entry.train_arguments
-    }
+    settings = {name: value for name, value in flat(asdict(config.settings)) if name not in entry.train_arguments}
+    return {name: value for name, value in settings.items() if value != standard[name]}
 
 
 def command(config: RunConfig, folder: Path) -> str:

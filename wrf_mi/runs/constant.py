@@ -59,8 +59,7 @@ def unbeaten(metrics: dict[str, Any]) -> str | None:
     if block is None or block["beaten"]:
         return None
     task = TASKS[metrics["task"]]
-    of_model = metrics[task.block]
-    both = [f"{key} {of_model[key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
+    both = [f"{key} {metrics[task.block][key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
     gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
     what = f"{metrics['model']} is no better than predicting {task.constant_words}"
     return f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores"

@@ -47,17 +47,9 @@ FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"
 SCORES = ("median", "mean", "p10", "p90")
-HEADINGS = {
-    "score": "score",
-    **{key: key for key in SCORES},
-    "reference_median": "reference median",
-    "n_train": "training rows",
-    "n_test": "test rows",
-    "train_seconds": "training, s",
-    "ms_per_sample": "ms per sample",
-    "peak_memory_mb": "peak memory, MB",
-    "status": "status",
-}
+HEADINGS = {key: key for key in ("score", *SCORES)} | {"reference_median": "reference median"}
+HEADINGS |= {"n_train": "training rows", "n_test": "test rows", "train_seconds": "training, s"}
+HEADINGS |= {"ms_per_sample": "ms per sample", "peak_memory_mb": "peak memory, MB", "status": "status"}
 """Headings of the table's columns after the varied settings."""
 
 

@@ -65,22 +65,11 @@ DEFAULT = Walk()
 def walked_channels(
     place: str, folder: str | Path | None = None, walk: Walk = DEFAULT, progress: bool = False
 ) -> Record:
-    """A floor's uplink and downlink channels: read from an earlier call, or traced now and stored.
+    """Uplink and downlink channels of the floor ``flat`` or ``office``; `InputError`: another place.
 
-    The official split is a seeded random split of 80 and 20 %.
-
-    Args:
-        place: ``flat`` or ``office``.
-        folder: folder of the channels in the layout of NeRF2's channels; by default ``traced-csi-<place>/`` below
-            ``WRF_MI_DATA`` if it exists, else in the user's cache.
-        walk: parameters.
-        progress: show a progress bar on standard error.
-
-    Returns:
-        A record with ``task="csi"``: ``observation`` and ``truth`` [1, n, antennas, 26], ``uplink`` [n, antennas, 26].
-
-    Raises:
-        InputError: no such place.
+    They are read or made in a folder in the layout of NeRF2's channels (`wrf_mi.synthetic.stored.stored`). The official
+    split is a seeded random split of 80 and 20 %. The record has ``task="csi"``: ``observation`` and ``truth``
+    [1, n, antennas, 26], ``uplink`` [n, antennas, 26]. ``progress`` shows a bar on standard error.
     """
     if place not in PLACES:
         raise InputError(f"place {place!r}: unknown; give one of {', '.join(PLACES)}")

@@ -74,18 +74,11 @@ DEFAULT = FloorReceivers()
 def traced_floor_strengths(
     folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
 ) -> Record:
-    """Signal strengths on the floor: read from an earlier call, or traced now and stored.
+    """Signal strengths on the floor, read or made in a folder of the BLE layout (`wrf_mi.synthetic.stored.stored`).
 
-    The official split is the first ``train`` rows and the rest; positions are drawn independently.
-
-    Args:
-        folder: folder in the layout of the BLE data; by default that of the data set's name below ``WRF_MI_DATA`` if it
-            exists, else in the user's cache.
-        floor: parameters.
-        progress: show a progress bar on standard error.
-
-    Returns:
-        A record with ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity.
+    The record has ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity. Its official split
+    is the first ``train`` rows and the rest; positions are drawn independently. ``progress`` shows a bar on standard
+    error.
     """
 
     def write(folder: Path, traced: TraceResult, extra: Files) -> None:
@@ -97,10 +90,9 @@ def traced_floor_strengths(
 def traced_floor_channels(
     folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
 ) -> Record:
-    """Channels of single antennas on the floor, without noise: read from an earlier call, or traced now and stored.
+    """Channels of single antennas on the floor, without noise, as `traced_floor_strengths`, of a DeepMIMO scenario.
 
-    Arguments are those of `traced_floor_strengths`, for a folder of a scenario of DeepMIMO. The record has
-    ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
+    The record has ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
     """
 
     def write(folder: Path, traced: TraceResult, extra: Files) -> None:

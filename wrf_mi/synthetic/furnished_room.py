@@ -91,16 +91,11 @@ diffraction of thin boards, through which most of the wave passes."""
 
 
 def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, progress: bool = False) -> Record:
-    """The traced room's spectra: read from an earlier call, or traced now (some minutes by default) and stored.
+    """The traced room's spectra, read or made in some minutes in a folder (`wrf_mi.synthetic.stored.stored`).
 
-    The official split is the first ``train`` rows and the rest; positions are drawn independently. The folder holds the
-    scene of the measured room, `MEASURED`, and a simulated LiDAR scan of the furnished room.
-
-    Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room/`` below ``WRF_MI_DATA`` if it
-            exists, else in the user's cache.
-        room: parameters.
-        progress: show progress bars on standard error.
+    The official split is the first ``train`` rows and the rest; positions are drawn independently. The folder, in the
+    NeRF2 layout, holds the scene of the measured room, `MEASURED`, and a simulated LiDAR scan of the furnished room.
+    ``progress`` shows bars on standard error.
     """
     facts = {"frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
 
@@ -115,20 +110,11 @@ def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, pr
 def traced_room_bands(
     folder: str | Path | None = None, bands: RoomBands = DEFAULT_BANDS, progress: bool = False
 ) -> Record:
-    """Spectra of the furnished room at several carriers: read from an earlier call, or traced now and stored.
+    """Spectra of the furnished room at several carriers, read or made in a folder like that of `traced_room`.
 
-    Rows are ordered by position, then by carrier. The official split holds out the last ``test`` positions with all
-    their rows; positions are drawn independently. The folder holds the measured room and a simulated LiDAR scan, as
-    that of `wrf_mi.synthetic.traced_room`.
-
-    Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room-bands/`` below ``WRF_MI_DATA`` if
-            it exists, else in the user's cache.
-        bands: parameters.
-        progress: show progress bars on standard error.
-
-    Returns:
-        A record with ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1.
+    The record has ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1. Rows are
+    ordered by position, then by carrier. The official split holds out the last ``test`` positions with all their rows;
+    positions are drawn independently.
     """
     poses = {rx.name: [*rx.position_m.tolist(), *rx.orientation_xyzw.tolist()] for rx in RECEIVERS}
 

@@ -35,16 +35,11 @@ def stored(
     write: Callable[[Path, Files], None],
     read: Callable[[Path, str], Record],
 ) -> Record:
-    """The record of a folder, which is made unless it holds data of the same parameters.
+    """The record of a name in a folder, which is made unless it holds data of the same parameters, ``facts``.
 
-    Args:
-        name: name of the record.
-        folder: folder of the data; None: the one of this name below ``WRF_MI_DATA`` if it exists, as it is, else in
-            the user's cache.
-        facts: parameters of the data.
-        write: makes the data, of a folder and the file that states the parameters. It comes last: without it the data
-            are made again.
-        read: reads the data, of a folder and a name.
+    Without a folder it is the one of this name below ``WRF_MI_DATA`` if it exists, as it is, else in the user's cache.
+    ``write`` makes the data, of a folder and the file that states the parameters, which comes last: without it the data
+    are made again. ``read`` reads them, of a folder and a name.
     """
     if folder is None:
         location = locate(name)
