@@ -41,7 +41,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
     if as_json:
         return show(as_json, metrics, "")
-    from ..runs.constant import unbeaten
+    from ..runs.results import unbeaten
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]

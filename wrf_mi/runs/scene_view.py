@@ -57,8 +57,9 @@ def surfaces_of(scene: Any) -> list[Surface]:
 
 def gaussian_cloud(gaussians: Gaussians) -> GaussianCloud:
     """Gaussians for a transmitter, coloured by opacity times magnitude of all signals, in dB."""
-    shapes = (np.array(values, float).T for values in (gaussians.position, gaussians.scale, gaussians.rotation))
+    shapes = gaussians.position, gaussians.scale, gaussians.rotation
+    position, scale, rotation = (np.array(values, float).T for values in shapes)
     strength = np.sqrt(np.square(np.array(gaussians.signal, float)).sum(axis=0))
     if gaussians.opacity is not None:
         strength = strength * np.array(gaussians.opacity, float)
-    return GaussianCloud(*shapes, 20 * np.log10(np.maximum(strength, WEAKEST)))
+    return GaussianCloud(position, scale, rotation, 20 * np.log10(np.maximum(strength, WEAKEST)))
