@@ -178,8 +178,8 @@ def small_plan() -> list[Row]:
     """Rows of the tables that take seconds: a field, which is resumed, and a trace in a scene that is made for it."""
     words = [word for setting in FIELD for word in ("--set", setting)]
     entries = {
-        "wrf-gs+": Entry("WRF-GS+", ("--model", "wrf-gs+", "--deterministic", *words)),
-        "ray-tracing": Entry("ray tracing", ("--model", "ray-tracing", "--scene", NAMED, "--depth", "1")),
+        "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", options=("--deterministic", *words)),
+        "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED, ("--depth", "1")),
     }
     part = Part("rssi", "rssi", FLAT, "official", entries, scene="open")
     return [Row(part, name, 1.0, 0) for name in entries]

@@ -37,7 +37,7 @@ from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder, say
 from .sources import fit_key, modules_of_command, source_digests, source_files
 from .table_pages import read_rows, write_tables
-from .table_plan import CORRECTED, NAMED, PARTS, Part, Row, available, plan
+from .table_plan import CORRECTED, PARTS, Part, Row, available, plan
 
 FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
 QUANTILES = 101  # number of equally spaced quantiles of a row's scores
@@ -99,11 +99,9 @@ def corrected_scene(row: Row, folder: Path) -> Path:
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
     """Figures of a row, from a finished run of the same key or a new one."""
-    scenes, data = list[Path](), _data_digest(row.part.dataset)
-    if CORRECTED in row.entry.arguments:
-        scenes = [corrected_scene(row, runs / "scenes")]
-    elif NAMED in row.entry.arguments:
-        scenes = [scene_of(row.part, runs / "scenes")]
+    scenes, data, place = list[Path](), _data_digest(row.part.dataset), runs / "scenes"
+    if row.entry.scene:
+        scenes = [corrected_scene(row, place) if row.entry.scene == CORRECTED else scene_of(row.part, place)]
     source = source_digests(*modules_of_command(row.command.split()))
     folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scenes])}"
     wall = None
@@ -119,7 +117,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
     run = read_run(folder)
     scores = np.sort(run.score[~np.isnan(run.score)])
     figures = {key: run.metrics[key] for key in KEPT}
-    if CORRECTED in row.entry.arguments:
+    if row.entry.scene == CORRECTED:
         figures["train_seconds"] += json.loads((scenes[0] / CORRECTION).read_text(encoding="utf-8"))["seconds"]
     facts = {"row": row.name, "label": row.entry.label, "share": row.share, "seed": row.seed, "command": row.command}
     facts |= {**provenance(*modules_of_command(row.command.split())), "data": data, "wall_seconds": wall, **figures}
@@ -156,7 +154,7 @@ def tables(
         say(result["row"], f"median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s")
         write_tables(place, quick)
 
-    for part in dict.fromkeys(row.part for row in left if {NAMED, CORRECTED} & set(row.entry.arguments)):
+    for part in dict.fromkeys(row.part for row in left if row.entry.scene):
         # Before workers need them at the same time; failures are reported row by row.
         with suppress(InputError):
             scene_of(part, runs / place.name / "scenes")

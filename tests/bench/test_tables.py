@@ -49,8 +49,7 @@ def test_every_method_of_the_paper_is_planned_for_its_task():
     for task, names in PAPER.items():
         assert names <= {row.method for row in plan() if row.part.task == task and row.share == 1}
     for row in plan():
-        model = row.entry.arguments[row.entry.arguments.index("--model") + 1]
-        assert model in MODELS
+        assert row.entry.model in MODELS
 
 
 def test_names_are_unique_and_whole_tables_come_first():
