@@ -138,7 +138,7 @@ def _gains() -> tuple[Call, Call]:
     return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, next(new))
 
 
-def _paths_alone() -> tuple[Call, Call]:
+def _alone() -> tuple[Call, Call]:
     """Ours trains the paths of spectra by the graph, theirs by Adam on paths, receiver and loss as such: without
     Gaussians a step should cost at most 1.05 times as much.
     """
@@ -193,7 +193,9 @@ PAIRS: list[Pair] = [
     Pair("integrator", "our Mitsuba integrator over `volprim_rf_basic`, geometry new", _integrator),
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
-    Pair("paths-alone", f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths", _paths_alone),
+    Pair(
+        "paths-alone", f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such", _alone
+    ),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
 ]
