@@ -120,18 +120,14 @@ def _number(value: Any) -> Any:
     return value
 
 
-def _plain(value: Any) -> Any:
-    """Values that JSON lacks: arrays as lists, others as text."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
 def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
     """A value of the type ``hint``."""
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
         # JSON has lists in place of tuples and arrays; else nothing is converted.
-        return _adapter(hint).validate_json(json.dumps(value, default=_plain), strict=True)
+        text = json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
+        return _adapter(hint).validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
     text = f"expected {first['type'].split('_')[0]}, got {first['input']!r}"

@@ -6,6 +6,7 @@ import io
 import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -48,17 +49,13 @@ def stored(
         folder = user_cache() / name
     folder = Path(folder)
     recipe = yaml.safe_dump({**facts, "sionna_rt": version("sionna-rt")}, sort_keys=False)
-    if _content(folder / RECIPE) != yaml.safe_load(recipe):
+    content = None
+    with suppress(OSError, ValueError, yaml.YAMLError):  # the data are not there, or written in part
+        content = yaml.safe_load((folder / RECIPE).read_text(encoding="utf-8"))
+    if content != yaml.safe_load(recipe):
         logger.info("tracing %s into %s", name, folder)
         write(folder, {RECIPE: recipe})
     return read(folder, name)
-
-
-def _content(file: Path) -> Any:
-    try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
-        return None  # the data are not there, or written in part
 
 
 def scan_file(xml: Path, seed: int, scanner_m: Sequence[tuple[float, float, float]]) -> Files:
