@@ -283,7 +283,6 @@ NOTE = (
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of results."""
     head = ("what", "SSIM median", "mean", "p10", "p90", "IDW median")
     rows = []
     for result in results:
@@ -302,7 +301,6 @@ def own_table(result: Mapping[str, Any]) -> str:
 
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of checks."""
     pairs = [(result["title"], row) for result in results for row in result["figures"]["rows"]]
     cells = ([f"{title}: {row['what']}", f"**{row['value']}**", row["asked"]] for title, row in pairs)
     return markdown_table(["what", "measured", "asked"], cells)

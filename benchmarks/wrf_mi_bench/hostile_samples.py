@@ -88,7 +88,6 @@ def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "file
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
-    """Read a run folder and predict."""
     return lambda folder: open_run(folder / name).predict([[2.0, 1.0, 1.0]])
 
 

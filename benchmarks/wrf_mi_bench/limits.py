@@ -110,7 +110,6 @@ def room() -> tuple[Any, FloatArray, FloatArray]:
 
 
 def rows() -> Iterator[tuple[str, str]]:
-    """What was tried, and what came out."""
     relative = [level_db(traced(opened(sheet()), [BEFORE], BEHIND)), half_plane_db()]
     relative[0] -= free_space_db(BEHIND[0] - BEFORE[0])
     text = "conducting half plane, vertical antennas 3 m from it and 1.5 m below its edge, relative to free space"

@@ -37,8 +37,6 @@ ROWS = 64
 
 @dataclass(frozen=True)
 class Cell:
-    """A fitted model."""
-
     title: str  # label in the table
     model: str  # name of the model
     n_train: int | None  # number of training rows; None: all
@@ -49,7 +47,6 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name for files and progress."""
         return f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
 
 

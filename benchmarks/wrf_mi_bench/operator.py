@@ -58,13 +58,11 @@ class Direct:
         return self._network(self.params, to_tensor(np.reshape(tx_pos_m, (3, 1))))
 
     def gaussians(self, parts: Any) -> Gaussians:
-        """Gaussians of `parts`."""
         position, scale, rotation, signal, last = (list(part) for part in parts)
         alpha, delta = (None, last) if self._product else (last[0], None)
         return Gaussians(position, scale, rotation, signal, alpha, delta, 1)
 
     def operator(self, gaussians: Gaussians) -> PixelOperator:
-        """Operator of Gaussians from `gaussians`."""
         weights = pixel_weights(gaussians, self.pose, self.plane)
         return PixelOperator(weights, self.plane.height, self.plane.width)
 

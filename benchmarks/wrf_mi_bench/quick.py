@@ -253,7 +253,6 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
 
 
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
-    """Stored ratios."""
     try:
         content = json.loads(file.read_text())
         ratios: dict[str, dict[str, float]] = content["figures"]["ratios"]
@@ -268,7 +267,6 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 
 
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
-    """Markdown table of measured ratios."""
     titles = {known.name: known.title for known in PAIRS}
     lines = []
     for name, pair in ratios.items():

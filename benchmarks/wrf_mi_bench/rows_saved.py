@@ -92,7 +92,6 @@ def saved(scores: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _task(scores: Sequence[Mapping[str, Any]], dataset: str) -> Task:
-    """Task of a data set."""
     return TASKS[next(entry["task"] for entry in scores if entry["dataset"] == dataset)]
 
 

@@ -184,7 +184,6 @@ def verdict(growth: Interval, limit: float) -> str:
 
 
 def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """Rows for the benchmark's table."""
     lines = []
     for result in results:
         slope, sizes = Interval(**result["exponent"]), result["sizes"]

@@ -76,8 +76,6 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that are measured together."""
-
     name: str  # name for files and progress
     figures: tuple[Figure, ...]  # stored figures
     measure: Callable[[Path], Sequence[float]]  # function from the folder of runs to the figures' values
@@ -193,7 +191,6 @@ def main() -> dict[str, Any]:
 
 
 def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
-    """Rows of a group, measured or read."""
     if not group.present:
         return [figure.row(None, ABSENT) for figure in group.figures]
     file = place / f"{group.name}.json"
@@ -220,7 +217,6 @@ def _failure(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of stored and measured figures."""
     lines = []
     for row in rows:
         measured = "" if row["measured"] is None else f"{row['measured']:.4g}"

@@ -85,12 +85,10 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name for files and progress."""
         return f"{self.dataset}-{self.split}-{'all' if self.n_train is None else self.n_train}"
 
     @property
     def title(self) -> str:
-        """Label in the table."""
         return f"{self.dataset}, {self.split}, {'all' if self.n_train is None else self.n_train} rows"
 
 

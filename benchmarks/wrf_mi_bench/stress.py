@@ -139,14 +139,12 @@ RANDOM = "random fields"
 
 
 def images(random: int, of_each: int) -> list[Row]:
-    """Images of random and of ill-conditioned fields."""
     rows = [fields.image_row(f"image, {RANDOM}", {RANDOM: fields.ordinary}, random)]
     rows += [fields.image_row(f"image, {name}", {name: family}, of_each) for name, family in fields.HARD.items()]
     return [*rows, fields.image_row("image, 50,000 layers", {"layers": fields.layers}, 1, fields.SMALL)]
 
 
 def gradients(of_each: int, names: Iterable[str] = (RANDOM, *fields.HARD)) -> list[Row]:
-    """Derivatives of images, worst group of parameters."""
     families = {RANDOM: lambda rng: fields.made(60, rng), **fields.HARD}
     chosen = {name: families[name] for name in names if name != "none"}
     return [fields.gradient_row(f"derivatives, {name}", fields.cases({name: chosen[name]}, of_each)) for name in chosen]

@@ -225,14 +225,12 @@ class _Reference:
         self._model, self._there = model, joint.learned(model)
 
     def report(self, paths: OraclePaths) -> FloatArray:
-        """Flat report."""
         model, ports = self._model, (ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))
         if isinstance(model, CsiReceiver):
             ports = np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz)
         return ORACLE.report(model, paths.at(*ports), self._there)
 
     def error(self, report: FloatArray, paths: OraclePaths) -> float:
-        """Error of a report."""
         waves = np.abs(paths.gain).reshape(len(self._there), -1).sum(axis=1) + np.abs(self._there).max(axis=1)
         return report_error(self._model, report, self.report(paths), waves)
 

@@ -20,7 +20,6 @@ from .table_plan import MADE_HERE, PARTS, SHARES, Part, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
-    """All rows stored in a folder."""
     rows = []
     for path in sorted(place.glob("*-seed*.json")):
         try:
@@ -84,7 +83,6 @@ Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
 
 
 def grouped(part: Part, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> Groups:
-    """Stored rows of a part."""
     groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
     for row in plan(quick):
         if row.part == part and row.name in stored:

@@ -14,8 +14,6 @@ SHARES = (1.0, 0.3, 0.1)
 
 @dataclass(frozen=True)
 class Entry:
-    """A method of a table."""
-
     label: str  # label in the table
     model: str  # name of the model
     scene: str = ""  # `NAMED` or `CORRECTED`; "": none
@@ -165,12 +163,10 @@ class Row:
 
     @property
     def entry(self) -> Entry:
-        """Method."""
         return self.part.entries[self.method]
 
     @property
     def name(self) -> str:
-        """Name of its file."""
         p = self.part
         return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
 

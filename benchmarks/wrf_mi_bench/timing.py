@@ -51,7 +51,6 @@ class Within:
     context: Callable[[], AbstractContextManager[Any]]  # function that returns the context
 
     def __call__(self) -> Any:
-        """Result of the call in its context."""
         with self.context():
             return self.call()
 

@@ -129,7 +129,6 @@ def against_splatted(fields: int = 20, **field: Any) -> list[dict[str, float]]:
 
 
 def worst(differences: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The worst of several `difference`."""
     return {
         "lowest_ssim": min(f["ssim"] for f in differences),
         "largest_magnitude_error": max(f["magnitude_error"] for f in differences),

@@ -200,7 +200,6 @@ def main() -> dict[str, Any]:
 def rows(
     fits: Mapping[str, Mapping[str, Any]], steps: Mapping[str, Mapping[str, Any]], machine: Mapping[str, float]
 ) -> list[dict[str, str]]:
-    """Lines of the table."""
     peak, stream = machine["product_gflop_s"], machine["stream_gb_s"]
     best = f"{peak:.0f} GFLOP/s in a product, {stream:.1f} GB/s read and written"
     lines = [line("the machine's best", best)]

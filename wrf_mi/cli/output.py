@@ -80,9 +80,8 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
 class Watch:
     """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
-    Args:
-        resumable: whether the work asks `stop` and can go on later: the first Ctrl-C then lets the current step finish
-            and writes a checkpoint, and a second one ends at once.
+    The first Ctrl-C lets the current step of ``resumable`` work, which asks `stop` and can go on later, finish and
+    write a checkpoint; a second one ends at once.
     """
 
     def __init__(self, resumable: bool = False) -> None:

@@ -46,21 +46,13 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Inputs:
-    """Known quantities of m rows to predict; never their observations.
+    """Known quantities of m rows to predict; never their observations."""
 
-    Attributes:
-        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
-        tx_heading_rad: headings of the transmitter [m], or None.
-        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
-        first_row: number of the first row, for messages.
-        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
-    """
-
-    tx_pos_m: FloatArray
-    tx_heading_rad: FloatArray | None = None
-    uplink: NDArray[Any] | None = None
-    first_row: int = 0
-    carriers_hz: FloatArray | None = None
+    tx_pos_m: FloatArray  # positions of the transmitter [m, 3], metres; NaN where unknown
+    tx_heading_rad: FloatArray | None = None  # headings of the transmitter [m], or None
+    uplink: NDArray[Any] | None = None  # uplink channel coefficients [m, antennas, subcarriers], complex64, or None
+    first_row: int = 0  # number of the first row, for messages
+    carriers_hz: FloatArray | None = None  # carrier of each row [m], Hz, or None where the data have a single carrier
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -226,13 +218,11 @@ class Record:
         return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
 
     def precision(self, rows: IntArray) -> FloatArray | None:
-        """Inverse variance of the noise of some rows' observations, relative to a typical reading's.
+        """Inverse variance [n_rx, m] of the noise of m rows' observations, relative to a typical reading's.
 
         (median of ``std`` / ``std``)^2 where the data state ``std``, with the median over the observations received in
-        these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance.
-
-        Returns:
-            Shape [n_rx, m] for m rows, 1 where nothing was received; None where the data state neither.
+        these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance. 1 where nothing
+        was received; None where the data state neither.
         """
         if self.std is None:
             return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)
