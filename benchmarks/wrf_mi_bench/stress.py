@@ -98,11 +98,11 @@ def _similarity(contrast: float) -> float:
     errors = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
-        one, other = (
+        first, second = (
             ((1 - contrast) * 0.7 + contrast * rng.uniform(size=fields.SIZE)).astype(np.float32) for _ in range(2)
         )
-        truth = structural_similarity(one.astype(float), other.astype(float), data_range=1)
-        errors.append(abs(float(similarity(to_float(one), to_float(other), 1, *fields.SIZE)[0]) - truth))
+        truth = structural_similarity(first.astype(float), second.astype(float), data_range=1)
+        errors.append(abs(float(similarity(to_float(first), to_float(second), 1, *fields.SIZE)[0]) - truth))
     return float(np.median(errors))
 
 

@@ -61,11 +61,11 @@ CARRIERS = (Held(BANDS, "frequency", None, ("materials",), 5),)
 RECEIVERS = (Held(FLOOR, "receiver", None, None, 4), Held(FLAT, "receiver", 400, None, 6))
 
 
-def corrected(held: Held, scene: str, record: Record, split: Split, folder: Path) -> str:
+def corrected(case: Held, scene: str, record: Record, split: Split, folder: Path) -> str:
     """Scene in ``folder`` that is corrected by a split's training rows, made where needed."""
     if not folder.exists():
         options: CorrectionOptions = default_options(record)
-        options = options if held.parts is None else replace(options, parts=held.parts)
+        options = options if case.parts is None else replace(options, parts=case.parts)
         write_page(correct_scene(scene, record, split, options), folder, False)
     return str(folder)
 
@@ -94,13 +94,13 @@ def _facts(hybrid: Results) -> dict[str, Any]:
     return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:-1]}}
 
 
-def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+def at_carrier(case: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
     """Scores of the methods at a carrier that is held out, by name; ``inside_90`` and ``crps`` of the hybrid."""
-    scene, record = str(scene_of_data(held.dataset, folder.parent)), load_record(held.dataset)
-    split = f"{held.kind}:{fold}"
-    (rows,) = make_splits(record, split, seed, held.n_train)
-    better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
-    fit = partial(_run, folder, held.dataset, split, seed, n_train=held.n_train)
+    scene, record = str(scene_of_data(case.dataset, folder.parent)), load_record(case.dataset)
+    split = f"{case.kind}:{fold}"
+    (rows,) = make_splits(record, split, seed, case.n_train)
+    better = corrected(case, scene, record, rows, folder.parent / f"corrected-{folder.name}")
+    fit = partial(_run, folder, case.dataset, split, seed, n_train=case.n_train)
     hybrid = fit("hybrid", scene=scene)
     scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
     for name, where in ((TRACED, scene), (CORRECTED, better)):
@@ -110,17 +110,17 @@ def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
     return scores | {CARRIER: _scores(hybrid, hybrid.references["carrier"]), **_facts(hybrid)}
 
 
-def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+def at_receivers(case: Held, left: int, fold: int, seed: int, folder: Path) -> dict[str, Any]:
     """Scores of the methods at receivers that are held out but for ``left`` rows each, as `at_carrier`.
 
     The scene is corrected without any of their rows.
     """
-    scene, record = str(scene_of_data(held.dataset, folder.parent)), load_record(held.dataset)
-    (none,) = make_splits(record, f"{held.kind}:{fold}", seed, held.n_train)
-    name = f"corrected-{held.dataset}-{fold}-{seed}"
-    better = corrected(held, scene, record, none, folder.parent / name)
-    split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
-    (rows,) = make_splits(record, split, seed, held.n_train)
+    scene, record = str(scene_of_data(case.dataset, folder.parent)), load_record(case.dataset)
+    (none,) = make_splits(record, f"{case.kind}:{fold}", seed, case.n_train)
+    name = f"corrected-{case.dataset}-{fold}-{seed}"
+    better = corrected(case, scene, record, none, folder.parent / name)
+    split = f"{case.kind}:{fold}" if not left else f"{case.kind}+{left}:{fold}"
+    (rows,) = make_splits(record, split, seed, case.n_train)
     hybrid = _run(folder, record, rows, seed, "hybrid", scene=scene)
     scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
@@ -212,12 +212,12 @@ def carriers() -> dict[str, Any]:
     """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
     place = RUNS / fit_key(source_files())
     parts: Parts = {}
-    for held in CARRIERS:
-        hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
-        for fold in range(held.folds):
-            names = {seed: f"{held.dataset}-{fold}-{seed}" for seed in SEEDS}
-            parts[f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
-                name: partial(at_carrier, held, fold, seed, place / name) for seed, name in names.items()
+    for case in CARRIERS:
+        hz = np.unique(load_record(case.dataset).carriers_hz)  # type: ignore[arg-type]
+        for fold in range(case.folds):
+            names = {seed: f"{case.dataset}-{fold}-{seed}" for seed in SEEDS}
+            parts[f"{case.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
+                name: partial(at_carrier, case, fold, seed, place / name) for seed, name in names.items()
             }
     return _measured("new-carriers", parts)
 
@@ -227,11 +227,11 @@ def receivers() -> dict[str, Any]:
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
     parts: Parts = {}
-    for held in RECEIVERS:
+    for case in RECEIVERS:
         for left in LEFT:
-            names = {(seed, k): f"{held.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(held.folds)}
-            parts[f"{held.dataset}, {left} rows at new receivers"] = {
-                name: partial(at_receivers, held, left, k, seed, place / name) for (seed, k), name in names.items()
+            names = {(seed, k): f"{case.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(case.folds)}
+            parts[f"{case.dataset}, {left} rows at new receivers"] = {
+                name: partial(at_receivers, case, left, k, seed, place / name) for (seed, k), name in names.items()
             }
     return _measured("new-receivers", parts)
 

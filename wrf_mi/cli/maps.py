@@ -116,17 +116,17 @@ def locate_command(a: Arguments) -> int:
 
 
 def _summary(figures: dict[str, Any]) -> str:
-    form, held = figures["likelihood"], figures.get("held_out")
+    form, held_out = figures["likelihood"], figures.get("held_out")
     shape = "normal" if form["degrees"] is None else f"Student-t of {form['degrees']:g} degrees of freedom"
     text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
     text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
     text += ", receivers that received nothing count" if form["silence"] else ""
-    if held is None:
+    if held_out is None:
         text += " (default: the run has too few training rows to hold any out)"
     else:
-        share = f"{held['inside']:.0%} inside their 90 % regions"
-        what = f"{held['rows']} predictions of held-out training rows"
-        text += f", chosen by {what}: {share}, mean error {held['error_m']:.2f} m"
+        share = f"{held_out['inside']:.0%} inside their 90 % regions"
+        what = f"{held_out['rows']} predictions of held-out training rows"
+        text += f", chosen by {what}: {share}, mean error {held_out['error_m']:.2f} m"
     level = f"{figures['level']:.0%}"
     known = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
     known["error (m)"] = figures.get("error_m")
