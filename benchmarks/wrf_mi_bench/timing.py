@@ -115,7 +115,7 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
 def history_of(call: Call) -> tuple[float, list[dict[str, Any]]]:
     """Time of a call in ms, and Dr.Jit's history of its kernels."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        call()  # functions that were recorded without the history are recorded again
+        settle(call())  # functions that were recorded without the history are recorded again
         dr.sync_thread()
         dr.kernel_history_clear()
         total_ms = 1e3 * seconds(call)
