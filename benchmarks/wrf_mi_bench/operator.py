@@ -140,8 +140,10 @@ def main() -> dict[str, Any]:
     raw, processor = interleaved(alone, REPEATS, most_s=120), interleaved(alone, REPEATS, most_s=60, processor=True)
     each = {name: raw[name] / many for name, (_, many) in calls.items()}
     times = {name: bootstrap(ms) for name, ms in each.items()}
-    shares = {name: np.median(processor[name]) / many for name, (_, many) in calls.items()}
-    rows = [line(name, f"{times[name]} ms; processors {ms:.3g} ms") for name, ms in shares.items()]
+    rows = [
+        line(name, f"{times[name]} ms; processors {np.median(processor[name]) / many:.3g} ms")
+        for name, (_, many) in calls.items()
+    ]
     for what, name in (("pixels", "pixels, one transmitter"), (f"pixels, {BATCH}", f"pixels, each of {BATCH}")):
         rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [

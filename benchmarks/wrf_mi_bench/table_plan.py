@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 from wrf_mi.datasets.registry import locate
 
@@ -198,12 +199,11 @@ def plan(quick: bool = False) -> list[Row]:
         return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
     first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
     first.sort(key=lambda row: row.method not in CHEAP)
-    known = [(part, share) for part in PARTS if part.few for share in SHARES[1:]]
-    few = [Row(part, name, share, 0) for part, share in known for name in part.entries if name in FEW]
+    pairs = product(PARTS, SHARES[1:])
+    few = [Row(part, name, share, 0) for part, share in pairs for name in part.entries if part.few and name in FEW]
     few.sort(key=lambda row: row.method not in CHEAP)
-    quickly = [row for row in first if row.method not in row.part.once]
-    again = [replace(row, seed=seed) for row in quickly for seed in row.entry.seeds[1:]]
-    again += [replace(row, seed=seed) for row in few for seed in row.entry.few_seeds[1:]]
+    again = [replace(row, seed=n) for row in first for n in row.entry.seeds[1:] if row.method not in row.part.once]
+    again += [replace(row, seed=n) for row in few for n in row.entry.few_seeds[1:]]
     return [*first, *few, *again]
 
 

@@ -97,11 +97,15 @@ def corrected_scene(row: Row, folder: Path) -> Path:
     return scene
 
 
+def _scenes(row: Row, place: Path) -> list[Path]:
+    if not row.entry.scene:
+        return []
+    return [corrected_scene(row, place) if row.entry.scene == CORRECTED else scene_of(row.part, place)]
+
+
 def measure(runs: Path, row: Row) -> dict[str, Any]:
     """Figures of a row, from a finished run of the same key or a new one."""
-    scenes, data, place = list[Path](), _data_digest(row.part.dataset), runs / "scenes"
-    if row.entry.scene:
-        scenes = [corrected_scene(row, place) if row.entry.scene == CORRECTED else scene_of(row.part, place)]
+    scenes, data = _scenes(row, runs / "scenes"), _data_digest(row.part.dataset)
     source = source_digests(*modules_of_command(row.command.split()))
     folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scenes])}"
     wall = None
@@ -112,7 +116,7 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
         resumes = not row.method.startswith("ray-tracing")
         if folder.exists() and not (resumes and (folder / CONFIG).exists()):
             shutil.rmtree(folder)  # stopped before its configuration was written
-        scene = [str(word) for place in scenes for word in ("--scene", place)]
+        scene = ["--scene", str(scenes[0])] if scenes else []
         wall = run_command(row.arguments(scene), folder, resumes=resumes)
     run = read_run(folder)
     scores = np.sort(run.score[~np.isnan(run.score)])

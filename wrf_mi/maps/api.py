@@ -238,8 +238,8 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
         if (limit := conditions.threshold_db) is not None:
             variables["coverage_probability"] = coverage_probability(variables["power_dbm"], std_db, limit)
     if parts.traced is not None and parts.learned is not None:
-        sides = (task.level(Prediction(side)).mean for side in (parts.traced, parts.learned))
-        traced, learned = (of_headings(side).mean(axis=1) + added for side in sides)
+        sides = parts.traced, parts.learned
+        traced, learned = (of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added for side in sides)
         variables |= {"traced_share": traced, "learned_share": learned, "share_difference_db": traced - learned}
     if parts.paths is not None:
         names = [field.name for field in fields(PathStatistics)]

@@ -69,9 +69,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     columns = min(COLUMNS, len(panels))
     width = PANEL_IN * columns + 1
     heading = _heading(dataset, measured, int(width * LETTERS_PER_INCH))
-    x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
-    aspect = np.clip(y_m / x_m, 0.3, 1.6) if flat else 0.9
-    height = PANEL_IN * float(aspect) * lines + 0.7 + LINE_IN * heading.count("\n")
+    height = PANEL_IN * _aspect(dataset) * lines + 0.7 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
@@ -122,6 +120,11 @@ def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
     if len(measured):
         ends.append(np.percentile(measured, [MEASURED_TAIL, 100 - MEASURED_TAIL]))
     return float(np.min(ends)), float(np.max(ends))
+
+
+def _aspect(dataset: xarray.Dataset) -> float:
+    x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
+    return 0.9 if "point" in dataset.sizes else float(np.clip(y_m / x_m, 0.3, 1.6))
 
 
 def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,8 +77,7 @@ def scene_content(
         drawn[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
         note = f"Mesh: the largest {most} of {len(corners)} triangles."
     # Names of radio materials without the prefix of ITU-R P.2040's.
-    plain = [materials[surface.name].removeprefix("itu_").removeprefix("itu-") for surface in surfaces]
-    labels = np.array([name.replace("_", " ") for name in plain])
+    labels = np.array([re.sub("^itu[_-]", "", materials[surface.name]).replace("_", " ") for surface in surfaces])
     meshes = []
     for label in sorted(set(labels)):
         for above in (False, True):
@@ -178,8 +178,8 @@ def gaussians_content(
         clouds.append(gaussian_cloud(fitted.predictor.gaussians(position[None])))
     strength = np.stack([cloud.strength_db for cloud in clouds])
     order = np.argsort(-np.mean(10 ** (strength / 10), axis=0), kind="stable")[: options.gaussians]
-    shapes = ([getattr(cloud, name)[order] for cloud in clouds] for name in ("scale_m", "rotation_xyzw"))
-    scale, rotation = (np.stack(shape) for shape in shapes)
+    names = "scale_m", "rotation_xyzw"
+    scale, rotation = (np.stack([getattr(cloud, name)[order] for cloud in clouds]) for name in names)
     if (scale == scale[:1]).all() and (rotation == rotation[:1]).all():
         scale, rotation = scale[:1], rotation[:1]
     log_scale, total, notes = np.log(np.maximum(scale, SMALLEST_M)), strength.shape[1], []

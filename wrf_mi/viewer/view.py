@@ -72,7 +72,7 @@ class _Gathered:
     progress: bool
     content: ViewContent = field(default_factory=lambda: ViewContent(""))
     titles: list[str] = field(default_factory=list)
-    scene: tuple[Any, dict[str, str]] | None = None
+    scenes: list[tuple[Any, dict[str, str]]] = field(default_factory=list)  # the first is shown
     material_used: bool = False
 
     def add(self, source: Source) -> None:
@@ -83,7 +83,7 @@ class _Gathered:
             self._add_map(source)
         elif hasattr(source, "mi_scene"):
             self.titles.append("scene")
-            self.scene = self.scene or layers.surfaces_in(source)
+            self.scenes.append(layers.surfaces_in(source))
         elif not Path(source).exists() and str(source) not in scenes():
             known = ", ".join(scenes())
             raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {known})")
@@ -94,8 +94,8 @@ class _Gathered:
         else:
             self.on_stage("opening the scene", 0.0)
             self.titles.append(Path(source).name)
-            opened, self.material_used = layers.read_scene(source, self.material), True
-            self.scene = self.scene or opened
+            self.scenes.append(layers.read_scene(source, self.material))
+            self.material_used = True
 
     def _add_map(self, source: Any) -> None:
         content, notes = read_map(source)
@@ -117,7 +117,7 @@ class _Gathered:
         if run.config.scene is not None:
             self.on_stage("opening the scene", 0.0)
             scene = layers.run_scene(run, scene_carrier(record))
-            self.scene = self.scene or layers.surfaces_in(scene)
+            self.scenes.append(layers.surfaces_in(scene))
         if content.rows is None:
             return
         stored = content.rows.stored
@@ -183,8 +183,8 @@ def view(
     if material is not None and not gathered.material_used:
         raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
     content = gathered.content
-    if gathered.scene is not None:
-        content.scene, note = layers.scene_content(*gathered.scene)
+    if gathered.scenes:
+        content.scene, note = layers.scene_content(*gathered.scenes[0])
         content.notes += [note] if note else []
     content.maps, notes = thinned(content.maps)
     content.notes += notes
