@@ -3,8 +3,6 @@
 A case is a run of ``wrf-mi`` with a run folder; a check is a function that compares a part with a reference.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -26,8 +24,7 @@ from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
 from wrf_mi.runs.sweep import dataset_files, markdown_table
 
-from .fit_key import fit_key
-from .sources import SOURCE, modules_of_benchmark, modules_of_command, source_digests
+from .sources import SOURCE, fit_key, modules_of_benchmark, modules_of_command, source_digests
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
 """Public data sets; all others are made on this machine."""
@@ -89,20 +86,21 @@ def _here(title: str, function: str, *data: str, quick: str = "", table: str = "
 CASES: Mapping[str, Case] = {
     "wrf-gs+-paper": Case(
         "WRF-GS+, L = 9 as the paper",
-        ("train", RFID, "--model", "wrf-gs+", "--preset", "paper", "--set", "steps=15000"),
+        ("train", RFID, *("--model", "wrf-gs+", "--preset", "paper"), "--set", "steps=15000"),
     ),
     "demo": Case("the demo (WRF-GS+, short)", ("demo",), (RFID, FLAT)),
 }
 """Runs that are not rows of the tables (`wrf_mi_bench.table_plan`)."""
 
+_STORED: Any = {"resumes": True}  # of checks that keep their parts
 _OWN: Mapping[str, Check] = {
     "traced-and-splatted": _here("Mitsuba integrator", "traced:main"),
     "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
-    "flat-plan": _here("mesh of a flat", "plan:flat_plan", FLAT),
+    "flat-plan": _here("mesh of a flat", "scene:flat_plan", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
-    "pareto": _here("run time against error", "pareto:main", resumes=True),
+    "pareto": _here("run time against error", "table_pages:pareto", resumes=True),
     "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main"),
     "training": _here("training", "training:main", RFID),
@@ -111,31 +109,22 @@ _OWN: Mapping[str, Check] = {
         "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
     ),
     "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
-    "new-carriers": _here(
-        "carriers without measurements", "unmeasured:carriers", resumes=True, table="unmeasured:table"
-    ),
+    "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(
         "receivers without measurements, and with few",
         "unmeasured:receivers",
         FLAT,
-        resumes=True,
         table="unmeasured:table",
+        **_STORED,
     ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
-    "phase-error": _here("spectra from scans", "phase_error:main", resumes=True, table="phase_error:table"),
+    "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "sentinels": _here(
-        "figures kept",
-        "sentinels:main",
-        RFID,
-        FLAT,
-        CONFERENCE,
-        OFFICE,
-        resumes=True,
-        table="sentinels:table",
+        "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"
     ),
 }
 _CHECKS = Registry[Check]("benchmark", ENTRY_POINTS, _OWN)
@@ -268,20 +257,11 @@ def provenance(*modules: str) -> dict[str, Any]:
     ``modules`` made the result; what they import counts too.
     """
     count, known = worker_threads(), versions()
-    machine = {
-        "processor": known["device"],
-        "cores": os.cpu_count(),
-        "memory_gb": round(psutil.virtual_memory().total / 1e9),
-        "system": f"{platform.system()} {platform.machine()}",
-    }
-    threads = {} if count is None else {"worker_threads": count}
-    return {
-        "date": time.strftime("%Y-%m-%d"),
-        "machine": machine,
-        "versions": known,
-        SOURCE: source_digests(*modules),
-        **threads,
-    }
+    machine = {"processor": known["device"], "cores": os.cpu_count()}
+    machine["memory_gb"] = round(psutil.virtual_memory().total / 1e9)
+    machine["system"] = f"{platform.system()} {platform.machine()}"
+    facts = {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": known}
+    return facts | {SOURCE: source_digests(*modules)} | ({} if count is None else {"worker_threads": count})
 
 
 def read_results(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -303,7 +283,6 @@ NOTE = (
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of results."""
     head = ("what", "SSIM median", "mean", "p10", "p90", "IDW median")
     rows = []
     for result in results:
@@ -322,7 +301,6 @@ def own_table(result: Mapping[str, Any]) -> str:
 
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of checks."""
     pairs = [(result["title"], row) for result in results for row in result["figures"]["rows"]]
     cells = ([f"{title}: {row['what']}", f"**{row['value']}**", row["asked"]] for title, row in pairs)
     return markdown_table(["what", "measured", "asked"], cells)

@@ -1,7 +1,5 @@
 """A check in a subprocess: ``python -m wrf_mi_bench.check MODULE:FUNCTION FILE``."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

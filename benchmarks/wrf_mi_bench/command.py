@@ -1,7 +1,5 @@
 """Command ``wrf-mi bench``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -72,14 +70,8 @@ def _check(a: argparse.Namespace) -> None:
         (a.backend and not quick, "--backend: belongs to --quick; other cases use the one that `wrf-mi doctor` shows"),
         (a.store and not quick, "--store: belongs to --quick without names; cases and tables are stored in any case"),
         (quick and a.scheduler, "--quick: its pairs are interleaved in one process; omit --scheduler"),
-        (
-            a.store and quick and a.names,
-            f"--store: a quick {' '.join(a.names)} is not stored; omit --store, or --quick",
-        ),
-        (
-            a.stale and others,
-            "--stale: lists all results and measures none; omit names, --quick, --store and --scheduler",
-        ),
+        (a.store and quick and a.names, f"--store: a quick {' '.join(a.names)} is not stored; omit it, or --quick"),
+        (a.stale and others, "--stale: lists results and measures none; omit names, --quick, --store and --scheduler"),
     ):
         if refused:
             raise InputError(message)

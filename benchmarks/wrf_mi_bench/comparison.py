@@ -1,9 +1,8 @@
 """Rows of the benchmarks' tables, and data that they need."""
 
-from __future__ import annotations
-
 import json
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -23,6 +22,11 @@ MEASURED = "measured"  # machine, versions and date of a stored part
 def line(what: str, value: str, asked: str = "") -> Row:
     """Row of a check's table."""
     return {"what": what, "value": value, "asked": asked}
+
+
+def say(name: str, text: str) -> None:
+    """Print a line of progress of a benchmark on standard error."""
+    print(f"{name}: {text}", file=sys.stderr, flush=True)
 
 
 def kept(file: Path, measure: Callable[[], Any]) -> Any:
@@ -47,9 +51,8 @@ def stored_part(benchmark: str, name: str, measure: Callable[[], dict[str, Any]]
     Parts are stored when they are done, with machine, versions and date, so that a measurement of many hours goes on,
     on another machine too. A part is measured again where its file is deleted.
     """
-    return dict(
-        kept(STORED / benchmark / f"{name}.json", lambda: {MEASURED: provenance(*modules_of(benchmark)), **measure()})
-    )
+    file = STORED / benchmark / f"{name}.json"
+    return dict(kept(file, lambda: {MEASURED: provenance(*modules_of(benchmark)), **measure()}))
 
 
 def measured_on(parts: Iterable[Mapping[str, Any]]) -> str:

@@ -5,8 +5,6 @@ the LLVM and NumPy of this process. LLVM libraries are those that `wrf_mi.backen
 versions of NumPy are folders in the environment variable `NUMPY_FOLDERS`, made by ``pip install --target``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -109,7 +107,12 @@ def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any
         if first is None:
             first = arrays, f"1 thread, LLVM {versions['llvm']}, NumPy {versions['numpy']}"
             continue
-        name = _name(variant, versions)
+        name = {
+            "threads": f"{variant.threads} threads",
+            "llvm": f"LLVM {versions['llvm']}",
+            "numpy": f"NumPy {versions['numpy']}",
+            "cuda": f"CUDA, {versions['device']}",
+        }[variant.kind]
         for quantity, value in differences(first[0], arrays).items():
             bound = 0.0 if variant.kind == "threads" and quantity in EXACT else BOUNDS[quantity]
             asked = f"at most {bound:g}" if bound else "bit-identical"
@@ -117,17 +120,7 @@ def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any
             row |= {"variant": name, "compared_with": first[1], "quantity": quantity}
             rows.append({**row, "difference": value, "bound": bound})
     above = [row["what"] for row in rows if not row["difference"] <= row["bound"]]
-    failed = {"failed": f"beyond its bound: {'; '.join(above)}"} if above else {}
-    return {"rows": rows, **failed}
-
-
-def _name(variant: Variant, versions: Mapping[str, str]) -> str:
-    return {
-        "threads": f"{variant.threads} threads",
-        "llvm": f"LLVM {versions['llvm']}",
-        "numpy": f"NumPy {versions['numpy']}",
-        "cuda": f"CUDA, {versions['device']}",
-    }[variant.kind]
+    return {"rows": rows} | ({"failed": f"beyond its bound: {'; '.join(above)}"} if above else {})
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -1,7 +1,5 @@
 """One variant of `wrf_mi_bench.elsewhere`: ``python -m wrf_mi_bench.elsewhere_job FILE BACKEND THREADS SMALL``."""
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -3,8 +3,6 @@
 Each measurement returns lines of a table (`wrf_mi_bench.comparison.line`) and what is wrong.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import subprocess
@@ -143,7 +141,7 @@ def main(folder: str, out: str) -> None:
 
     place, lost, errors = Path(folder), list[int](), StringIO()
     prepare_data(place)
-    tables = Tables(place)
+    tables = Tables("tables", place)
     tables.prepare(children=False)  # but in workers, which import the module themselves
     wrong, content = list[str](), list[dict[str, Any]]()
     for name, scheduler in (("whole", []), ("lost", ["--scheduler", "local:2"])):

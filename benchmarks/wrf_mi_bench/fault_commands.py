@@ -1,7 +1,5 @@
 """Commands on small data that are tried under faults: trainings, the correction of a scene, and the tables."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -44,12 +42,14 @@ STRENGTHS, SIDES_M = 24, (-1.0, 5.0)  # number of signal strengths, and extent o
 
 
 class Command(ABC):
-    """A command of ``wrf-mi`` with its results below a folder."""
+    """A command of ``wrf-mi`` by its name in reports, on the data of a folder, with its results below another."""
 
-    name: str  # name in reports
     file_bytes: Sequence[int] = (250, 400, 1500, 6000)  # limits of the size of files, in place of a full disk
     refused: Sequence[int] = (2,)  # exit statuses where results cannot be written
     locked: Sequence[str] = ()  # folders that one process at a time writes into
+
+    def __init__(self, name: str, data: Path) -> None:
+        self.name, self._data = name, data
 
     def prepare(self, children: bool) -> None:
         """Prepare this process, in which the command is called.
@@ -84,9 +84,6 @@ class Training(Command):
 
     locked = ("run",)
 
-    def __init__(self, name: str, data: Path) -> None:
-        self.name, self._data = name, data
-
     def call(self, place: Path) -> list[str]:
         out = place / "run"
         if (out / CONFIG).exists():
@@ -115,11 +112,6 @@ def _file_content(folder: Path) -> dict[str, Any]:
 class Correction(Command):
     """``wrf-mi correct``, which is called again unless the scene is there."""
 
-    name = "correct"
-
-    def __init__(self, data: Path) -> None:
-        self._data = data
-
     def prepare(self, children: bool) -> None:
         """Compute on one thread: sums of several depend on their order."""
         from wrf_mi.backend import init
@@ -127,12 +119,9 @@ class Correction(Command):
         init("llvm", threads=1)
 
     def call(self, place: Path) -> list[str] | None:
-        out = place / "scene"
-        if out.exists():
-            return None
-        scene, data = (str(self._data / name) for name in (ROOM, f"{HOME}/{FLAT}"))
+        out, scene, data = (str(path) for path in (place / "scene", self._data / ROOM, self._data / HOME / FLAT))
         options = ["--depth", "1", "--rays", "256", "--fit", "gain"]
-        return ["correct", scene, data, "--out", str(out), *options]
+        return None if Path(out).exists() else ["correct", scene, data, "--out", out, *options]
 
     def content(self, place: Path) -> dict[str, Any]:
         """All files of the scene folder, without the duration on its page."""
@@ -147,11 +136,7 @@ class Correction(Command):
 class Tables(Command):
     """``wrf-mi bench tables`` of a small plan, which is called again."""
 
-    name = "tables"
     refused = (1, 2)  # 1: rows failed, the others and the page are written
-
-    def __init__(self, data: Path) -> None:
-        self._data = data
 
     def prepare(self, children: bool) -> None:
         """Plan a row that is resumed and one that is not, whose scene is made."""
@@ -193,8 +178,8 @@ def small_plan() -> list[Row]:
     """Rows of the tables that take seconds: a field, which is resumed, and a trace in a scene that is made for it."""
     words = [word for setting in FIELD for word in ("--set", setting)]
     entries = {
-        "wrf-gs+": Entry("WRF-GS+", ("--model", "wrf-gs+", "--deterministic", *words)),
-        "ray-tracing": Entry("ray tracing", ("--model", "ray-tracing", "--scene", NAMED, "--depth", "1")),
+        "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", options=("--deterministic", *words)),
+        "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED, ("--depth", "1")),
     }
     part = Part("rssi", "rssi", FLAT, "official", entries, scene="open")
     return [Row(part, name, 1.0, 0) for name in entries]
@@ -202,8 +187,8 @@ def small_plan() -> list[Row]:
 
 COMMANDS: Mapping[str, Callable[[Path], Command]] = {
     **{name: partial(Training, name) for name in SETTINGS},
-    "correct": Correction,
-    "tables": Tables,
+    "correct": partial(Correction, "correct"),
+    "tables": partial(Tables, "tables"),
 }
 """Commands by name, each of a folder of `prepare_data`."""
 
@@ -216,9 +201,6 @@ def prepare_data(folder: Path) -> None:
         return
     prepare_spectra(folder / SPECTRA)
     prepare_strengths(folder / HOME / FLAT, STRENGTHS)
-    sides = {
-        f"side{axis}{end}": ("itu_concrete", sheet(axis, SIDES_M[end], SIDES_M, SIDES_M))
-        for axis in range(3)
-        for end in range(2)
-    }
+    ends = [(axis, end) for axis in range(3) for end in range(2)]
+    sides = {f"side{k}{end}": ("itu_concrete", sheet(k, SIDES_M[end], SIDES_M, SIDES_M)) for k, end in ends}
     write_scene(folder / ROOM, sides, "A closed room")

@@ -6,8 +6,6 @@ Each command (`wrf_mi_bench.fault_commands`) is a fork of one process that has i
 one without faults, bit for bit, with no other file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import json
@@ -40,8 +38,7 @@ EVENTS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 CAPABILITIES_VERSION, DAC_OVERRIDE = 0x20080522, 1
 """Version 3 of Linux's capabilities, and the one by which root writes where permissions forbid it (capabilities(7))."""
 
-Signals = Sequence[tuple[float, int]]
-"""Signals to a process: seconds after its start, and number."""
+Signals = Sequence[tuple[float, int]]  # signals to a process: seconds after its start, and number
 
 
 def watch_changes(folder: Path, at: int = 0, number: int = signal.SIGKILL, times: int = 1) -> list[str]:
@@ -126,11 +123,7 @@ class Trial:
         shutil.rmtree(folder / "again")
 
     def run(
-        self,
-        place: Path,
-        before: Callable[[], Any] = lambda: None,
-        signals: Signals = (),
-        children: bool = False,
+        self, place: Path, before: Callable[[], Any] = lambda: None, signals: Signals = (), children: bool = False
     ) -> int:
         """Status of the command with its results in a folder, where it goes on if it was begun.
 

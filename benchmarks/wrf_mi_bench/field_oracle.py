@@ -9,8 +9,6 @@ One loop over the Gaussians, no tiles, no culling. It fixes choices that the WRF
 * equal depths are ordered by the centre's world coordinates, not by storage order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,14 +71,8 @@ def project(mean_m: ArrayLike, scale_m: ArrayLike, quaternion_xyzw: ArrayLike, r
     sigma = to_world.T @ covariance_matrix(scale_m, quaternion_xyzw) @ to_world
     in_plane = basis @ sigma @ np.swapaxes(basis, -1, -2) / np.where(near, 1.0, depth)[:, None, None] ** 2
     by_depth = np.lexsort((mean[:, 2], mean[:, 1], mean[:, 0], depth))
-    return Projection(
-        centre_m=centre,
-        depth_m=depth,
-        direction=direction,
-        basis=basis,
-        covariance=in_plane + LOW_PASS_RAD**2 * np.eye(2),
-        order=by_depth[~near[by_depth]],
-    )
+    covariance = in_plane + LOW_PASS_RAD**2 * np.eye(2)
+    return Projection(centre, depth, direction, basis, covariance, order=by_depth[~near[by_depth]])
 
 
 def reach(projection: Projection, index: int, directions: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -3,8 +3,6 @@
 `wrf_mi_bench.gpu_job` measures each in a process of its own.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """Times of one backend for `wrf_mi_bench.gpu`: ``python -m wrf_mi_bench.gpu_job FILE BACKEND``."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys
@@ -56,12 +54,7 @@ def step(model: str, gaussians: int) -> Any:
     from .workloads import record, size_deg
 
     spectra = record(ROWS)
-    options = (
-        *QUIET,
-        f"initial.gaussians={gaussians}",
-        f"initial.size_deg={size_deg(gaussians):.3g}",
-        "steps=1000000",
-    )
+    options = (*QUIET, f"initial.gaussians={gaussians}", f"initial.size_deg={size_deg(gaussians):.3g}", "steps=1000000")
     of = Trainer(spectra, make_splits(spectra, "random")[0], with_settings(TrainConfig(model=model), options))
     return some_steps(of, 1)
 

@@ -4,8 +4,6 @@ The readers run in a child process (``python -m wrf_mi_bench.hostile_files FOLDE
 or hang without harm; it goes on with the next input. Inputs follow from their number: each can be made again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -24,6 +22,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
+
+import psutil
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import append_line, one_line, write_atomically
@@ -64,9 +64,8 @@ def mutated(content: bytes, number: int, name: str) -> bytes:
                 data[at:at] = data[at : at + size] * rng.choice((1, 2, 50))
             case 5:
                 wide = rng.choice((4, 8))
-                data[at : at + wide] = (rng.choice(NUMBERS) % (1 << 8 * wide)).to_bytes(
-                    wide, rng.choice(("little", "big"))
-                )
+                number_of_file = rng.choice(NUMBERS) % (1 << 8 * wide)
+                data[at : at + wide] = number_of_file.to_bytes(wide, rng.choice(("little", "big")))
             case 6 | 7 if words := list(WORD.finditer(bytes(data[at : at + 4096]))):
                 word = rng.choice(words)
                 data[at + word.start() : at + word.end()] = rng.choice(TEXTS)
@@ -145,13 +144,6 @@ def _watched(child: subprocess.Popen[bytes], state: Path) -> str | None:
     return None if child.returncode == 0 else f"the process ended with status {child.returncode}"
 
 
-def _limit_memory() -> None:
-    import psutil
-
-    most = psutil.Process().memory_info().vms + MEMORY_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-
-
 def forked_module(
     module: str, arguments: Sequence[str], quiet: bool | None = None, most_s: float | None = None
 ) -> tuple[int, str]:
@@ -201,7 +193,8 @@ def main(folder: str, names: str, first: str, count: str) -> None:
     logging.disable(logging.CRITICAL)
     place = Path(folder)
     warm()
-    _limit_memory()
+    most = psutil.Process().memory_info().vms + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
     for user in ("wrf_mi.scene.scan.points", "wrf_mi.datasets.deepmimo", "wrf_mi.viewer.map_layer"):
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)

@@ -1,12 +1,11 @@
 """Small valid files of every format that is read, and their readers, for `wrf_mi_bench.hostile_files`."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from PIL import Image
 
 from wrf_mi.core import Paths, Receiver, Record
 from wrf_mi.core.array_files import write_arrays
+from wrf_mi.core.files import write_atomically
 from wrf_mi.core.paths import load_paths, save_paths
 from wrf_mi.core.types import Split
 from wrf_mi.datasets import load, load_split, save_split, write_ble_folder, write_spectrum_folder
@@ -27,7 +27,7 @@ from wrf_mi.datasets.deepmimo import read_deepmimo
 from wrf_mi.datasets.nerf2_csi import write_nerf2_csi
 from wrf_mi.datasets.newrf import read_newrf, read_pickled_table
 from wrf_mi.exports import export
-from wrf_mi.exports.field_file import import_field
+from wrf_mi.exports.fields import import_field
 from wrf_mi.exports.format import ExportOptions
 from wrf_mi.exports.paths_table import read_paths
 from wrf_mi.maps.api import radio_map
@@ -74,9 +74,8 @@ class Reader:
 
 def _whole(kind: str, *files: str) -> dict[str, Reader]:
     """Files of a data set, which is read as a whole."""
-    return {
-        f"{kind}: {Path(file).name}": Reader(kind, file, lambda folder: check_parts(load(folder))) for file in files
-    }
+    readers = (Reader(kind, file, lambda folder: check_parts(load(folder))) for file in files)
+    return {f"{kind}: {Path(reader.file).name}": reader for reader in readers}
 
 
 def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "files") -> dict[str, Reader]:
@@ -89,7 +88,6 @@ def _each(kind: str, reader: Callable[..., Any], *files: str, group: str = "file
 
 
 def _predicted(name: str) -> Callable[[Path], Any]:
-    """Read a run folder and predict."""
     return lambda folder: open_run(folder / name).predict([[2.0, 1.0, 1.0]])
 
 
@@ -202,20 +200,18 @@ def prepare(folder: Path) -> None:
     hz = CARRIER_HZ + 1e6 * np.arange(4)
     station = {**common, "frequencies_hz": hz, "uplink": channels[0], "uplink_hz": hz - 1e8}
     write_nerf2_csi(folder / "nerf2-csi", Record("csi", "csi", observation=channels, **station))
-    _write_nerf2_ble(folder / "nerf2-ble", positions, rng)
+    poses, powers = {"gateway1": [0.0, 0, 1], "gateway2": [3.0, 0, 1]}, rng.uniform(-90, -40, (len(positions), 2))
+    write_atomically(folder / "nerf2-ble" / "gateway_position.yml", yaml.safe_dump(poses))
+    for name, header, table in (("tx_pos", "x,y,z", positions), ("gateway_rssi", ",".join(poses), powers)):
+        np.savetxt(folder / "nerf2-ble" / f"{name}.csv", table, delimiter=",", header=header, comments="")
     _write_deepmimo(folder / "deepmimo", rng)
-    _write_scene(folder / "scene")
+    corners, faces = np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    above = Surface("ceiling", "ceiling", corners + np.array([0.0, 0, 3]), faces)
+    surfaces = [Surface("floor", "floor", corners, faces), above]
+    write_scene(folder / "scene", surfaces, frame="z upwards", source="made here")
     _write_files(folder / "files", positions, rng)
     _write_runs(folder)
     (folder / "done").touch()
-
-
-def _write_nerf2_ble(folder: Path, positions: Any, rng: np.random.Generator) -> None:
-    folder.mkdir(parents=True)
-    (folder / "gateway_position.yml").write_text(yaml.safe_dump({"gateway1": [0.0, 0, 1], "gateway2": [3.0, 0, 1]}))
-    np.savetxt(folder / "tx_pos.csv", positions, delimiter=",", header="x,y,z", comments="")
-    powers = rng.uniform(-90, -40, (len(positions), 2))
-    np.savetxt(folder / "gateway_rssi.csv", powers, delimiter=",", header="gateway1,gateway2", comments="")
 
 
 def _write_deepmimo(folder: Path, rng: np.random.Generator) -> None:
@@ -230,14 +226,6 @@ def _write_deepmimo(folder: Path, rng: np.random.Generator) -> None:
     matrices |= {"rx_pos": rng.uniform(-9, 9, (6, 3)), "tx_pos": np.array([[0.0, 0, 9]])}
     for name, values in matrices.items():
         savemat(folder / f"{name}_t000_tx000_r001.mat", {name: values.astype(np.float32)})
-
-
-def _write_scene(folder: Path) -> None:
-    corners = np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    above = corners + np.array([0.0, 0, 3])
-    surfaces = [Surface("floor", "floor", corners, faces), Surface("ceiling", "ceiling", above, faces)]
-    write_scene(folder, surfaces, frame="z upwards", source="made here")
 
 
 def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None:
@@ -271,14 +259,10 @@ def _write_files(folder: Path, positions: Any, rng: np.random.Generator) -> None
         samples = rng.integers(-99, 99, (4, 2, 448, 2), dtype=np.int16)
         stored.create_dataset("Pilot_Samples", data=samples, compression="gzip")
         stored.attrs.update({"num_mob_ant": 2, "samples_per_user": 224, "measured_noise": 0})
-    numbers: Any = np.arange(2.0)
-    ones: Any = np.ones((2, 3)) / np.sqrt(3)
-    kinds, nowhere = np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3))
-    rows = np.arange(2)
-    paths = Paths(
-        rows, rows * 0, numbers + 1j, numbers + 1.0, ones, ones, kinds, nowhere, np.zeros((2, 0), np.int32), (), 2, 1
-    )
-    save_paths(folder / "paths.npz", paths)
+    rows, ones = np.arange(2), np.ones((2, 3)) / np.sqrt(3)
+    bounces = np.zeros((2, 0), np.uint8), np.zeros((2, 0, 3)), np.zeros((2, 0), np.int32)
+    arrays: Any = (rows, rows * 0, rows + 1j, rows + 1.0, ones, ones, *bounces, (), 2, 1)
+    save_paths(folder / "paths.npz", Paths(*arrays))
     (folder / "heard.csv").write_text("x,y,rssi_one,other_dbm\n1,2,-60.5,-71\n2,2,,-70\n")
     save_split(folder / "split.npz", Split("own", 0, np.arange(6), np.arange(6, 8), np.arange(8, 12)))
     np.savetxt(folder / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")
@@ -301,10 +285,6 @@ def _write_runs(folder: Path) -> None:
     run = train(folder / "spectra", folder / "runs" / "field", "wrf-gs+", settings=settings).folder
     export(run, "field", folder / "runs" / "field.npz")
     open_run(run).predict([[2.0, 1.0, 1.0]])  # builds the operator
-    asked = iter(range(1, 5))
-    try:
-        train(
-            folder / "spectra", folder / "runs" / "stopped", "wrf-gs+", settings=settings, stop=lambda: next(asked) >= 3
-        )
-    except Interrupted:
-        return
+    asked, stopped = iter(range(1, 5)), folder / "runs" / "stopped"
+    with suppress(Interrupted):
+        train(folder / "spectra", stopped, "wrf-gs+", settings=settings, stop=lambda: next(asked) >= 3)

@@ -5,10 +5,7 @@ likelihood and k are chosen by training rows held out in space (`wrf_mi.maps.loc
 run share their errors, so that intervals resample stretches of the run.
 """
 
-from __future__ import annotations
-
 import shutil
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -17,9 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.core.types import IntArray
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_file import test_observations
 from wrf_mi.maps.locate_likelihood import COUNTS, METRICS, Neighbours
@@ -30,10 +25,9 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
-from .comparison import data_folder, kept, line
-from .fit_key import fit_key, source_files
-from .table_plan import PARTS
-from .tables import scene_of
+from .comparison import data_folder, kept, line, say
+from .sources import fit_key, source_files
+from .tables import scene_of_data
 
 RUNS = Path("runs/bench/locate")
 STRETCH = 20  # consecutive test rows that are resampled together: the robot moves 3 m in them
@@ -43,8 +37,6 @@ ROWS = 64
 
 @dataclass(frozen=True)
 class Cell:
-    """A fitted model."""
-
     title: str  # label in the table
     model: str  # name of the model
     n_train: int | None  # number of training rows; None: all
@@ -55,20 +47,16 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name for files and progress."""
         return f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
 
 
 HYBRID = partial(Cell, "hybrid, knows walls", "hybrid")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
 SEEDS = (0, 1, 2)
-CELLS = (
-    *(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS),
-    HYBRID(None),
-)
+CELLS = (*(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS), HYBRID(None))
 
 
-def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
+def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
     """Errors in metres of a cell, of nearest neighbours, and whether regions hold the true positions, by test row."""
     if not (folder / FINISHED).exists():
         shutil.rmtree(folder, ignore_errors=True)
@@ -79,28 +67,16 @@ def measure(cell: Cell, scene: str, folder: Path) -> dict[str, Any]:
     strengths_dbm, true_m = test_observations(run)
     located = locate(run, strengths_dbm, on_progress=_show(cell.name))
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
-    best = best_neighbours(record, rows, strengths_dbm, true_m)
-    near = located.neighbours_error_m(true_m)
-    assert near is not None
-    return {
-        "error_m": located.error_m(true_m).tolist(),
-        "neighbours_error_m": near.tolist(),
-        "best_neighbours_error_m": best.tolist(),
-        "inside": located.covers(true_m).tolist(),
-        "area_m2": located.area_m2.tolist(),
-        "radius_m": located.radius_m.tolist(),
-        "calibration": asdict(located.calibration),
-    }
-
-
-def best_neighbours(record: Record, rows: IntArray, observed_dbm: FloatArray, true_m: FloatArray) -> FloatArray:
-    """Errors of nearest neighbours with the k and the distance that are best on the test rows themselves."""
-    errors = [
-        np.linalg.norm(Neighbours(count, metric).locate(record, rows, observed_dbm)[:, :2] - true_m, axis=1)
-        for metric in METRICS
-        for count in COUNTS
-    ]
-    return np.asarray(min(errors, key=lambda error: float(error.mean())), float)
+    # Errors of nearest neighbours with the k and the distance that are best on the test rows themselves.
+    ways = [Neighbours(count, metric) for metric in METRICS for count in COUNTS]
+    near_m = (way.locate(record, rows, strengths_dbm)[:, :2] for way in ways)
+    best = min((np.linalg.norm(at - true_m, axis=1) for at in near_m), key=lambda error: float(error.mean()))
+    arrays: dict[str, Any] = {"error_m": located.error_m(true_m)}
+    arrays["neighbours_error_m"] = located.neighbours_error_m(true_m)
+    arrays |= {"best_neighbours_error_m": best, "inside": located.covers(true_m)}
+    arrays |= {"area_m2": located.area_m2, "radius_m": located.radius_m}
+    lists = {name: np.asarray(values).tolist() for name, values in arrays.items()}
+    return {**lists, "calibration": asdict(located.calibration)}
 
 
 def stretches(values: FloatArray) -> FloatArray:
@@ -135,10 +111,9 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     which = f"seed {cell.seed}" if len(draws) == 1 else f"{len(draws)} draws"
     what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, {which}"
-    value = (
-        f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN {figures['neighbours_median_m']:.2f} m "
-    )
-    value += f"(mean {figures['neighbours_mean_m']:.2f}), {inside[0]:.0%} inside"
+    value = f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN "
+    value += f"{figures['neighbours_median_m']:.2f} m (mean {figures['neighbours_mean_m']:.2f}), "
+    value += f"{inside[0]:.0%} inside"
     asked = f"gain {gain[0]:.2f} m ({gain[1]:.2f} to {gain[2]:.2f}), 85 to 95 % inside"
     return {**line(what, value, asked), **figures}
 
@@ -149,7 +124,7 @@ def _show(name: str) -> Any:
     def on_progress(stage: str, share: float, progress: Any = None, /) -> None:
         if stage != last[0]:
             last[0] = stage
-            print(f"locate: {name}: {stage}", file=sys.stderr, flush=True)
+            say("locate", f"{name}: {stage}")
 
     return on_progress
 
@@ -162,17 +137,14 @@ def main() -> dict[str, Any]:
     """
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
-    scene = scene_of(next(part for part in PARTS if part.dataset == FLAT), place)[1]
+    scene = scene_of_data(FLAT, place)
     measured: dict[Cell, dict[str, Any]] = {}
     for number, cell in enumerate(CELLS, 1):
-        print(f"locate: {number} of {len(CELLS)}: {cell.name}", file=sys.stderr, flush=True)
+        say("locate", f"{number} of {len(CELLS)}: {cell.name}")
         measured[cell] = kept(place / f"{cell.name}.json", partial(measure, cell, scene, place / cell.name))
         row = row_of(cell, [measured[cell]])
-        print(f"locate: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
-    return {
-        "calibration": {cell.name: result["calibration"] for cell, result in measured.items()},
-        **summary(measured),
-    }
+        say("locate", f"{row['what']}: {row['value']}; {row['asked']}")
+    return {"calibration": {cell.name: result["calibration"] for cell, result in measured.items()}, **summary(measured)}
 
 
 def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
@@ -190,9 +162,8 @@ def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
     outside = [row["what"] for row in pooled.values() if not INSIDE[0] <= row["inside"][0] <= INSIDE[1]]
     verdict: dict[str, Any] = {"not_clearly_better": worse, "coverage_outside": outside}
     if worse or outside:
-        verdict["failed"] = (
-            f"not clearly better than kNN: {worse or 'none'}; coverage outside 85 to 95 %: {outside or 'none'}"
-        )
+        text = f"not clearly better than kNN: {worse or 'none'}"
+        verdict["failed"] = f"{text}; coverage outside 85 to 95 %: {outside or 'none'}"
     return {"rows": rows, **verdict}
 
 

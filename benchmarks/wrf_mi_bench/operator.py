@@ -1,7 +1,5 @@
 """Prediction by operator compared with direct evaluation: time, memory and difference; times of networks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -59,13 +57,11 @@ class Direct:
         return self._network(self.params, to_tensor(np.reshape(tx_pos_m, (3, 1))))
 
     def gaussians(self, parts: Any) -> Gaussians:
-        """Gaussians of `parts`."""
         position, scale, rotation, signal, last = (list(part) for part in parts)
         alpha, delta = (None, last) if self._product else (last[0], None)
         return Gaussians(position, scale, rotation, signal, alpha, delta, 1)
 
     def operator(self, gaussians: Gaussians) -> PixelOperator:
-        """Operator of Gaussians from `gaussians`."""
         weights = pixel_weights(gaussians, self.pose, self.plane)
         return PixelOperator(weights, self.plane.height, self.plane.width)
 
@@ -117,16 +113,13 @@ def of_networks(rng: np.random.Generator) -> dict[str, dict[str, Any]]:
 
 def main() -> dict[str, Any]:
     """Times, memory and differences, with rows for the table."""
-    rng = np.random.default_rng(0)
-    field = Factorised()
+    rng, field = np.random.default_rng(0), Factorised()
     params = parameters(field, GAUSSIANS, SIZE_DEG)
     direct = Direct(field, params)
     tx = rng.uniform(-2, 2, (BATCH, 3)).astype(np.float32)
     gaussians = direct.gaussians(direct.parts(tx[0]))
 
-    def build() -> PixelOperator:
-        return direct.operator(gaussians)
-
+    build = partial(direct.operator, gaussians)
     built, built_mb, pixels = bootstrap(interleaved({"": build}, 5)[""]), memory_mb(build), build()
     factors, coefficients = static_signals(field, params)
     assert factors is not None
@@ -154,17 +147,11 @@ def main() -> dict[str, Any]:
         rows.append(line(f"times faster than direct: {what}", str(ratio(each["direct, pixels"], each[name]))))
     rows += [
         line("building: pixels", f"{built} ms, {built_mb:.0f} MB beside its result"),
-        line(
-            "size: pixels",
-            f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB",
-        ),
+        line("size: pixels", f"{sum(part.nbytes for part in weights_parts) / 1e6:.2g} MB"),
         line("size: pixels, composed", f"{images.table.nbytes / 1e6:.2g} MB"),
     ]
-    for name, kind, values in (
-        ("alpha", field, params),
-        ("product", WrfGs(), parameters(WrfGs(), GAUSSIANS, SIZE_DEG)),
-    ):
-        error = difference(kind, values, tx[0])
+    for name, kind in (("alpha", field), ("product", WrfGs())):
+        error = difference(kind, parameters(kind, GAUSSIANS, SIZE_DEG), tx[0])
         rows.append(line(f"relative L2 difference from direct, {name} blending", f"pixels {error:.1e}", "1e-4"))
     for name, shares in of_networks(rng).items():
         text = "; ".join(f"{key} {interval}" for key, interval in shares.items())

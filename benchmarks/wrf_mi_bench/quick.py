@@ -5,8 +5,6 @@ as those of elapsed times on two threads varied nine times more. A larger ratio 
 where the whole 95 % interval of a ratio lies above `WORSE` times the stored one.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time
@@ -72,11 +70,7 @@ def _splatting() -> tuple[Call, Call]:
 
 def _integrator() -> tuple[Call, Call]:
     gaussians, receiver = field(500, 5.0, opacity=0.3)
-    stock = _stock(gaussians, receiver)
-
-    def theirs() -> None:
-        stock.field(gaussians)
-
+    theirs = partial(_stock(gaussians, receiver).field, gaussians)
     return integrator(gaussians, receiver), Within(theirs, rgb_variant)
 
 
@@ -143,7 +137,7 @@ def _gains() -> tuple[Call, Call]:
     return lambda: recompute(traced, scene), lambda: trace_paths(scene, tx, RECEIVER, next(new))
 
 
-def _paths_alone() -> tuple[Call, Call]:
+def _alone() -> tuple[Call, Call]:
     """Ours trains the paths of spectra by the graph, theirs by Adam on paths, receiver and loss as such: without
     Gaussians a step should cost at most 1.05 times as much.
     """
@@ -199,9 +193,7 @@ PAIRS: list[Pair] = [
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
     Pair(
-        "paths-alone",
-        f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such",
-        _paths_alone,
+        "paths-alone", f"{STEPS} steps of the graph without Gaussians over {STEPS} of the traced paths as such", _alone
     ),
     Pair("kept-rays", "a traced spectrum with kept rays over one with new ones", _kept_rays),
     Pair("gains", "new gains of known paths over tracing anew, 64 transmitters", _gains),
@@ -237,7 +229,8 @@ def worse(measured: Mapping[str, Mapping[str, float]], stored: Mapping[str, Mapp
 
 def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, Any]:
     """Ratios of all pairs, stored in ``out`` or else compared with stored ones (`BenchFailed` where one is worse)."""
-    file = file_of(out)
+    # Ratios of each backend have a file.
+    file = out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
     stored = None if store else read_stored(file)
     start = time.perf_counter()
     with threadpool_limits(1, "blas"):
@@ -258,13 +251,7 @@ def quick(out: Path, store: bool, pairs: Sequence[Pair] = PAIRS) -> dict[str, An
     return result
 
 
-def file_of(out: Path) -> Path:
-    """File of this backend's stored ratios: ``quick.json``, or ``quick-cuda.json``."""
-    return out / (FILE if (name := init().name) == "llvm" else FILE.replace(".", f"-{name}."))
-
-
 def read_stored(file: Path) -> dict[str, dict[str, float]]:
-    """Stored ratios."""
     try:
         content = json.loads(file.read_text())
         ratios: dict[str, dict[str, float]] = content["figures"]["ratios"]
@@ -279,10 +266,9 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 
 
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
-    """Markdown table of measured ratios."""
-    titles = {pair.name: pair.title for pair in PAIRS}
+    titles = {known.name: known.title for known in PAIRS}
     lines = []
-    for name, one in ratios.items():
-        interval = f"**{one['value']:.2g}** ({one['low']:.2g} to {one['high']:.2g})"
-        lines.append([titles[name], interval, f"{one['ours_ms']:.3g} ms, {one['theirs_ms']:.3g} ms"])
+    for name, pair in ratios.items():
+        interval = f"**{pair['value']:.2g}** ({pair['low']:.2g} to {pair['high']:.2g})"
+        lines.append([titles[name], interval, f"{pair['ours_ms']:.3g} ms, {pair['theirs_ms']:.3g} ms"])
     return markdown_table(["ratio", "measured (95 % interval)", "medians"], lines)

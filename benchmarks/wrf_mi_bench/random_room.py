@@ -6,8 +6,6 @@ the frame of the devices as a whole, and each of its positions a little more, as
 made of the scan by the pipeline of the command ``mesh``, with the materials of the default rules.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -4,8 +4,6 @@ the paths alone with trained gain and materials.
 The *rows saved* are the share of the rows of a random start that joint training needs for the same score.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,17 +21,14 @@ from wrf_mi.tasks.task import Task
 
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line
-from .fit_key import fit_key, source_files
-from .stages import LAB, Cell, scene_of_cell
+from .sources import fit_key, source_files
+from .stages import LAB, Cell
 from .table_plan import SEEDS
+from .tables import scene_of_data
 
 RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")
 """Kept results, and the picture, which is written only in a checkout of the project."""
-ROWS: Mapping[str, Sequence[int]] = {
-    LAB: (20, 40, 80, 160),
-    ROOM: (50, 100, 200, 400),
-    FLAT: (50, 100, 200, 400),
-}
+ROWS: Mapping[str, Sequence[int]] = {LAB: (20, 40, 80, 160), ROOM: (50, 100, 200, 400), FLAT: (50, 100, 200, 400)}
 STEPS = 3000
 RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
 PATHS, IDW = "paths alone", "IDW"
@@ -43,7 +38,7 @@ CALIBRATION = ("calibration=gain,materials", "transmission=true")  # settings of
 
 def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str, Any]:
     """Median scores of all `CURVES` by name, and of inverse-distance weighting; ``task``."""
-    scene, scores, field = scene_of_cell(cell, folder.parent), dict[str, Any](), (f"steps={steps}",)
+    scene, scores, field = scene_of_data(cell.dataset, folder.parent), dict[str, Any](), (f"steps={steps}",)
     for name, model, field_scene, settings in (
         (RANDOM, "wrf-gs+", None, field),
         (MESH, "wrf-gs+", None, (*field, f"initial.mesh={scene}")),
@@ -78,9 +73,8 @@ def rows_needed(rows: Sequence[int], score: Sequence[float], goal: float, higher
 
 def curves(scores: Sequence[Mapping[str, Any]], dataset: str, name: str) -> np.ndarray:
     """Scores [sizes, seeds] of a data set by a name of `measure`."""
-    return np.array(
-        [[entry[name] for entry in scores if (entry["dataset"], entry["rows"]) == (dataset, n)] for n in ROWS[dataset]]
-    )
+    of_data = [entry for entry in scores if entry["dataset"] == dataset]
+    return np.array([[entry[name] for entry in of_data if entry["rows"] == n] for n in ROWS[dataset]])
 
 
 def saved(scores: Sequence[Mapping[str, Any]]) -> list[Row]:
@@ -98,7 +92,6 @@ def saved(scores: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _task(scores: Sequence[Mapping[str, Any]], dataset: str) -> Task:
-    """Task of a data set."""
     return TASKS[next(entry["task"] for entry in scores if entry["dataset"] == dataset)]
 
 

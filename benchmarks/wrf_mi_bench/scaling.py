@@ -1,7 +1,5 @@
 """Growth of time and memory with the size of the work, and exponents of the growth."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import tempfile
@@ -158,9 +156,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
     ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time
     with its interval, ``limit`` that of n log n at the same sizes.
     """
-    sizes: list[int] = []
-    times: list[Any] = []
-    memory: list[float] = []
+    sizes, times, memory = list[int](), list[Any](), list[float]()
     for size in axis.sizes:
         if sizes and 1e-3 * float(np.median(times[-1])) * (size / sizes[-1]) ** 1.1 > call_s:
             break
@@ -175,18 +171,9 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         logger.info("%s %d: %.1f ms, %.0f MB", axis.name, size, np.median(times[-1]), memory[-1])
         del call
         gc.collect()
-    growth = exponent(sizes, times)
-    return {
-        "name": axis.name,
-        "title": axis.title,
-        "work": axis.work,
-        "sizes": sizes,
-        "left_out": list(axis.sizes[len(sizes) :]),
-        "ms": [float(np.median(ms)) for ms in times],
-        "memory_mb": memory,
-        "exponent": vars(growth),
-        "limit": n_log_n(sizes),
-    }
+    result: dict[str, Any] = {"name": axis.name, "title": axis.title, "work": axis.work, "sizes": sizes}
+    result |= {"left_out": list(axis.sizes[len(sizes) :]), "ms": [float(np.median(ms)) for ms in times]}
+    return result | {"memory_mb": memory, "exponent": vars(exponent(sizes, times)), "limit": n_log_n(sizes)}
 
 
 def verdict(growth: Interval, limit: float) -> str:
@@ -197,7 +184,6 @@ def verdict(growth: Interval, limit: float) -> str:
 
 
 def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """Rows for the benchmark's table."""
     lines = []
     for result in results:
         slope, sizes = Interval(**result["exponent"]), result["sizes"]
@@ -206,13 +192,9 @@ def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
         growth = [f"{ms:.3g} ms" for ms in result["ms"]]
         memory = [f"{mb:.0f}" for mb in result["memory_mb"]]
         value = f"exponent {slope.value:.2f} ({slope.low:.2f} to {slope.high:.2f}) from {larger[0]:,}"
-        lines.append(
-            line(
-                f"{sizes[0]:,} to {sizes[-1]:,} {result['work']}, {result['title']}{missing}",
-                f"{value}; {', '.join(growth)}; {', '.join(memory)} MB",
-                f"at most n log n ({result['limit']:.2f}): {verdict(slope, result['limit'])}",
-            )
-        )
+        what = f"{sizes[0]:,} to {sizes[-1]:,} {result['work']}, {result['title']}{missing}"
+        asked = f"at most n log n ({result['limit']:.2f}): {verdict(slope, result['limit'])}"
+        lines.append(line(what, f"{value}; {', '.join(growth)}; {', '.join(memory)} MB", asked))
     return lines
 
 

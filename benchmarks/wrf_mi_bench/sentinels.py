@@ -8,14 +8,11 @@ They take three quarters of an hour on two cores, the tables many hours. Each fi
 | paths that MATLAB's image method has, found again | 95 % Wilson interval of the stored share over these paths |
 | worst errors of `stress` and of the Mitsuba integrator, fewer of the same cases | up to the bound of that benchmark |
 
-Results are kept by the content of the packages' files (`wrf_mi_bench.fit_key.source_files`): a stopped call is
+Results are kept by the content of the packages' files (`wrf_mi_bench.sources.source_files`): a stopped call is
 resumed, and changed code is measured again.
 """
 
-from __future__ import annotations
-
 import json
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,12 +28,13 @@ from wrf_mi.runs.sweep import dataset_files, markdown_table
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
-from .fit_key import fit_key, source_files
+from .comparison import STORED, say
+from .sources import fit_key, source_files
 from .stress_rows import stages
 from .table_plan import Row, available, plan
 from .tables import FOLDER, measure
 
-STORED, RUNS = Path("benchmarks/results"), Path("runs/bench/sentinels")
+RUNS = Path("runs/bench/sentinels")
 TABLE_ROWS = (
     *(f"spectrum-{RFID}-official-{name}" for name in ("kriging", "vae", "dcgan", "ray-tracing", "wrf-gs+")),
     *(f"spectrum-{RFID}-blocked-{name}" for name in ("idw", "kriging", "wrf-gs")),
@@ -78,8 +76,6 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that are measured together."""
-
     name: str  # name for files and progress
     figures: tuple[Figure, ...]  # stored figures
     measure: Callable[[Path], Sequence[float]]  # function from the folder of runs to the figures' values
@@ -186,16 +182,15 @@ def main() -> dict[str, Any]:
     begun = time.perf_counter()
     for count, group in enumerate(known, 1):
         minutes = (time.perf_counter() - begun) / 60
-        _say(f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
+        say("sentinels", f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
         group_rows = _rows(group, place)
         rows += group_rows
         for row in group_rows:
-            _say(f"{row['what']}: {row['value']}; stored {row['asked']}")
+            say("sentinels", f"{row['what']}: {row['value']}; stored {row['asked']}")
     return {"rows": rows, **_failure(rows)}
 
 
 def _rows(group: Group, place: Path) -> list[dict[str, Any]]:
-    """Rows of a group, measured or read."""
     if not group.present:
         return [figure.row(None, ABSENT) for figure in group.figures]
     file = place / f"{group.name}.json"
@@ -221,12 +216,7 @@ def _failure(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     return {"failed": f"{len(lost)} of {len(rows)} figures got worse or were not measured, first {first}"}
 
 
-def _say(text: str) -> None:
-    print(f"sentinels: {text}", file=sys.stderr, flush=True)
-
-
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of stored and measured figures."""
     lines = []
     for row in rows:
         measured = "" if row["measured"] is None else f"{row['measured']:.4g}"

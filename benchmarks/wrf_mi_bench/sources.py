@@ -1,10 +1,11 @@
-"""Digests of the source that a result depends on.
+"""Digests of the source that a result depends on, and keys of stored fits.
 
 A result depends on the module of its benchmark, on what this module names for subprocesses, and on every module of this
 project that these import. A digest is that of syntax trees without docstrings: comments and layout do not count.
-"""
 
-from __future__ import annotations
+A run folder whose name holds the key of a fit, a digest of everything that determines it, is used again. Other
+settings, rows, seed, data or versions give another key, and so another folder.
+"""
 
 import ast
 import hashlib
@@ -14,7 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from wrf_mi.core.digest import content_digest, files_below
 from wrf_mi.models import MODELS
+from wrf_mi.runs.folder import versions
 
 from .table_plan import CORRECTED, NAMED
 
@@ -22,6 +25,7 @@ PACKAGES = {"wrf_mi": "", "wrf_mi_bench": "benchmarks", "wrf_mi_plugins": "plugi
 """Packages of this project, and their folders in a checkout."""
 SOURCE = "source"  # key of the digests in a stored result
 DIGITS = 12  # hexadecimal digits of a digest
+KEY_DIGITS = 16  # hexadecimal digits of a key: two of a million fits share a key with a probability of 3e-8
 COMMANDS = {
     "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
     "train": ("wrf_mi.cli.train",),
@@ -133,3 +137,22 @@ def _imports(file: Path, module: str) -> tuple[str, ...]:
             base = ".".join([*above, *([node.module] if node.module else [])])
             modules += [base, *(f"{base}.{name.name}" for name in node.names)]
     return tuple(modules)
+
+
+def fit_key(*determining: Any) -> str:
+    """Key of a fit: a digest of `versions` and of values as for `wrf_mi.core.digest.content_digest`.
+
+    `InputError` for a path that does not exist.
+    """
+    return content_digest(versions(), *determining)[:KEY_DIGITS]
+
+
+def source_files() -> dict[str, Path]:
+    """Files of `wrf_mi`, its plugins and its scenes by name, except compiled files."""
+    by_name: dict[str, Path] = {}
+    for name in PACKAGES.keys() - {__package__}:
+        spec = find_spec(name)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            files = [path for path in files_below(Path(folder)) if "__pycache__" not in path.parts]
+            by_name |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in files}
+    return by_name

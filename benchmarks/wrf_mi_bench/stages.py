@@ -9,10 +9,7 @@ of errors on training rows that are held out in space: the hybrid has its own, o
 ``wrf-mi train --intervals`` does.
 """
 
-from __future__ import annotations
-
 import shutil
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,10 +30,9 @@ from wrf_mi.tasks.scores import bootstrap
 from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
-from .comparison import data_folder, measured_on, stored_part
-from .fit_key import fit_key, source_files
-from .table_plan import PARTS
-from .tables import meshed_scan, scene_of
+from .comparison import data_folder, line, measured_on, say, stored_part
+from .sources import fit_key, source_files
+from .tables import scene_of_data
 
 RUNS = Path("runs/bench/stages")
 LAB, CHANNELS = "laboratory", "random-room"
@@ -89,12 +85,10 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name for files and progress."""
         return f"{self.dataset}-{self.split}-{'all' if self.n_train is None else self.n_train}"
 
     @property
     def title(self) -> str:
-        """Label in the table."""
         return f"{self.dataset}, {self.split}, {'all' if self.n_train is None else self.n_train} rows"
 
 
@@ -108,18 +102,10 @@ INTERVAL_MODELS = ("kriging", JOINT, HYBRID)
 """Models; Gaussians are trained jointly with the paths of the scene where there is one."""
 
 
-def scene_of_cell(cell: Cell, folder: Path) -> str | None:
-    """Scene of a cell's data set, made where needed; None: none is known."""
-    if cell.dataset in (LAB, ROOM):
-        return str(meshed_scan(cell.dataset, folder))
-    part = next(part for part in PARTS if part.dataset == cell.dataset)
-    return None if part.scene == "open" else scene_of(part, folder)[1]
-
-
 def data_of(cell: Cell, folder: Path) -> tuple[str | Record, str | None]:
     """Data of a cell and their scene; both of a random room are made in ``folder``, the same ones each time."""
     if cell.dataset != CHANNELS:
-        return cell.dataset, scene_of_cell(cell, folder.parent)
+        return cell.dataset, scene_of_data(cell.dataset, folder.parent)
     record, _, measured = random_room_record(CHANNELS_SEED, folder / CHANNELS)
     return record, str(measured)
 
@@ -138,8 +124,7 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
     figures = []
     for name, run in {HYBRID: hybrid, **others}.items():
         figure = {"model": name, "score": run.metrics[block], "block": block}
-        keys = ("train_seconds", "inside_90", "crps", "ms_per_sample")
-        figure |= {key: run.metrics.get(key) for key in keys}
+        figure |= {key: run.metrics.get(key) for key in ("train_seconds", "inside_90", "crps", "ms_per_sample")}
         if name == HYBRID:
             figure["stages"] = run.metrics["stages"]
         else:
@@ -195,10 +180,15 @@ def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, 
             limit = LIMITS[part["block"]]
             interval = f"{part['gain_low']:.3g} to {part['gain_high']:.3g}"
             asked = f"hybrid better by {part['gain']:.3g} ({interval}), at most {limit} worse"
-        rows.append(
-            {"what": f"{cell.title}: {part['model']}", "value": value, "asked": asked, **part, "cell": cell.name}
-        )
+        rows.append({**line(f"{cell.title}: {part['model']}", value, asked), **part, "cell": cell.name})
     return rows
+
+
+def _place() -> Path:
+    """Folder of the runs of this code; `InputError` where measured data are not on this machine."""
+    for name in (RFID, FLAT):
+        data_folder(name)
+    return RUNS / fit_key(source_files())
 
 
 def main() -> dict[str, Any]:
@@ -207,18 +197,14 @@ def main() -> dict[str, Any]:
     ``worse`` is the number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside`` that of
     runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; ``failed`` is there where a limit is exceeded.
     """
-    for name in (RFID, FLAT):
-        data_folder(name)
-    place = RUNS / fit_key(source_files())
-    place.mkdir(parents=True, exist_ok=True)
-    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    place, rows, parts = _place(), list[dict[str, Any]](), list[dict[str, Any]]()
     for count, cell in enumerate(CELLS, 1):
-        print(f"stages: {count} of {len(CELLS)}: {cell.title}", file=sys.stderr, flush=True)
+        say("stages", f"{count} of {len(CELLS)}: {cell.title}")
         parts.append(stored_part("stages", cell.name, partial(measured, cell, place / cell.name)))
         lines = rows_of(cell, parts[-1]["models"])
         rows += lines
         for row in lines:
-            print(f"stages: {row['what']}: {row['value']}; {row['asked']}", file=sys.stderr, flush=True)
+            say("stages", f"{row['what']}: {row['value']}; {row['asked']}")
     return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
 
 
@@ -277,10 +263,8 @@ def measured_intervals(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
         run = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
     else:
         run = run_alone(cell, data, folder, name, scene, intervals=True)
-    block = TASKS[run.task].block
-    return {"block": block, "score": run.metrics[block]} | {
-        key: run.metrics[key] for key in ("inside_90", "crps", "train_seconds")
-    }
+    block, keys = TASKS[run.task].block, ("inside_90", "crps", "train_seconds")
+    return {"block": block, "score": run.metrics[block], **{key: run.metrics[key] for key in keys}}
 
 
 def intervals() -> dict[str, Any]:
@@ -288,23 +272,18 @@ def intervals() -> dict[str, Any]:
 
     ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` states where some do not.
     """
-    for name in (RFID, FLAT):
-        data_folder(name)
-    place = RUNS / fit_key(source_files())
-    place.mkdir(parents=True, exist_ok=True)
-    rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
+    place, rows, parts = _place(), list[dict[str, Any]](), list[dict[str, Any]]()
     for cell in INTERVAL_CELLS:
         for name in INTERVAL_MODELS:
-            print(f"intervals: {cell.title}: {name}", file=sys.stderr, flush=True)
-            part = stored_part(
-                "intervals", f"{cell.name}-{name}", partial(measured_intervals, cell, name, place / cell.name)
-            )
+            say("intervals", f"{cell.title}: {name}")
+            work = partial(measured_intervals, cell, name, place / cell.name)
+            part = stored_part("intervals", f"{cell.name}-{name}", work)
             parts.append(part)
             value = f"{part['inside_90']:.1%} inside, CRPS {part['crps']:.3g}"
             known = {key: part[key] for key in ("inside_90", "crps", "score")}
-            row = {"what": f"{cell.title}: {name}", "value": value, "asked": "85 to 95 % inside"}
+            row = line(f"{cell.title}: {name}", value, "85 to 95 % inside")
             rows.append({**row, **known, "cell": cell.title, "model": name})
-            print(f"intervals: {row['what']}: {value}", file=sys.stderr, flush=True)
+            say("intervals", f"{row['what']}: {value}")
     inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
     result = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
     if inside < len(rows):

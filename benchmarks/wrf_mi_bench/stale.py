@@ -4,8 +4,6 @@ A result states digests of its source (`wrf_mi_bench.sources`). One that states 
 commit that stored it, in a git repository, and is unknown elsewhere.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess
@@ -76,9 +74,8 @@ def stale_lines(older: Sequence[Mapping[str, Any]], count: int) -> str:
         more = f" and {len(folders) - SHOWN} more" if len(folders) > SHOWN else ""
         lines.append(f"{item['name']}: {item['date']}; {item['command']}; changed: {', '.join(folders[:SHOWN])}{more}")
     unknown = sum(item["changed"] == UNKNOWN for item in older)
-    return "\n".join(
-        [*lines, f"{len(older) - unknown} of {count} results are older than their source, {unknown} unknown"]
-    )
+    lines.append(f"{len(older) - unknown} of {count} results are older than their source, {unknown} unknown")
+    return "\n".join(lines)
 
 
 @dataclass

@@ -4,8 +4,6 @@ comparisons.
 All parameters are exactly representable in float32, so that differences come from the arithmetic alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -172,8 +170,7 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
     return field_oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
 
 
-Report = Callable[[Gaussians, Pose], Sequence[Any]]
-"""Differentiable real arrays computed from a field."""
+Report = Callable[[Gaussians, Pose], Sequence[Any]]  # differentiable real arrays computed from a field
 Slope = Callable[["Field", str, int], dict[str, FloatArray]]
 """Derivatives by group of parameters for a field, a blending and a seed."""
 

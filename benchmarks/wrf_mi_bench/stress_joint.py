@@ -8,8 +8,6 @@ are relative to the sum of the waves' magnitudes, those of spectra to their norm
 step of each parameter: 1 / k for metres, 1 for rad and logarithms.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -157,14 +155,11 @@ class _Joint:
         values |= {name: np.asarray(value, float) for name, value in case.values.items()}
         self._values = _rounded(values)
         if case.cancels:
-            self._cancel()
-
-    def _cancel(self) -> None:
-        name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
-        traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
-        factor = -wave / traced_wave * (1 + LEFT)
-        gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
-        self._values = _rounded({**self._values, name: gain})
+            name, wave = self._traced.gain_name, self.learned(MODELS["RSSI"])[0, 0]
+            traced_wave = self._oracle(self._values).at(np.zeros((1, 3)), np.array([HZ]))[0, 0]
+            factor = -wave / traced_wave * (1 + LEFT)
+            gain = self._values[name] + [np.log(np.abs(factor)), np.angle(factor)]
+            self._values = _rounded({**self._values, name: gain})
 
     def rows(self, name: str, models: Iterable[str]) -> list[Row]:
         """Values and derivatives of the receiver models."""
@@ -230,14 +225,12 @@ class _Reference:
         self._model, self._there = model, joint.learned(model)
 
     def report(self, paths: OraclePaths) -> FloatArray:
-        """Flat report."""
         model, ports = self._model, (ELEMENTS_M, np.full(len(ELEMENTS_M), HZ))
         if isinstance(model, CsiReceiver):
             ports = np.zeros((len(model.frequencies_hz), 3)), np.array(model.frequencies_hz)
         return ORACLE.report(model, paths.at(*ports), self._there)
 
     def error(self, report: FloatArray, paths: OraclePaths) -> float:
-        """Error of a report."""
         waves = np.abs(paths.gain).reshape(len(self._there), -1).sum(axis=1) + np.abs(self._there).max(axis=1)
         return report_error(self._model, report, self.report(paths), waves)
 
@@ -297,15 +290,9 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     wavenumber = 2 * np.pi * frequency_hz / speed_of_light
     where = f"{frequency_hz / 1e9:g} GHz in {size_m[0]:g} m"
     more = f" rad; with lengths in float32 {wavenumber * single.error:.0e} rad"
-    return [
-        row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more),
-        row(
-            f"Sionna RT's own delays at {where}, {counted} paths",
-            delay.error,
-            DELAY,
-            f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad",
-        ),
-    ]
+    phase = row(f"phase at {where}, {len(paths)} paths", wavenumber * worst.error, PHASE, more)
+    more = f" of the delay: {metres * 1e3:.2g} mm, {wavenumber * metres:.0e} rad"
+    return [phase, row(f"Sionna RT's own delays at {where}, {counted} paths", delay.error, DELAY, more)]
 
 
 def _sionna_delays(scene: Any, tx_pos_m: FloatArray, rx_pos_m: FloatArray) -> list[FloatArray]:

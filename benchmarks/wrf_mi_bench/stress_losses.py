@@ -1,7 +1,5 @@
 """Losses in float32 against float64, scikit-image and NumPy, values and derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

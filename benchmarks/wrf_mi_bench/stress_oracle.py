@@ -5,8 +5,6 @@ no device code. The direction of a leg is that from an image of the transmitter 
 Airy sums, patterns SciPy's spherical harmonics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,8 +28,7 @@ from .stress_rows import relative
 
 ComplexArray = NDArray[np.complex128]
 Values = Mapping[str, FloatArray]
-Planes = tuple[FloatArray, FloatArray]
-"""Unit normals [q, 3] and offsets [q] of planes."""
+Planes = tuple[FloatArray, FloatArray]  # unit normals [q, 3] and offsets [q] of planes
 ACROSS = 1e-6  # sine of the angle to a wall's normal below which the polarisation basis is arbitrary
 
 
@@ -88,16 +85,16 @@ class TracedOracle:
         ways = [(end - start) / length[:, None] for start, end in zip(images, mirrored, strict=True)]
 
         cosine, sine = self._heading.T
-        none, one = np.zeros_like(cosine), np.ones_like(cosine)
-        turned = np.array([[cosine, sine, none], [-sine, cosine, none], [none, none, one]])
+        none, unit = np.zeros_like(cosine), np.ones_like(cosine)
+        turned = np.array([[cosine, sine, none], [-sine, cosine, none], [none, none, unit]])
         departure = np.einsum("ijp,pj->pi", turned, ways[0])
         sent = np.einsum("ijp,pi->pj", turned, traced.options.tx_antenna.field(departure)).astype(complex)
         for level, before, after in zip(self._levels, ways, ways[1:], strict=False):
             sent = self._interact(planes, level, before, after, sent, values)
         antenna = receiver.antenna.to_world(Rotation.from_matrix(to_world).as_quat())
-        taken = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
+        received = receiver.antenna.field(-ways[-1] @ antenna) @ antenna.T
         loss = self._exists * speed_of_light / traced.frequency_hz / (4 * np.pi * length)
-        gain = (taken * sent).sum(axis=-1) * loss
+        gain = (received * sent).sum(axis=-1) * loss
         amplitude, phase = values.get(traced.gain_name, np.zeros(2))
         gain = gain * np.exp(amplitude + 1j * phase)
         arrival = -ways[-1] @ to_world
@@ -142,7 +139,7 @@ class TracedOracle:
         other /= np.linalg.norm(other, axis=-1, keepdims=True)
         across = np.where(size > ACROSS, across / np.where(size > ACROSS, size, 1), other)
         along = np.cross(across, before), np.cross(across, after)
-        s, p = ((sent * one).sum(axis=-1, keepdims=True) for one in (across, along[0]))
+        s, p = ((sent * axis).sum(axis=-1, keepdims=True) for axis in (across, along[0]))
         return np.where(met[:, None], te[:, None] * s * across + tm[:, None] * p * along[1], sent)
 
 

@@ -4,8 +4,6 @@ The footprint here is the largest response on a ray; splatting takes the respons
 (`wrf_mi_plugins.ray_response`). Both agree in the limit of small angles only, so each has a definition in NumPy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -5,8 +5,6 @@ over directions (RSSI, CSI) is relative to the sum of magnitudes, as waves may c
 spectra is relative to their norm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -26,17 +24,7 @@ from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.receivers.device_paths import Ports, TracedPaths, path_sum
 from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 
-from .stress_fields import (
-    HARD,
-    SIZE,
-    Family,
-    cases,
-    gradient_row,
-    on_device,
-    ordinary,
-    pose,
-    reference,
-)
+from .stress_fields import HARD, SIZE, Family, cases, gradient_row, on_device, ordinary, pose, reference
 from .stress_oracle import ReportOracle, report_error
 from .stress_rows import DOUBLE, IMAGE, Row, Worst
 
@@ -107,28 +95,12 @@ def of_paths(count: int, each: int = 50) -> list[Row]:
         length = 10 ** rng.uniform(0, 5, each)
         arrival = unit_vectors(rng.uniform(0, 2 * np.pi, each), rng.uniform(-1.5, 1.5, each))
         gain = 10 ** rng.uniform(-15, 15, each) * np.exp(2j * np.pi * rng.uniform(size=each))
-        traced = TracedPaths(
-            (DOUBLE(gain.real.copy()), DOUBLE(gain.imag.copy())),
-            DOUBLE(length),
-            [DOUBLE(np.ascontiguousarray(c)) for c in arrival.T],
-            1,
-            each,
-        )
-        none = np.zeros((each, 0))
-        known = Paths(
-            tx=np.zeros(each, np.int64),
-            rx=np.zeros(each, np.int64),
-            gain=gain,
-            length_m=length,
-            departure=-arrival,
-            arrival=arrival,
-            interactions=none.astype(np.int32),
-            vertices_m=np.zeros((each, 0, 3)),
-            objects=none.astype(np.int32),
-            object_names=(),
-            n_tx=1,
-            n_rx=1,
-        )
+        gains = DOUBLE(gain.real.copy()), DOUBLE(gain.imag.copy())
+        directions = [DOUBLE(np.ascontiguousarray(column)) for column in arrival.T]
+        traced = TracedPaths(gains, DOUBLE(length), directions, 1, each)
+        first = np.zeros(each, np.int64)
+        none: Any = (np.zeros((each, 0), np.uint8), np.zeros((each, 0, 3)), np.zeros((each, 0), np.int32), (), 1, 1)
+        known = Paths(first, first, gain, length, -arrival, arrival, *none)
         for ports, truth in (
             (Ports(elements, np.full(16, carrier_hz)), antenna_csi(known, array, elements, carrier_hz)[..., 0]),
             (Ports(np.zeros((16, 3)), tones), csi(known, tones)),

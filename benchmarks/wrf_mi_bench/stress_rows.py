@@ -1,7 +1,5 @@
 """Rows of the stress benchmark: number of cases, worst error and bound; and their summary for the README."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -52,13 +50,11 @@ class Worst:
         self.error, self.where = 0.0, ""
 
     def add(self, error: Any, where: str = "") -> None:
-        """Include an error."""
         value = float(error) if np.isfinite(error) else float("inf")
         if value > self.error:
             self.error, self.where = value, where
 
     def row(self, what: str, bound: float, more: str = "") -> Row:
-        """Row of the table."""
         return row(what, self.error, bound, f"{f' ({self.where})' if self.where else ''}{more}")
 
 
@@ -103,7 +99,6 @@ class GradientWorst:
             self.compared += int(plain.sum())
 
     def row(self, what: str, bound: float = GRADIENT) -> Row:
-        """Row of the table."""
         more = f"; cosine 1 - {self.cosine.error:.0e}, norm 1 ± {self.norm.error:.0e}"
         if self.compared:
             more += f", {self.signs} of {self.compared} signs wrong"
@@ -111,7 +106,6 @@ class GradientWorst:
 
 
 def row(what: str, worst: float, bound: float, more: str = "") -> Row:
-    """Row of the table."""
     return {"what": what, "value": f"worst {worst:.1e}{more}", "asked": f"at most {bound:g}"}
 
 
@@ -121,7 +115,6 @@ def worst_of(row: Mapping[str, str]) -> tuple[float, float]:
 
 
 def held(row: Row) -> bool:
-    """Whether a row keeps its bound."""
     if row["asked"] == NEITHER:
         return row["value"].endswith(" 0 did neither")
     worst, bound = worst_of(row)

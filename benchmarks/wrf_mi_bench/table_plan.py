@@ -1,9 +1,8 @@
 """Runs of the tables of all methods: tasks, data sets, splits, methods, shares of the training rows, seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 from wrf_mi.datasets.registry import locate
 
@@ -16,10 +15,10 @@ SHARES = (1.0, 0.3, 0.1)
 
 @dataclass(frozen=True)
 class Entry:
-    """A method of a table."""
-
     label: str  # label in the table
-    arguments: tuple[str, ...]  # arguments of ``wrf-mi train`` except data set, split, rows and seed
+    model: str  # name of the model
+    scene: str = ""  # `NAMED` or `CORRECTED`; "": none
+    options: tuple[str, ...] = ()  # further arguments of ``wrf-mi train`` except data set, split, rows and seed
     quick: tuple[str, ...] = ()  # further arguments of the small version, which takes half a minute
     seeds: Sequence[int] = ONE  # seeds; several for random methods of less than three minutes
     few_seeds: Sequence[int] = SEEDS  # seeds with fewer rows, which are random themselves
@@ -30,109 +29,88 @@ def _set(*settings: str) -> tuple[str, ...]:
     return tuple(word for setting in settings for word in ("--set", setting))
 
 
-def _model(name: str, *more: str) -> tuple[str, ...]:
-    return ("--model", name, *more)
-
-
 NAMED, CORRECTED = "{scene}", "{corrected}"
 """Arguments that are replaced by the arguments of a scene, as stated and corrected by the row's training rows."""
 THROUGH_WALLS = ("--paths", "line-of-sight,reflection,transmission")
 IN_A_FLAT = (*THROUGH_WALLS, "--depth", "6", "--reflections", "2")  # transmission through walls of two surfaces each
-CALIBRATED = ("--calibrate", "gain,patterns")  # calibration of uncalibrated strengths
+CALIBRATED = (*IN_A_FLAT, "--calibrate", "gain,patterns")  # calibration of uncalibrated strengths
 ON_A_FLOOR = (*THROUGH_WALLS, "--depth", "5", "--reflections", "3")
 """Paths of the synthetic channels except diffuse scattering."""
 FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for steps in (250, 75))
 """Schedules of the small version: networks, and networks with slow steps."""
 SHORT = _set("steps=400", "validate_every=200")  # schedule of fields of Gaussians in the small version
 SPECTRUM: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="0.90, p90 0.95"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="0.82, p90 0.88"),
-    "nerf2": Entry("NeRF2", _model("nerf2"), SIXTY, SEEDS, published="0.78, p90 0.86"),
-    "vae": Entry("VAE", _model("vae"), FEWER, SEEDS, published="0.70, p90 0.82"),
-    "dcgan": Entry("DCGAN", _model("dcgan"), SIXTY, published="0.56, p90 0.69"),
-    "ray-tracing": Entry("ray tracing", _model("ray-tracing", "--scene", NAMED), published="0.38, p90 0.61"),
-    "kriging": Entry("kriging", _model("kriging"), (), SEEDS),
-    "idw": Entry("IDW", _model("idw")),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="0.90, p90 0.95"),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="0.82, p90 0.88"),
+    "nerf2": Entry("NeRF2", "nerf2", quick=SIXTY, seeds=SEEDS, published="0.78, p90 0.86"),
+    "vae": Entry("VAE", "vae", quick=FEWER, seeds=SEEDS, published="0.70, p90 0.82"),
+    "dcgan": Entry("DCGAN", "dcgan", quick=SIXTY, published="0.56, p90 0.69"),
+    "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED, published="0.38, p90 0.61"),
+    "kriging": Entry("kriging", "kriging", seeds=SEEDS),
+    "idw": Entry("IDW", "idw"),
 }
 ROOM = _set("steps=18000")
 """Schedule for transmitters anywhere in a room: SSIM 0.770 on validation rows, 0.754 after a third of the steps."""
 FURNISHED = {
     **SPECTRUM,
-    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], arguments=_model("wrf-gs+", *ROOM)),
-    "wrf-gs": replace(SPECTRUM["wrf-gs"], arguments=_model("wrf-gs", *ROOM)),
-    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
-    "hybrid": Entry("hybrid, knows the scan", _model("hybrid", "--scene", NAMED)),
-    "ray-tracing": Entry(
-        "ray tracing in the scan", _model("ray-tracing", "--scene", NAMED, *THROUGH_WALLS), published="0.38, p90 0.61"
-    ),
-    "ray-tracing-corrected": Entry(
-        "ray tracing in the scan, corrected", _model("ray-tracing", "--scene", CORRECTED, *THROUGH_WALLS)
-    ),
+    "wrf-gs+": replace(SPECTRUM["wrf-gs+"], options=ROOM),
+    "wrf-gs": replace(SPECTRUM["wrf-gs"], options=ROOM),
+    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", "wrf-gs+", NAMED, quick=SHORT),
+    "hybrid": Entry("hybrid, knows the scan", "hybrid", NAMED),
+    "ray-tracing": Entry("ray tracing in the scan", "ray-tracing", NAMED, THROUGH_WALLS, published="0.38, p90 0.61"),
+    "ray-tracing-corrected": Entry("ray tracing in the scan, corrected", "ray-tracing", CORRECTED, THROUGH_WALLS),
 }
 UNSEEN = {
     **SPECTRUM,
     "ray-tracing": Entry(
-        "ray tracing, line of sight alone",
-        _model("ray-tracing", "--scene", NAMED),
-        few_seeds=ONE,
-        published="0.38, p90 0.61",
+        "ray tracing, line of sight alone", "ray-tracing", NAMED, few_seeds=ONE, published="0.38, p90 0.61"
     ),
 }
 """Methods without a mesh, where only the direct path can be traced."""
 RSSI: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="2.4, p10 1.1, p90 4.6"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="2.9"),
-    "wrf-gs+-joint": Entry("WRF-GS+, knows walls", _model("wrf-gs+", "--scene", NAMED), SHORT, SEEDS),
-    "hybrid": Entry("hybrid, knows walls and heading", _model("hybrid", "--scene", NAMED)),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="3.1"),
-    "ray-tracing": Entry(
-        "ray tracing, calibrated, knows walls and heading",
-        _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT, *CALIBRATED),
-    ),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="2.4, p10 1.1, p90 4.6"),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="2.9"),
+    "wrf-gs+-joint": Entry("WRF-GS+, knows walls", "wrf-gs+", NAMED, quick=SHORT, seeds=SEEDS),
+    "hybrid": Entry("hybrid, knows walls and heading", "hybrid", NAMED),
+    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE, published="3.1"),
+    "ray-tracing": Entry("ray tracing, calibrated, knows walls and heading", "ray-tracing", NAMED, CALIBRATED),
     "ray-tracing-corrected": Entry(
-        "ray tracing, calibrated, walls corrected, knows heading",
-        _model("ray-tracing", "--scene", CORRECTED, *IN_A_FLAT, *CALIBRATED),
+        "ray tracing, calibrated, walls corrected, knows heading", "ray-tracing", CORRECTED, CALIBRATED
     ),
-    "ray-tracing-offsets": Entry(
-        "ray tracing, one offset a receiver", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
-    ),
-    "trees": Entry("randomised trees, know the heading", _model("trees"), (), SEEDS),
-    "kriging": Entry("kriging, knows the heading", _model("kriging")),
-    "idw": Entry("IDW", _model("idw")),
-    "mri": Entry("MRI", _model("mri"), published="8.3"),
+    "ray-tracing-offsets": Entry("ray tracing, one offset a receiver", "ray-tracing", NAMED, IN_A_FLAT),
+    "trees": Entry("randomised trees, know the heading", "trees", seeds=SEEDS),
+    "kriging": Entry("kriging, knows the heading", "kriging"),
+    "idw": Entry("IDW", "idw"),
+    "mri": Entry("MRI", "mri", published="8.3"),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT, SEEDS, published="23.91, p10 20.85, p90 25.52"),
-    "wrf-gs": Entry("WRF-GS", _model("wrf-gs"), SHORT, SEEDS, published="22.98, p10 20.82, p90 24.33"),
-    "nerf2": Entry("NeRF2", _model("nerf2"), FEWER, few_seeds=ONE, published="20.55"),
-    "fire": Entry("FIRE", _model("fire"), FEWER, SEEDS, published="15.29"),
-    "r2f2": Entry("R2F2", _model("r2f2"), (), SEEDS, published="8.57"),
-    "optml": Entry("OptML", _model("optml"), FEWER, SEEDS, published="8.47"),
-    "linear": Entry("linear map", _model("linear"), (), SEEDS),
-    "hybrid": Entry("hybrid, from the uplink and positions", _model("hybrid")),
-    "kriging": Entry("kriging, from positions", _model("kriging")),
-    "ray-tracing": Entry(
-        "ray tracing, from positions and walls", _model("ray-tracing", "--scene", NAMED, *ON_A_FLOOR), few_seeds=ONE
-    ),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="23.91, p10 20.85, p90 25.52"),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="22.98, p10 20.82, p90 24.33"),
+    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE, published="20.55"),
+    "fire": Entry("FIRE", "fire", quick=FEWER, seeds=SEEDS, published="15.29"),
+    "r2f2": Entry("R2F2", "r2f2", seeds=SEEDS, published="8.57"),
+    "optml": Entry("OptML", "optml", quick=FEWER, seeds=SEEDS, published="8.47"),
+    "linear": Entry("linear map", "linear", seeds=SEEDS),
+    "hybrid": Entry("hybrid, from the uplink and positions", "hybrid"),
+    "kriging": Entry("kriging, from positions", "kriging"),
+    "ray-tracing": Entry("ray tracing, from positions and walls", "ray-tracing", NAMED, ON_A_FLOOR, few_seeds=ONE),
 }
 NEW_CARRIERS: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", _model("wrf-gs+"), SHORT),
-    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", _model("wrf-gs+", "--scene", NAMED), SHORT),
-    "hybrid": Entry("hybrid, knows the scan", _model("hybrid", "--scene", NAMED)),
-    "ray-tracing": Entry("ray tracing in the scan", _model("ray-tracing", "--scene", NAMED, *THROUGH_WALLS)),
-    "kriging": Entry("kriging, over position and log frequency", _model("kriging")),
-    "idw": Entry("IDW, over position and log frequency", _model("idw")),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT),
+    "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", "wrf-gs+", NAMED, quick=SHORT),
+    "hybrid": Entry("hybrid, knows the scan", "hybrid", NAMED),
+    "ray-tracing": Entry("ray tracing in the scan", "ray-tracing", NAMED, THROUGH_WALLS),
+    "kriging": Entry("kriging, over position and log frequency", "kriging"),
+    "idw": Entry("IDW, over position and log frequency", "idw"),
 }
 KNOWN_POSITIONS = {name: entry for name, entry in NEW_CARRIERS.items() if not name.startswith("wrf-gs")}
 """Methods without a field of Gaussians, where the positions of the test rows were measured at other carriers."""
 NEW_RECEIVERS: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", _model("wrf-gs+"), SHORT),
-    "hybrid": Entry("hybrid, knows walls", _model("hybrid", "--scene", NAMED)),
-    "kriging": Entry("kriging, pooled over receivers", _model("kriging")),
-    "ray-tracing": Entry(
-        "ray tracing, mean offset of the receivers", _model("ray-tracing", "--scene", NAMED, *IN_A_FLAT)
-    ),
-    "mri": Entry("one path-loss law (MRI)", _model("mri")),
+    "wrf-gs+": Entry("WRF-GS+, by the receiver's pose", "wrf-gs+", quick=SHORT),
+    "hybrid": Entry("hybrid, knows walls", "hybrid", NAMED),
+    "kriging": Entry("kriging, pooled over receivers", "kriging"),
+    "ray-tracing": Entry("ray tracing, mean offset of the receivers", "ray-tracing", NAMED, IN_A_FLAT),
+    "mri": Entry("one path-loss law (MRI)", "mri"),
 }
 CHEAP = ("ray-tracing", "ray-tracing-corrected", "linear", "trees", "kriging", "idw", "mri")
 """Methods measured first: seconds to a minute each."""
@@ -186,19 +164,17 @@ class Row:
 
     @property
     def entry(self) -> Entry:
-        """Method."""
         return self.part.entries[self.method]
 
     @property
     def name(self) -> str:
-        """Name of its file."""
         p = self.part
         return f"{p.task}-{p.dataset}-{p.split}-{self.method}-{round(100 * self.share)}-seed{self.seed}"
 
     @property
     def command(self) -> str:
         """Command with a placeholder for the scene, the same on every machine."""
-        corrected = ", corrected" if CORRECTED in self.entry.arguments else ""
+        corrected = ", corrected" if self.entry.scene == CORRECTED else ""
         return " ".join(["wrf-mi", *self.arguments(["--scene", f"{{{self.part.scene}{corrected}}}"])])
 
     @property
@@ -209,9 +185,7 @@ class Row:
 
     def arguments(self, scene: Sequence[str]) -> list[str]:
         """Arguments of ``wrf-mi`` without ``--out``; ``scene`` replaces the arguments of the scene."""
-        words = list(self.entry.arguments)
-        for place in [words.index(name) for name in (NAMED, CORRECTED) if name in words]:
-            words[place - 1 : place + 1] = scene
+        words = ["--model", self.entry.model, *(scene if self.entry.scene else ()), *self.entry.options]
         if self.quick:
             words += self.entry.quick
         elif self.part.split == "blocked":
@@ -225,22 +199,11 @@ def plan(quick: bool = False) -> list[Row]:
         return [Row(part, name, SHARES[-1], 0, True) for part in QUICK_PARTS for name in part.entries]
     first = [Row(part, name, 1.0, 0) for part in PARTS for name in part.entries]
     first.sort(key=lambda row: row.method not in CHEAP)
-    few = [
-        Row(part, name, share, 0)
-        for part in PARTS
-        if part.few
-        for share in SHARES[1:]
-        for name in part.entries
-        if name in FEW
-    ]
+    pairs = product(PARTS, SHARES[1:])
+    few = [Row(part, name, share, 0) for part, share in pairs for name in part.entries if part.few and name in FEW]
     few.sort(key=lambda row: row.method not in CHEAP)
-    again = [
-        Row(row.part, row.method, row.share, seed)
-        for row in first
-        if row.method not in row.part.once
-        for seed in row.entry.seeds[1:]
-    ]
-    again += [Row(row.part, row.method, row.share, seed) for row in few for seed in row.entry.few_seeds[1:]]
+    again = [replace(row, seed=n) for row in first for n in row.entry.seeds[1:] if row.method not in row.part.once]
+    again += [replace(row, seed=n) for row in few for n in row.entry.few_seeds[1:]]
     return [*first, *few, *again]
 
 

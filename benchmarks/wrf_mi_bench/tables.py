@@ -3,14 +3,11 @@
 Each row of `wrf_mi_bench.table_plan` is stored as a JSON file when its run is done, so an interrupted measurement can
 be resumed, on another machine too. A row is measured again where its arguments or the content of its data set have
 changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a run folder has
-a key of command, source, data, scene and versions (`wrf_mi_bench.fit_key`).
+a key of command, source, data, scene and versions (`wrf_mi_bench.sources`).
 """
-
-from __future__ import annotations
 
 import json
 import shutil
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -37,11 +34,10 @@ from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
-from .comparison import data_folder
-from .fit_key import fit_key, source_files
-from .sources import modules_of_command, source_digests
+from .comparison import data_folder, say
+from .sources import fit_key, modules_of_command, source_digests, source_files
 from .table_pages import read_rows, write_tables
-from .table_plan import CORRECTED, NAMED, Part, Row, available, plan
+from .table_plan import CORRECTED, PARTS, Part, Row, available, plan
 
 FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
 QUANTILES = 101  # number of equally spaced quantiles of a row's scores
@@ -50,27 +46,36 @@ FAR_M, PLATE_M = 100.0, 0.01  # distance and size of the only surface of the ope
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 
-def scene_of(part: Part, folder: Path) -> list[str]:
-    """Arguments with the scene of a part, which is made in ``folder`` where needed."""
+def scene_of(part: Part, folder: Path) -> Path:
+    """Scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
         place = folder / f"open-{fit_key(FAR_M, PLATE_M)}"
         if not place.exists():
             plate = sheet(0, FAR_M, (FAR_M, FAR_M + PLATE_M), (FAR_M, FAR_M + PLATE_M))
-            with atomic_folder(place, False) as made:
-                write_scene(made, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
-        return ["--scene", str(place)]
+            with atomic_folder(place, False) as unfinished:
+                write_scene(unfinished, {"plate": ("itu_wood", plate)}, "Nothing but a small plate far away")
+        return place
     if part.scene == "lidar":
-        return ["--scene", str(meshed_scan(part.dataset, folder))]
+        return meshed_scan(part.dataset, folder)
     if part.scene == "floor":
         load_record(part.dataset)  # made where needed
-        return ["--scene", str(data_folder(part.dataset) / MEASURED)]
-    if part.scene == "flat":
-        layout = data_folder(part.dataset) / "layout.csv"
-        made = folder / f"flat-{fit_key(layout, FLAT_HEIGHT_M)}"
-        if not made.exists():
-            make_scene(layout, made, height_m=FLAT_HEIGHT_M)  # whole, or not at all
-        return ["--scene", str(made)]
-    raise ValueError(f"{part.scene}: no scene of a part")
+        return data_folder(part.dataset) / MEASURED
+    layout = data_folder(part.dataset) / "layout.csv"
+    place = folder / f"flat-{fit_key(layout, FLAT_HEIGHT_M)}"
+    if not place.exists():
+        make_scene(layout, place, height_m=FLAT_HEIGHT_M)  # whole, or not at all
+    return place
+
+
+def scene_of_data(dataset: str, folder: Path) -> str | None:
+    """Scene of a data set, made in ``folder`` where needed, as its part of the tables or else its scan states it.
+
+    None: nothing is known but free space.
+    """
+    part = next((part for part in PARTS if part.dataset == dataset), None)
+    if part is None:
+        return str(meshed_scan(dataset, folder))
+    return None if part.scene == "open" else str(scene_of(part, folder))
 
 
 def meshed_scan(dataset: str, folder: Path) -> Path:
@@ -85,54 +90,43 @@ def meshed_scan(dataset: str, folder: Path) -> Path:
 
 def corrected_scene(row: Row, folder: Path) -> Path:
     """Scene of a row in ``folder``, corrected by its training rows."""
-    stated = scene_of(row.part, folder)[1]
+    stated = scene_of(row.part, folder)
     scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
     if not scene.exists():
-        run_command(["correct", stated, row.part.dataset, *row.rows], scene, resumes=False)
+        run_command(["correct", str(stated), row.part.dataset, *row.rows], scene, resumes=False)
     return scene
 
 
-def _scene(row: Row, runs: Path) -> list[str]:
-    if CORRECTED in row.entry.arguments:
-        return ["--scene", str(corrected_scene(row, runs / "scenes"))]
-    return scene_of(row.part, runs / "scenes") if NAMED in row.entry.arguments else []
+def _scenes(row: Row, place: Path) -> list[Path]:
+    if not row.entry.scene:
+        return []
+    return [corrected_scene(row, place) if row.entry.scene == CORRECTED else scene_of(row.part, place)]
 
 
 def measure(runs: Path, row: Row) -> dict[str, Any]:
     """Figures of a row, from a finished run of the same key or a new one."""
-    scene = _scene(row, runs)
-    data = _data_digest(row.part.dataset)
+    scenes, data = _scenes(row, runs / "scenes"), _data_digest(row.part.dataset)
     source = source_digests(*modules_of_command(row.command.split()))
-    folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scene[1:]])}"
+    folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scenes])}"
     wall = None
     if is_finished(folder):
-        print(
-            f"tables: {row.name}: finished before in {folder}, with the same source, data and versions", file=sys.stderr
-        )
+        say("tables", f"{row.name}: finished before in {folder}, with the same source, data and versions")
     else:
         # Ray tracing takes seconds and cannot be resumed.
         resumes = not row.method.startswith("ray-tracing")
         if folder.exists() and not (resumes and (folder / CONFIG).exists()):
             shutil.rmtree(folder)  # stopped before its configuration was written
+        scene = ["--scene", str(scenes[0])] if scenes else []
         wall = run_command(row.arguments(scene), folder, resumes=resumes)
     run = read_run(folder)
     scores = np.sort(run.score[~np.isnan(run.score)])
     figures = {key: run.metrics[key] for key in KEPT}
-    if CORRECTED in row.entry.arguments:
-        figures["train_seconds"] += json.loads((Path(scene[1]) / CORRECTION).read_text(encoding="utf-8"))["seconds"]
-    return {
-        "row": row.name,
-        "label": row.entry.label,
-        "share": row.share,
-        "seed": row.seed,
-        "command": row.command,
-        **provenance(*modules_of_command(row.command.split())),
-        "data": data,
-        "wall_seconds": wall,
-        **figures,
-        "score": summary(scores),
-        "quantiles": [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))],
-    }
+    if row.entry.scene == CORRECTED:
+        figures["train_seconds"] += json.loads((scenes[0] / CORRECTION).read_text(encoding="utf-8"))["seconds"]
+    facts = {"row": row.name, "label": row.entry.label, "share": row.share, "seed": row.seed, "command": row.command}
+    facts |= {**provenance(*modules_of_command(row.command.split())), "data": data, "wall_seconds": wall, **figures}
+    quantiles = [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))]
+    return {**facts, "score": summary(scores), "quantiles": quantiles}
 
 
 def tables(
@@ -146,35 +140,32 @@ def tables(
     place.mkdir(parents=True, exist_ok=True)
     remove_leftovers(place)
     rows = plan(quick)
-    missing = sorted({row.part.dataset for row in rows if not available(row.part)})
-    for name in missing:
-        print(f"tables: data set {name} is not on this machine and is left out; see wrf-mi data list", file=sys.stderr)
+    for name in sorted({row.part.dataset for row in rows if not available(row.part)}):
+        say("tables", f"data set {name} is not on this machine and is left out; see wrf-mi data list")
     stored, digests = {row["row"]: row for row in read_rows(place)}, dict[str, str]()
     left = [row for row in rows if available(row.part) and not _holds(stored.get(row.name), row, digests)]
-    print(f"tables: {len(left)} of {len(rows)} rows to measure; results in {place}", file=sys.stderr)
+    say("tables", f"{len(left)} of {len(rows)} rows to measure; results in {place}")
     _report_versions([stored[row.name] for row in rows if row.name in stored and row not in left])
-    begun = time.perf_counter()
-    failures: list[str] = []
+    begun, failures = time.perf_counter(), list[str]()
 
     def each(index: int, result: dict[str, Any] | str) -> None:
         if isinstance(result, str):
             if result:
                 failures.append(result)
-                print(f"tables: {result}", file=sys.stderr, flush=True)
+                say("tables", result)
             return
         write_atomically(place / f"{left[index].name}.json", json.dumps(result, indent=1) + "\n")
-        text = f"{result['row']}: median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s"
-        print(text, file=sys.stderr, flush=True)
+        say(result["row"], f"median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s")
         write_tables(place, quick)
 
-    for part in dict.fromkeys(row.part for row in left if {NAMED, CORRECTED} & set(row.entry.arguments)):
+    for part in dict.fromkeys(row.part for row in left if row.entry.scene):
         # Before workers need them at the same time; failures are reported row by row.
         with suppress(InputError):
             scene_of(part, runs / place.name / "scenes")
     call = partial(_guarded, runs / place.name, None if most_s is None else time.time() + most_s)
     (scheduler or Scheduler()).map(call, left, what="measuring", each=each)
     write_tables(place, quick)
-    print(f"tables: {place / 'README.md'} after {(time.perf_counter() - begun) / 60:.0f} min", file=sys.stderr)
+    say("tables", f"{place / 'README.md'} after {(time.perf_counter() - begun) / 60:.0f} min")
     if failures:
         raise BenchFailed(f"tables: {len(failures)} rows did not finish: {failures[0]}")
     return read_rows(place)
@@ -206,8 +197,7 @@ def _report_versions(rows: Sequence[Mapping[str, Any]]) -> None:
     silent = sum("data" not in row for row in rows)
     for count, what in ((others, "were measured by other versions of packages"), (silent, "do not state their data")):
         if count:
-            text = f"tables: {count} of {len(rows)} stored rows {what} and are kept; delete their files to measure them"
-            print(text, file=sys.stderr)
+            say("tables", f"{count} of {len(rows)} stored rows {what} and are kept; delete their files to measure them")
 
 
 def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:

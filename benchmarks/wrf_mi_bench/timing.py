@@ -1,4 +1,4 @@
-"""Time of a call, its shares of tracing, code generation and execution, and its memory.
+"""Time of a call, the history of its kernels, and its memory.
 
 Calls are compared by *interleaved pairs* in one process: a changing load affects both alike, so that the ratio of a
 pair varies far less than either time.
@@ -6,8 +6,6 @@ pair varies far less than either time.
 Memory is the largest resident memory during a call less that before it, after the caches of Dr.Jit and the C library
 are emptied. Linux resets its peak on request; elsewhere the process is sampled every millisecond.
 """
-
-from __future__ import annotations
 
 import ctypes
 import gc
@@ -39,17 +37,6 @@ RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 LOOK_EVERY_S = 1e-3
 
 
-@dataclass(frozen=True)
-class Split:
-    """Shares of the time of a call, in ms."""
-
-    tracing: float  # Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder
-    code_generation: float  # generation of kernels that were not in the cache, with LLVM's or CUDA's compiler
-    execution: float  # execution of kernels; concurrent ones count in full, up to the time of the call
-    kernels: int  # number of launched kernels, reductions and sorts included
-    compiled: int  # number of compiled kernels among them
-
-
 def settle(result: Any) -> None:
     """Evaluate Dr.Jit arrays of a result and wait for all kernels."""
     dr.eval(result)
@@ -64,7 +51,6 @@ class Within:
     context: Callable[[], AbstractContextManager[Any]]  # function that returns the context
 
     def __call__(self) -> Any:
-        """Result of the call in its context."""
         with self.context():
             return self.call()
 
@@ -126,29 +112,14 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
     return bootstrap(ours / theirs)
 
 
-def history_of(call: Call, again: bool = False) -> tuple[float, list[dict[str, Any]]]:
-    """Time of a call in ms, and Dr.Jit's history of its kernels.
-
-    A frozen function that was recorded without the history is recorded again by the first call, which is made before
-    where ``again`` is given.
-    """
+def history_of(call: Call) -> tuple[float, list[dict[str, Any]]]:
+    """Time of a call in ms, and Dr.Jit's history of its kernels."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        if again:
-            call()
+        settle(call())  # functions that were recorded without the history are recorded again
         dr.sync_thread()
         dr.kernel_history_clear()
         total_ms = 1e3 * seconds(call)
         return total_ms, dr.kernel_history()
-
-
-def split(call: Call) -> Split:
-    """Shares of the time of a call, see `history_of`."""
-    total_ms, history = history_of(call)
-    generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
-    # Kernels may run concurrently with each other and with the recording of the next.
-    executed = min(sum(entry["execution_time"] for entry in history), max(total_ms - generated, 0.0))
-    compiled = sum(not entry.get("cache_hit", 1) for entry in history)
-    return Split(max(total_ms - generated - executed, 0.0), generated, executed, len(history), compiled)
 
 
 def memory_mb(call: Call) -> float:
@@ -168,8 +139,7 @@ def memory_mb(call: Call) -> float:
         peak = 1024 * int(line.split()[1])
     else:
         peak = _watched(call)
-    result: float = max(peak - before, 0) / 1e6
-    return result
+    return float(max(peak - before, 0) / 1e6)
 
 
 def _watched(call: Call) -> int:
@@ -188,8 +158,7 @@ def _watched(call: Call) -> int:
     finally:
         done.set()
         thread.join()
-    result: int = max(peak[0], process.memory_info().rss)
-    return result
+    return int(max(peak[0], process.memory_info().rss))
 
 
 def exponent(sizes: Sequence[float], times: Sequence[ArrayLike], seed: int = 0) -> Interval:

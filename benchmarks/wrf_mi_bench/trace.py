@@ -1,7 +1,5 @@
 """Ray tracing compared with MATLAB's image method in two CAD rooms (the NeWRF data)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -62,9 +60,8 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
     ours, theirs = match_paths((paths.tx, paths.length_m, point), (row, length, data["path_last_point"]))
     extra = np.setdiff1d(np.arange(len(paths)), ours)
     missing = np.setdiff1d(np.arange(len(row)), theirs)
-    confirmed = confirm_paths(
-        paths.select(extra), data["rx_pos"], access_point.position_m, scene_surfaces(scene).triangles
-    )
+    triangles = scene_surfaces(scene).triangles
+    confirmed = confirm_paths(paths.select(extra), data["rx_pos"], access_point.position_m, triangles)
     last = np.linalg.norm(data["path_last_point"][missing] - data["rx_pos"][row[missing]], axis=1)
     free_space = replace(paths, gain=(wavelength / (4 * np.pi * paths.length_m)).astype(complex))
     # An error relative to a channel that is zero, as where MATLAB has no path, is not defined.

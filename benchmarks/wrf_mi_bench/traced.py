@@ -9,8 +9,6 @@ and recovered by subtracting the third, as the blending is linear. The integrato
 64 Gaussians, absorbs at most 0.9999, and makes ellipsoids of low opacity smaller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -126,16 +124,11 @@ def difference(a: Image, b: Image) -> dict[str, float]:
 
 def against_splatted(fields: int = 20, **field: Any) -> list[dict[str, float]]:
     """`difference` of traced and splatted for each blending on each of ``fields`` random fields."""
-    result = []
-    for seed in range(fields):
-        for blending in BLENDINGS:
-            gaussians, receiver = random_field(seed, blending, **field)
-            result.append(difference(traced(gaussians, receiver), splatted(gaussians, receiver)))
-    return result
+    scenes = (random_field(seed, blending, **field) for seed in range(fields) for blending in BLENDINGS)
+    return [difference(traced(*scene), splatted(*scene)) for scene in scenes]
 
 
 def worst(differences: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The worst of several `difference`."""
     return {
         "lowest_ssim": min(f["ssim"] for f in differences),
         "largest_magnitude_error": max(f["magnitude_error"] for f in differences),
@@ -206,7 +199,8 @@ class StockRenderer:
         """Complex field [height, width] of Gaussians of one transmitter with opacities (alpha blending)."""
         if gaussians.opacity is None or gaussians.batch != 1:
             raise ValueError("volprim_rf_basic blends by opacity, and Gaussians of one transmitter; give such")
-        columns = [*gaussians.position, *gaussians.scale, *_normalised(gaussians.rotation)]
+        inverse = dr.rsqrt(sum(q * q for q in gaussians.rotation))
+        columns = [*gaussians.position, *gaussians.scale, *(q * inverse for q in gaussians.rotation)]
         dr.eval(columns, gaussians.signal, gaussians.opacity)
         signal = np.stack([part.numpy() for part in gaussians.signal], axis=1)
         top = float(np.hypot(*signal.T).max()) or 1.0
@@ -252,11 +246,6 @@ class StockRenderer:
                 },
             }
         )
-
-
-def _normalised(quaternion: list[Any]) -> list[Any]:
-    length = dr.rsqrt(sum(q * q for q in quaternion))
-    return [q * length for q in quaternion]
 
 
 def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, float]:

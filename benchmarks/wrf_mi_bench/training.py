@@ -4,8 +4,6 @@ Each fit runs in a subprocess. Steps have as many Gaussians as the fit ended wit
 large matrix product and of memory; operations and bytes of a step are counted from the shapes of its arrays.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections import Counter
@@ -58,27 +56,21 @@ class Work:
     splat_gflop: float
     moved_gb: float
 
-    @property
-    def gflop(self) -> float:
-        """Operations of networks and splatting."""
-        return self.network_gflop + self.splat_gflop
-
 
 def fit(model: str) -> dict[str, Any]:
     """Time, memory and accuracy of a fit with default settings on the authors' split, in a subprocess."""
-    before = _children_seconds()
+
+    def processor_s() -> float:
+        times = psutil.Process().cpu_times()  # of all finished subprocesses
+        return float(times.children_user + times.children_system)
+
+    before = processor_s()
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "run"
         run_command(("train", DATA, "--model", model), folder, "bench training: ")
         metrics = json.loads((folder / METRICS).read_text())
     figures = {key: metrics.get(key) for key in ("peak_memory_mb", "ssim", "gaussians", "steps")}
-    return {"seconds": metrics["train_seconds"], "processor_seconds": _children_seconds() - before, **figures}
-
-
-def _children_seconds() -> float:
-    """Processor time of all finished subprocesses."""
-    times = psutil.Process().cpu_times()
-    return float(times.children_user + times.children_system)
+    return {"seconds": metrics["train_seconds"], "processor_seconds": processor_s() - before, **figures}
 
 
 def trainer(model: str, gaussians: int, batch: int) -> Trainer:
@@ -101,17 +93,14 @@ def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
 def work_of(of: Trainer) -> Work:
     """Operations and bytes of a step, from the shapes of its arrays."""
     shapes = {name: tuple(value.shape) for name, value in of.state.mean.items()}
-    n, batch = shapes["position"][1], of.config.batch
-    height, width = of.graph.form.size
-    pixels = height * width
+    n, batch, pixels = shapes["position"][1], of.config.batch, int(np.prod(of.graph.form.size))
     flop, moved = 0.0, 0.0
     for name, shape in shapes.items():
         if "." not in name or name.endswith(".bias"):
             continue
         columns = _columns(name, n, batch)
         # Backwards once for the weights and, where it depends on parameters, once for the input.
-        encoded = name.endswith((".position", ".transmitter"))
-        products = 2 if encoded else 3
+        products = 2 if name.endswith((".position", ".transmitter")) else 3
         outputs, inputs = shape
         flop += products * 2 * outputs * inputs * columns
         # Operands and result of each, and the layer's bias and rectifier, forwards and backwards.
@@ -169,7 +158,7 @@ PRODUCTS, WALKS = "products of networks", "two longest kernels, the walks of spl
 
 def shares(call: Callable[[], Any]) -> dict[str, float]:
     """Shares of the time of a call by kind of work, from Dr.Jit's kernel history."""
-    total_ms, history = history_of(call, again=True)  # recorded again, as recordings depend on the history's flag
+    total_ms, history = history_of(call)
     by_kind: Counter[str] = Counter()
     by_kernel: Counter[str] = Counter()
     for entry in history:
@@ -179,12 +168,8 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
             by_kernel[str(entry["hash"])] += entry["execution_time"]
     walks = sum(time for _, time in by_kernel.most_common(2))
     products, kernels = by_kind.pop("BatchedGemm", 0.0), by_kind.pop("JIT", 0.0)
-    parts = {
-        PRODUCTS: products,
-        WALKS: walks,
-        "other kernels": kernels - walks,
-        "sorts, sums and copies": sum(by_kind.values()),
-    }
+    parts = {PRODUCTS: products, WALKS: walks, "other kernels": kernels - walks}
+    parts["sorts, sums and copies"] = sum(by_kind.values())
     parts["launching them, Python"] = max(total_ms - sum(parts.values()), 0.0)
     return {name: value / total_ms for name, value in parts.items()}
 
@@ -204,15 +189,10 @@ def main() -> dict[str, Any]:
     times = interleaved(calls, ROUNDS)
     peak = 2e-6 * PRODUCT_SIZE**3 / bootstrap(times["product"], statistic=np.min).value
     stream = 8e-6 * STREAM_FLOATS / bootstrap(times["stream"], statistic=np.min).value
-    of_steps = {
-        name: {
-            "ms": asdict(bootstrap(times[name] / STEPS)),
-            "least_ms": float(times[name].min() / STEPS),
-            "work": asdict(work_of(of)),
-            "shares": shares(steps[name]),
-        }
-        for name, of in trainers.items()
-    }
+    of_steps: dict[str, dict[str, Any]] = {}
+    for name, of in trainers.items():
+        of_steps[name] = {"ms": asdict(bootstrap(times[name] / STEPS)), "least_ms": float(times[name].min() / STEPS)}
+        of_steps[name] |= {"work": asdict(work_of(of)), "shares": shares(steps[name])}
     machine = {"product_gflop_s": peak, "stream_gb_s": stream}
     return {"rows": rows(fits, of_steps, machine), "fits": fits, "steps": of_steps, "machine": machine}
 
@@ -220,15 +200,12 @@ def main() -> dict[str, Any]:
 def rows(
     fits: Mapping[str, Mapping[str, Any]], steps: Mapping[str, Mapping[str, Any]], machine: Mapping[str, float]
 ) -> list[dict[str, str]]:
-    """Lines of the table."""
     peak, stream = machine["product_gflop_s"], machine["stream_gb_s"]
     best = f"{peak:.0f} GFLOP/s in a product, {stream:.1f} GB/s read and written"
     lines = [line("the machine's best", best)]
     for model, run in fits.items():
-        value = (
-            f"{run['seconds']:.0f} s, of processors {run['processor_seconds']:.0f} s; {run['peak_memory_mb']:.0f} MB; "
-            f"median SSIM {run['ssim']['median']:.3f}"
-        )
+        value = f"{run['seconds']:.0f} s, of processors {run['processor_seconds']:.0f} s; "
+        value += f"{run['peak_memory_mb']:.0f} MB; median SSIM {run['ssim']['median']:.3f}"
         asked = f"{ASKED_S} s, {ASKED_MB} MB" if model in ("wrf-gs+", "kriging") else ""
         lines.append(line(f"{TITLES[model]}, fit to its final accuracy", value, asked))
     for name, run in steps.items():
@@ -236,11 +213,9 @@ def rows(
         where = f"{title}, a step of {batch} transmitter{'s' if int(batch) > 1 else ''}"
         work, ms = Work(**run["work"]), Interval(**run["ms"])
         # At best arithmetic and transfers overlap.
-        limit_ms = 1e3 * max(work.gflop / peak, work.moved_gb / stream)
-        value = (
-            f"{ms} ms; {work.network_gflop:.3f} GFLOP in networks, {work.splat_gflop:.3f} in splatting, "
-            f"{1e3 * work.moved_gb:.0f} MB moved: at least {limit_ms:.2f} ms, {100 * limit_ms / ms.value:.0f} %"
-        )
+        limit_ms = 1e3 * max((work.network_gflop + work.splat_gflop) / peak, work.moved_gb / stream)
+        value = f"{ms} ms; {work.network_gflop:.3f} GFLOP in networks, {work.splat_gflop:.3f} in splatting, "
+        value += f"{1e3 * work.moved_gb:.0f} MB moved: at least {limit_ms:.2f} ms, {100 * limit_ms / ms.value:.0f} %"
         lines.append(line(where, value))
         parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in run["shares"].items())
         lines.append(line(f"{where}: where its time goes", parts))

@@ -6,8 +6,6 @@ intervals are 95 % bootstrap intervals over rows. Each fold of each seed is stor
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,10 +29,10 @@ from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import MEASURED, data_folder, line, measured_on, stored_part
-from .fit_key import fit_key, source_files
+from .sources import fit_key, source_files
 from .stages import TRANSMISSION
-from .table_plan import PARTS, SEEDS
-from .tables import meshed_scan, scene_of
+from .table_plan import SEEDS
+from .tables import scene_of_data
 
 RUNS = Path("runs/bench/unmeasured")
 LEFT = (0, 5, 20, 100)  # numbers of rows at each receiver that is held out
@@ -42,6 +40,7 @@ HYBRID, TRACED, CORRECTED = "hybrid", "ray tracing", "ray tracing, corrected sce
 KRIGING, IDW, CARRIER, LAW = "kriging", "IDW", "nearest carrier", "one law"
 OWN_HYBRID, OWN_KRIGING, OWN_TREES = "hybrid of these rows", "kriging of these rows", "trees of these rows"
 SCORE_DIGITS = 4  # decimals of stored scores: finer than any difference that is reported
+Parts = dict[str, dict[str, Callable[[], dict[str, Any]]]]  # measurements by what is held out, and by name
 PAIRS = "pairs"
 FACTS = (PAIRS, "inside_90", "crps", "task", MEASURED)
 """What is known of a measurement beside the scores of the methods."""
@@ -62,11 +61,11 @@ CARRIERS = (Held(BANDS, "frequency", None, ("materials",), 5),)
 RECEIVERS = (Held(FLOOR, "receiver", None, None, 4), Held(FLAT, "receiver", 400, None, 6))
 
 
-def corrected(held: Held, scene: str, record: Record, split: Split, folder: Path) -> str:
+def corrected(case: Held, scene: str, record: Record, split: Split, folder: Path) -> str:
     """Scene in ``folder`` that is corrected by a split's training rows, made where needed."""
     if not folder.exists():
         options: CorrectionOptions = default_options(record)
-        options = options if held.parts is None else replace(options, parts=held.parts)
+        options = options if case.parts is None else replace(options, parts=case.parts)
         write_page(correct_scene(scene, record, split, options), folder, False)
     return str(folder)
 
@@ -95,46 +94,39 @@ def _facts(hybrid: Results) -> dict[str, Any]:
     return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:-1]}}
 
 
-def at_carrier(held: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+def at_carrier(case: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]:
     """Scores of the methods at a carrier that is held out, by name; ``inside_90`` and ``crps`` of the hybrid."""
-    scene, record = _scene(held, folder.parent), load_record(held.dataset)
-    split = f"{held.kind}:{fold}"
-    (rows,) = make_splits(record, split, seed, held.n_train)
-    better = corrected(held, scene, record, rows, folder.parent / f"corrected-{folder.name}")
-    rows_used: dict[str, Any] = {"n_train": held.n_train}
-    hybrid = _run(folder, held.dataset, split, seed, "hybrid", scene=scene, **rows_used)
-    traced = _run(folder, held.dataset, split, seed, "ray-tracing", scene=scene, settings=TRANSMISSION, **rows_used)
-    again = _run(folder, held.dataset, split, seed, "ray-tracing", scene=better, settings=TRANSMISSION, **rows_used)
-    kriging = _run(folder, held.dataset, split, seed, "kriging", **rows_used)
-    return {
-        HYBRID: _scores(hybrid),
-        TRACED: _scores(traced),
-        CORRECTED: _scores(again),
-        KRIGING: _scores(kriging),
-        IDW: _scores(hybrid, hybrid.references[TASKS[hybrid.task].reference]),
-        CARRIER: _scores(hybrid, hybrid.references["carrier"]),
-        **_facts(hybrid),
-    }
+    scene, record = str(scene_of_data(case.dataset, folder.parent)), load_record(case.dataset)
+    split = f"{case.kind}:{fold}"
+    (rows,) = make_splits(record, split, seed, case.n_train)
+    better = corrected(case, scene, record, rows, folder.parent / f"corrected-{folder.name}")
+    fit = partial(_run, folder, case.dataset, split, seed, n_train=case.n_train)
+    hybrid = fit("hybrid", scene=scene)
+    scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
+    for name, where in ((TRACED, scene), (CORRECTED, better)):
+        scores[name] = _scores(fit("ray-tracing", scene=where, settings=TRANSMISSION))
+    scores[KRIGING] = _scores(fit("kriging"))
+    scores[IDW] = _scores(hybrid, hybrid.references[TASKS[hybrid.task].reference])
+    return scores | {CARRIER: _scores(hybrid, hybrid.references["carrier"]), **_facts(hybrid)}
 
 
-def at_receivers(held: Held, left: int, fold: int, seed: int, folder: Path) -> dict[str, Any]:
+def at_receivers(case: Held, left: int, fold: int, seed: int, folder: Path) -> dict[str, Any]:
     """Scores of the methods at receivers that are held out but for ``left`` rows each, as `at_carrier`.
 
     The scene is corrected without any of their rows.
     """
-    scene, record = _scene(held, folder.parent), load_record(held.dataset)
-    (none,) = make_splits(record, f"{held.kind}:{fold}", seed, held.n_train)
-    name = f"corrected-{held.dataset}-{fold}-{seed}"
-    better = corrected(held, scene, record, none, folder.parent / name)
-    split = f"{held.kind}:{fold}" if not left else f"{held.kind}+{left}:{fold}"
-    (rows,) = make_splits(record, split, seed, held.n_train)
+    scene, record = str(scene_of_data(case.dataset, folder.parent)), load_record(case.dataset)
+    (none,) = make_splits(record, f"{case.kind}:{fold}", seed, case.n_train)
+    name = f"corrected-{case.dataset}-{fold}-{seed}"
+    better = corrected(case, scene, record, none, folder.parent / name)
+    split = f"{case.kind}:{fold}" if not left else f"{case.kind}+{left}:{fold}"
+    (rows,) = make_splits(record, split, seed, case.n_train)
     hybrid = _run(folder, record, rows, seed, "hybrid", scene=scene)
     scores: dict[str, Any] = {HYBRID: _scores(hybrid)}
     if left:
-        alone, these = only(record, rows)
-        scores[OWN_HYBRID] = _scores(_run(folder, alone, these, seed, "hybrid", scene=scene))
-        scores[OWN_KRIGING] = _scores(_run(folder, alone, these, seed, "kriging"))
-        scores[OWN_TREES] = _scores(_run(folder, alone, these, seed, "trees"))
+        fit = partial(_run, folder, *only(record, rows), seed)
+        scores[OWN_HYBRID] = _scores(fit("hybrid", scene=scene))
+        scores |= {OWN_KRIGING: _scores(fit("kriging")), OWN_TREES: _scores(fit("trees"))}
     else:
         for name, where in ((TRACED, scene), (CORRECTED, better)):
             scores[name] = _scores(_run(folder, record, rows, seed, "ray-tracing", scene=where, settings=TRANSMISSION))
@@ -149,12 +141,6 @@ def only(record: Record, split: Split) -> tuple[Record, Split]:
     alone = record.seen(replace(split, left=np.concatenate([split.left, scored]))).at_receivers(split.held_receivers)
     train = np.unique(split.left[:, 1])
     return alone, Split(f"{split.name}-alone", split.seed, train, train[:0], split.test)
-
-
-def _scene(held: Held, folder: Path) -> str:
-    if held.dataset == FLAT:
-        return scene_of(next(part for part in PARTS if part.dataset == FLAT), folder)[1]
-    return str(meshed_scan(held.dataset, folder))
 
 
 def gains(measurements: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float, Any]]:
@@ -225,13 +211,13 @@ def _with_gain(row: Mapping[str, Any]) -> str:
 def carriers() -> dict[str, Any]:
     """Measure every carrier held out in turn, three seeds; parts that are stored are read."""
     place = RUNS / fit_key(source_files())
-    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
-    for held in CARRIERS:
-        hz = np.unique(load_record(held.dataset).carriers_hz)  # type: ignore[arg-type]
-        for fold in range(held.folds):
-            names = {seed: f"{held.dataset}-{fold}-{seed}" for seed in SEEDS}
-            parts[f"{held.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
-                name: partial(at_carrier, held, fold, seed, place / name) for seed, name in names.items()
+    parts: Parts = {}
+    for case in CARRIERS:
+        hz = np.unique(load_record(case.dataset).carriers_hz)  # type: ignore[arg-type]
+        for fold in range(case.folds):
+            names = {seed: f"{case.dataset}-{fold}-{seed}" for seed in SEEDS}
+            parts[f"{case.dataset}, {hz[fold] / 1e9:.1f} GHz"] = {
+                name: partial(at_carrier, case, fold, seed, place / name) for seed, name in names.items()
             }
     return _measured("new-carriers", parts)
 
@@ -240,17 +226,17 @@ def receivers() -> dict[str, Any]:
     """Measure receivers held out in turn, without and with few rows of their own, three seeds, as `carriers`."""
     data_folder(FLAT)
     place = RUNS / fit_key(source_files())
-    parts: dict[str, dict[str, Callable[[], dict[str, Any]]]] = {}
-    for held in RECEIVERS:
+    parts: Parts = {}
+    for case in RECEIVERS:
         for left in LEFT:
-            names = {(seed, k): f"{held.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(held.folds)}
-            parts[f"{held.dataset}, {left} rows at new receivers"] = {
-                name: partial(at_receivers, held, left, k, seed, place / name) for (seed, k), name in names.items()
+            names = {(seed, k): f"{case.dataset}-{left}-{k}-{seed}" for seed in SEEDS for k in range(case.folds)}
+            parts[f"{case.dataset}, {left} rows at new receivers"] = {
+                name: partial(at_receivers, case, left, k, seed, place / name) for (seed, k), name in names.items()
             }
     return _measured("new-receivers", parts)
 
 
-def _measured(benchmark: str, parts: Mapping[str, Mapping[str, Callable[[], dict[str, Any]]]]) -> dict[str, Any]:
+def _measured(benchmark: str, parts: Parts) -> dict[str, Any]:
     """Rows of the table, of stored or new measurements by name, which are pooled by what was held out."""
     rows, measurements = list[dict[str, Any]](), list[dict[str, Any]]()
     for what, works in parts.items():

@@ -1,7 +1,5 @@
 """Calls of parts of the package at a given size, for the benchmarks of time and memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +33,6 @@ def size_deg(count: int) -> float:
 
 
 def splatting(gaussians: Any, receiver: Any, height: int = HEIGHT, width: int = WIDTH) -> Call:
-    """Splatting of Gaussians."""
     pose, plane = device_pose(receiver), perception_plane(height, width, mi.Float)
     return lambda: splat(gaussians, pose, plane)
 
@@ -76,7 +73,6 @@ def tracer(options: TraceOptions) -> RayTracer:
 
 
 def record(rows: int, **more: Any) -> Record:
-    """Random spectra."""
     observation = np.random.default_rng(0).random((1, rows, HEIGHT, WIDTH)).astype(np.float32)
     facts = {"receivers": (RECEIVER,)} | more
     return Record("random", "spectrum", transmitter_path(rows), observation=observation, **facts)

@@ -24,7 +24,7 @@ from PIL import Image
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.util import logging
-from wrf_mi_bench.fit_key import fit_key, source_files
+from wrf_mi_bench.sources import fit_key, source_files
 
 from wrf_mi.core.files import write_atomically
 from wrf_mi.datasets.registry import datasets

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
-from wrf_mi_bench import plan as bench_plan
+from wrf_mi_bench import scene as bench_scene
 from wrf_mi_bench.bench import (
     CASES,
     CHECKS,
@@ -21,8 +21,8 @@ from wrf_mi_bench.bench import (
     table,
 )
 from wrf_mi_bench.check import main
-from wrf_mi_bench.pareto import fronts, read_points
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
+from wrf_mi_bench.table_pages import fronts, read_points
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -117,8 +117,8 @@ def test_checks_name_missing_data(
 
 def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
-    monkeypatch.setattr(bench_plan, "flat_plan", lambda: figures)
-    assert main("wrf_mi_bench.plan:flat_plan", str(tmp_path / "out.json")) == 0
+    monkeypatch.setattr(bench_scene, "flat_plan", lambda: figures)
+    assert main("wrf_mi_bench.scene:flat_plan", str(tmp_path / "out.json")) == 0
     assert json.loads((tmp_path / "out.json").read_text()) == figures
     line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
     assert line == "| mesh: walls | **0.9** | 0.8 |"

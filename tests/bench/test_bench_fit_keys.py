@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, fit_key, tables
+from wrf_mi_bench import bench, sources, tables
 from wrf_mi_bench.table_plan import PARTS, Row
 
 
 def other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = fit_key.versions
-    monkeypatch.setattr(fit_key, "versions", lambda: before() | {"drjit": "0.1"})
+    before = sources.versions
+    monkeypatch.setattr(sources, "versions", lambda: before() | {"drjit": "0.1"})
 
 
 @pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])

@@ -13,7 +13,7 @@ from wrf_mi.scene.plan.walls import find_walls
 
 @needs("flat-ble/lidar")
 def test_walls_from_a_robots_map_agree_with_the_layout():
-    from wrf_mi_bench.plan import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
+    from wrf_mi_bench.scene import GRID_RESOLUTION_M, GRID_ROW_0, wall_agreement
 
     from wrf_mi.scene.plan.sources import read_plan
     from wrf_mi.scene.register import best_scale, register_walls, sample_walls

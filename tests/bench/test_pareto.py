@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from wrf_mi_bench.pareto import LEAST, Points, front, fronts, pareto_figure, points_of, read_points
+from wrf_mi_bench.table_pages import LEAST, Points, front, fronts, pareto_figure, points_of, read_points
 from wrf_mi_bench.table_plan import PARTS, Row
 
 from wrf_mi.core import InputError

@@ -12,8 +12,8 @@ from calling import call
 from wrf_mi_bench import bench, check
 from wrf_mi_bench import sentinels as bench_sentinels
 from wrf_mi_bench.bench import CHECKS
-from wrf_mi_bench.fit_key import source_files
 from wrf_mi_bench.sentinels import STORED, TABLE_ROWS, Figure, Group, groups, main, median_interval
+from wrf_mi_bench.sources import source_files
 from wrf_mi_bench.tables import FOLDER
 
 from wrf_mi.core import InputError

@@ -12,11 +12,11 @@ from wrf_mi_bench.timing import (
     Interval,
     bootstrap,
     exponent,
+    history_of,
     interleaved,
     larger_half,
     memory_mb,
     ratio,
-    split,
 )
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
@@ -85,21 +85,16 @@ def test_what_slows_both_calls_leaves_their_ratio(clock: list[float]) -> None:
         ratio([1, 2], [1])
 
 
-def test_python_counts_as_tracing_and_kernels_as_execution() -> None:
-    waited = split(busy)
-    assert waited.tracing >= 1e3 * BUSY_S
-    assert waited.kernels == waited.execution == waited.code_generation == 0
+def test_history_holds_the_kernels_of_a_call() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    def kernel() -> object:
-        return dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25)
-
-    split(kernel)
-    warm = split(kernel)
-    assert warm.kernels == 1
-    assert warm.compiled == 0
-    assert warm.execution > 0
+    total_ms, history = history_of(busy)
+    assert total_ms >= 1e3 * BUSY_S
+    assert history == []
+    total_ms, (kernel,) = history_of(lambda: dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25))
+    assert kernel["cache_hit"]
+    assert 0 < kernel["execution_time"] <= total_ms
 
 
 def test_memory_is_what_a_call_needs_beyond_what_was_there() -> None:

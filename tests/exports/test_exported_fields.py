@@ -18,8 +18,7 @@ from small_fits import settings
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.angles import rotation_matrix
 from wrf_mi.exports import ExportOptions, export
-from wrf_mi.exports.field_file import import_field
-from wrf_mi.exports.gaussians import RANGE_DB
+from wrf_mi.exports.fields import RANGE_DB, import_field
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import open_run
 

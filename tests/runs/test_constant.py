@@ -17,8 +17,8 @@ from made_channels import channels
 
 from wrf_mi.core import Record, Split
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi
-from wrf_mi.runs.constant import CONSTANT, against_constant, constant_scores, unbeaten
 from wrf_mi.runs.evaluate import evaluate
+from wrf_mi.runs.results import CONSTANT, against_constant, constant_scores, unbeaten
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import ssim
 

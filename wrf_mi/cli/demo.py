@@ -54,11 +54,8 @@ def demo(out: Path | None, on_progress: OnProgress, stop: Callable[[], bool]) ->
     """Train on measured spectra, trace measured signal strengths, and draw both.
 
     Without measured spectra, those of the embedded room are used, traced in its true mesh; the ray tracer then gets
-    the mesh made from a LiDAR scan of the room.
-
-    Returns:
-        The run of the field, in ``out`` (None: a new folder in ``runs/``) with the traced one in its subfolder
-        ``traced``, and ``index.html`` with all pictures.
+    the mesh made from a LiDAR scan of the room. The run of the field is in ``out`` (None: a new folder in ``runs/``)
+    with the traced one in its subfolder ``traced``; ``index.html`` has all pictures.
     """
     from ..runs.api import train
     from ..runs.compare import compare

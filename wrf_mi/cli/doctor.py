@@ -9,7 +9,7 @@ import subprocess
 import sys
 from typing import Any
 
-from ..backend import BackendError, LlvmLibrary, choose, find_cuda, find_llvm
+from ..backend import BackendError, choose, find_cuda, find_llvm
 from ..backend.libraries import install_commands, package_manager
 from ..backend.probe import installed_version, try_cuda, try_llvm
 from ..parallel.threads import processors
@@ -44,9 +44,12 @@ def report() -> dict[str, Any]:
         if version is None:
             problems.append({"problem": f"the package {name} is not installed", "remedy": "pip install -e ."})
     complete = not problems
-    llvm = [_llvm(library) for library in find_llvm(ignore_variable=True)]
-    gpu = _gpu()
-    backend = None
+    llvm = []
+    for library in find_llvm(ignore_variable=True):
+        verdict = try_llvm(library, fresh=True)
+        number = verdict.version or ".".join(map(str, library.version))
+        llvm.append({"path": str(library.path), "version": number, "usable": verdict.usable, "reason": verdict.reason})
+    gpu, backend = _gpu(), None
     try:
         backend = vars(choose())
     except BackendError as error:
@@ -82,19 +85,17 @@ def render(state: dict[str, Any]) -> str:
     lines.append(("data", state["data"]["home"]))
     lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in state["data"]["sets"]]
     width = max(len(label) for label, _ in lines) + 2
-    text = [f"{label:<{width}}{value}" for label, value in lines]
+    rows = [f"{label:<{width}}{value}" for label, value in lines]
     for entry in state["problems"]:
-        text += ["", entry["problem"], f"  remedy: {entry['remedy']}"]
-    return "\n".join(text)
+        rows += ["", entry["problem"], f"  remedy: {entry['remedy']}"]
+    return "\n".join(rows)
 
 
 def install_llvm() -> None:
     """Install an LLVM that works, with apt, dnf or brew, unless a backend works already.
 
-    Runs as root, or with a ``sudo`` that asks for no password. The package manager prints its output.
-
-    Raises:
-        BackendError: no permission, or no working LLVM afterwards: one line with the command to run by hand.
+    Runs as root, or with a ``sudo`` that asks for no password. The package manager prints its output. `BackendError`:
+    no permission, or no working LLVM afterwards: one line with the command to run by hand.
     """
     try:
         choose()
@@ -128,12 +129,6 @@ def doctor_command(a: Arguments) -> int:
     state = report()
     show(a.json, state, render(state))
     return 0 if state["ok"] else 1
-
-
-def _llvm(library: LlvmLibrary) -> dict[str, Any]:
-    verdict = try_llvm(library, fresh=True)
-    number = verdict.version or ".".join(map(str, library.version))
-    return {"path": str(library.path), "version": number, "usable": verdict.usable, "reason": verdict.reason}
 
 
 def _gpu() -> dict[str, Any]:

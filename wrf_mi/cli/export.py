@@ -58,7 +58,7 @@ def export_command(a: Arguments) -> int:
 
 def import_command(a: Arguments) -> int:
     """Make a run folder of an exported field."""
-    from ..exports.field_file import import_field
+    from ..exports.fields import import_field
 
     run = import_field(a.file, a.out)
     print(f"{run.config.model} on {run.config.dataset}: {run.folder}")

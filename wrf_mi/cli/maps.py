@@ -71,10 +71,8 @@ def _add_locate(commands: Any) -> None:
     parser = add_command(commands, "locate", locate_command, "position of a transmitter from what receivers received")
     add = parser.add_argument
     add("run", metavar="RUN", help="run folder of a model of signal strengths that states standard deviations")
-    text = (
-        "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was received, "
-    )
-    text += "and true positions x, y in metres if known (default: the test rows of the run)"
+    text = "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was "
+    text += "received, and true positions x, y in metres if known (default: the test rows of the run)"
     add("--input", metavar="FILE.csv", help=text)
     text = "file to write: estimate x, y, z, radius and area of the region, nearest neighbours; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
@@ -100,11 +98,10 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    strengths_dbm, true_m = (
-        files.test_observations(run)
-        if a.input is None
-        else files.read_observations(a.input, run.receivers, run.config.left_out)
-    )
+    if a.input is not None:
+        strengths_dbm, true_m = files.read_observations(a.input, run.receivers, run.config.left_out)
+    else:
+        strengths_dbm, true_m = files.test_observations(run)
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
     with Watch(resumable=True) as watch:
         located = locate(run, strengths_dbm, **options, on_progress=watch.on_progress, stop=watch.stop)
@@ -119,27 +116,25 @@ def locate_command(a: Arguments) -> int:
 
 
 def _summary(figures: dict[str, Any]) -> str:
-    form, held = figures["likelihood"], figures.get("held_out")
+    form, held_out = figures["likelihood"], figures.get("held_out")
     shape = "normal" if form["degrees"] is None else f"Student-t of {form['degrees']:g} degrees of freedom"
     text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
     text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
     text += ", receivers that received nothing count" if form["silence"] else ""
-    if held is None:
+    if held_out is None:
         text += " (default: the run has too few training rows to hold any out)"
     else:
-        share = f"{held['inside']:.0%} inside their 90 % regions"
-        what = f"{held['rows']} predictions of held-out training rows"
-        text += f", chosen by {what}: {share}, mean error {held['error_m']:.2f} m"
-    known = {
-        f"area of the {figures['level']:.0%} region (m2)": figures["area_m2"],
-        f"radius of {figures['level']:.0%} (m)": figures["radius_m"],
-        "error (m)": figures.get("error_m"),
-    }
+        share = f"{held_out['inside']:.0%} inside their 90 % regions"
+        what = f"{held_out['rows']} predictions of held-out training rows"
+        text += f", chosen by {what}: {share}, mean error {held_out['error_m']:.2f} m"
+    level = f"{figures['level']:.0%}"
+    known = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
+    known["error (m)"] = figures.get("error_m")
     if "neighbours" in figures:
         known[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
     text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
-        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {figures['level']:.0%} regions"
+        text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
     return text
 
 

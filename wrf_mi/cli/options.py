@@ -110,8 +110,7 @@ def add_operator(parser: argparse.ArgumentParser) -> None:
 def check_operator(a: Arguments) -> None:
     """Refuse ``--no-operator`` for a run that predicts without one.
 
-    Raises:
-        InputError: the run's model is no learned field, or the folder is no run.
+    `InputError`: the run's model is no learned field, or the folder is no run.
     """
     if not a.no_operator:
         return
@@ -126,10 +125,6 @@ def check_operator(a: Arguments) -> None:
 
 def _number(text: str) -> int | float:
     try:
-        return int(text)
-    except ValueError:
-        pass
-    try:
-        return float(text)
+        return int(text) if text.strip().lstrip("+-").isdecimal() else float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no number") from None

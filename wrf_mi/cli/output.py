@@ -41,14 +41,15 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
     if as_json:
         return show(as_json, metrics, "")
-    from ..runs.constant import unbeaten
+    from ..runs.results import unbeaten
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]
     references = {f"{words} ({key})": metrics["reference"].get(key) for key, words in task.references.items()}
     blocks = {metrics["model"]: metrics[task.block], **references}
     print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
-    _show_stages(metrics.get("stages", []), task.label)
+    if metrics.get("stages"):
+        _show_stages(metrics["stages"], task.label)
     if metrics.get("n_not_scored"):
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     if "inside_90" in metrics:
@@ -67,26 +68,20 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
 
 def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
     """Print what each stage of a fit contributes on held-out training rows and on test rows, and what it costs."""
-    if not reports:
-        return
     scores = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f")
     columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".3g")
     print(f"{'stage, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for report in reports:
         cells = [f"{report[key]:{form}}" if report.get(key) is not None else "" for key, _, form in columns]
-        print(
-            f"{report['stage']:<34}"
-            + "".join(f"{cell:>15}" for cell in cells)
-            + ("" if report["kept"] else "  not kept")
-        )
+        mark = "" if report["kept"] else "  not kept"
+        print(f"{report['stage']:<34}" + "".join(f"{cell:>15}" for cell in cells) + mark)
 
 
 class Watch:
     """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
-    Args:
-        resumable: whether the work asks `stop` and can go on later: the first Ctrl-C then lets the current step finish
-            and writes a checkpoint, and a second one ends at once.
+    The first Ctrl-C lets the current step of ``resumable`` work, which asks `stop` and can go on later, finish and
+    write a checkpoint; a second one ends at once.
     """
 
     def __init__(self, resumable: bool = False) -> None:
@@ -97,9 +92,7 @@ class Watch:
         )
         self._task: Any = None
         self._stage: str | None = None
-        self._score = ""
-        self._stop = False
-        self._begun = 0.0
+        self._score, self._stop, self._begun = "", False, 0.0
 
     def __enter__(self) -> Watch:
         """Handle Ctrl-C."""
@@ -130,7 +123,11 @@ class Watch:
         if new:
             self._stage, self._task, self._score = stage, None, ""
             self._begun = time.perf_counter()
-        text = self._left(fraction) if progress is None else self._text(progress)
+        if progress is not None:
+            text = self._text(progress)
+        else:  # as if the stage went on as fast as so far
+            begun = 0 < fraction < 1
+            text = _minutes((time.perf_counter() - self._begun) * (1 - fraction) / fraction) if begun else ""
         if self._console.is_terminal:
             if self._task is None:
                 self._bar.start()  # not before: the tracer has a bar of its own
@@ -141,12 +138,6 @@ class Watch:
             print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
         elif progress is None and new:
             print(stage, file=sys.stderr, flush=True)
-
-    def _left(self, fraction: float) -> str:
-        """Time left of a stage that has gone on as fast as so far; empty at its start."""
-        if not 0 < fraction < 1:
-            return ""
-        return _minutes((time.perf_counter() - self._begun) * (1 - fraction) / fraction)
 
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows

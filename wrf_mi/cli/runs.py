@@ -21,9 +21,7 @@ def _add_evaluate(commands: Any) -> None:
     parser.add_argument("run", metavar="RUN", help="run folder")
     text = "score on the test rows of another split that the run was not trained on; nothing is written"
     parser.add_argument("--split", help=text)
-    text = (
-        "draw how reliable probabilities of coverage are on the test rows, P(level > threshold) against observed share"
-    )
+    text = "draw how reliable probabilities of coverage are on test rows, P(level > threshold) against observed share"
     parser.add_argument("--reliability", metavar="FILE.png", help=text)
     add_operator(parser)
 
@@ -38,23 +36,19 @@ def evaluate_command(a: Arguments) -> int:
         raise InputError(f"{a.reliability}: the picture is written as .png; give such a name")
     check_operator(a)
     metrics = evaluate_run(a.run, a.split, not a.no_operator)
-    if a.reliability is not None:
-        metrics["coverage"] = _reliability(Path(a.run), Path(a.reliability))
-    show_metrics(metrics, None if a.split else Path(a.run), a.json)
-    if a.reliability is not None and not a.json:
-        error, score = metrics["coverage"]["error"], metrics["coverage"]["brier"]
-        print(f"coverage: observed share off by {error:.3f} on average, Brier score {score:.3f}: {a.reliability}")
-    return 0
-
-
-def _reliability(run: Path, picture: Path) -> dict[str, Any]:
-    """Draw the reliability of coverage; its errors and thresholds."""
+    if a.reliability is None:
+        return show_metrics(metrics, None if a.split else Path(a.run), a.json)
     from ..core.files import write_figure
     from ..maps.coverage import reliability_figure, run_reliability
 
-    result = run_reliability(run)
-    write_figure(picture, reliability_figure({run.resolve().name: result}))
-    return {"error": result.error, "brier": result.brier, "threshold_db": result.threshold_db.tolist()}
+    result = run_reliability(a.run)
+    write_figure(Path(a.reliability), reliability_figure({Path(a.run).resolve().name: result}))
+    coverage = {"error": result.error, "brier": result.brier, "threshold_db": result.threshold_db.tolist()}
+    show_metrics(metrics | {"coverage": coverage}, Path(a.run), a.json)
+    if not a.json:
+        text = f"off by {result.error:.3f} on average, Brier score {result.brier:.3f}"
+        print(f"coverage: observed share {text}: {a.reliability}")
+    return 0
 
 
 def _add_predict(commands: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ..backend import init
 from ..core import AntennaOptions, InputError
 from ..core.yaml_files import read_yaml
-from .options import (
-    DATASET,
-    Arguments,
-    Parser,
-    add_command,
-    add_n_train,
-    add_scheduler,
-    add_tracing,
-    add_training,
-)
+from .options import DATASET, Arguments, Parser, add_command, add_n_train, add_scheduler, add_tracing, add_training
 from .output import Watch, show, show_metrics
 
 if TYPE_CHECKING:
@@ -49,8 +41,7 @@ def _add_train(commands: Any) -> None:
 def train_command(a: Arguments) -> int:
     """Fit any model, or continue a stopped fit."""
     if a.help_settings:
-        print(_settings_text())
-        return 0
+        return _show_settings()
     if a.resume:
         values = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
         if any(value is not None and value is not False and value != [] for value in values):
@@ -75,21 +66,14 @@ def run_training(a: Arguments, **more: Any) -> int:
 
 
 def _resume(a: Arguments) -> int:
-    if _is_deterministic(Path(a.resume)):
-        init("llvm", threads=1)
+    with suppress(InputError):  # `read_config`, which chooses a backend, reports the error
+        if read_yaml(Path(a.resume) / "config.yaml").get("deterministic"):
+            init("llvm", threads=1)
     from ..runs.api import resume
 
     with Watch(resumable=True) as watch:
         run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
-
-
-def _is_deterministic(folder: Path) -> bool:
-    """Whether a run's settings ask for determinism; read as plain YAML, since `read_config` chooses a backend."""
-    try:
-        return bool(read_yaml(folder / "config.yaml").get("deterministic"))
-    except InputError:
-        return False  # `read_config` reports the error
 
 
 def training_request(a: Arguments) -> RunRequest:
@@ -103,20 +87,14 @@ def training_request(a: Arguments) -> RunRequest:
     if model == RAY_TRACING:
         settings = [*_tracing_settings(a), *settings]
     elif any(getattr(a, name) is not None for name in TRACING):
-        raise InputError(
-            f"--paths, --depth, --reflections, --rays, --phase-error and --calibrate belong to --model {RAY_TRACING}"
-        )
+        listed = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate"
+        raise InputError(f"{listed} belong to --model {RAY_TRACING}")
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
     names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
-    return RunRequest(
-        model,
-        settings=settings,
-        antennas=AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
-        split="official" if a.split is None else a.split,
-        seed=a.seed or 0,
-        **{name: getattr(a, name) for name in names},
-    )
+    stated = {name: getattr(a, name) for name in names} | {"split": a.split or "official", "seed": a.seed or 0}
+    antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
+    return RunRequest(model, settings=settings, antennas=antennas, **stated)
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
@@ -168,7 +146,7 @@ def _tracing_settings(a: Arguments) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in stated.items()]
 
 
-def _settings_text() -> str:
+def _show_settings() -> int:
     from ..core.settings import describe
     from ..models import MODELS
 
@@ -176,7 +154,8 @@ def _settings_text() -> str:
     for name, model in MODELS.items():
         for data, kind in model.settings_by_data().items():
             names.setdefault(kind, []).append(f"{name}, {data}" if data else name)
-    return "\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items())
+    print("\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items()))
+    return 0
 
 
 def _add_trace(commands: Any) -> None:
@@ -207,7 +186,11 @@ def trace_command(a: Arguments) -> int:
     if a.calibrate is not None and a.scheduler is not None:
         raise InputError("trace: --calibrate trains in one process; omit --scheduler")
     if a.deepmimo is not None:
-        _check_deepmimo(a)
+        from ..tracing.deepmimo import check_deepmimo_folder
+
+        if a.calibrate is not None:
+            raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
+        check_deepmimo_folder(a.deepmimo)
     with open_scheduler(a.scheduler) as scheduler:
         status = run_training(a, scheduler=scheduler if a.scheduler else None)
     if a.deepmimo is not None:
@@ -216,14 +199,6 @@ def trace_command(a: Arguments) -> int:
 
         write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS))
     return status
-
-
-def _check_deepmimo(a: Arguments) -> None:
-    from ..tracing.deepmimo import check_deepmimo_folder
-
-    if a.calibrate is not None:
-        raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
-    check_deepmimo_folder(a.deepmimo)
 
 
 def _add_sweep(commands: Any) -> None:

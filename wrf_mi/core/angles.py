@@ -27,15 +27,7 @@ def azimuth_rad(width: int) -> FloatArray:
 
 
 def unit_vectors(azimuth: ArrayLike, elevation: ArrayLike) -> FloatArray:
-    """Unit vectors of directions in the receiver's frame.
-
-    Args:
-        azimuth: radians, any shape.
-        elevation: radians, a shape that broadcasts with ``azimuth``.
-
-    Returns:
-        Vectors of the broadcast shape with a last axis (x, y, z).
-    """
+    """Unit vectors [..., 3] of directions in the receiver's frame, of angles in radians whose shapes broadcast."""
     az, el = np.broadcast_arrays(np.asarray(azimuth, float), np.asarray(elevation, float))
     return np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
 
@@ -58,9 +50,7 @@ def solid_angles(height: int, width: int) -> FloatArray:
 def azimuth_elevation(vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Azimuth in [0, 2 pi) and elevation in [-pi/2, pi/2], in radians, of vectors [..., 3]."""
     v = np.asarray(vectors, float)
-    azimuth = np.arctan2(v[..., 1], v[..., 0]) % (2 * np.pi)
-    elevation = np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
-    return azimuth, elevation
+    return np.arctan2(v[..., 1], v[..., 0]) % (2 * np.pi), np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
 
 
 def rotation_matrix(quaternion_xyzw: ArrayLike) -> FloatArray:

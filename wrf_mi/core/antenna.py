@@ -14,20 +14,15 @@ from .errors import InputError
 
 OMNIDIRECTIONAL = ("iso", "dipole", "hw_dipole")
 """Sionna RT's antenna patterns without dependence on azimuth: isotropic, short and half-wave dipole."""
-PATTERNS = (*OMNIDIRECTIONAL, "tr38901")
-"""Sionna RT's antenna patterns; the last is the element of 3GPP TR 38.901."""
-POLARIZATIONS = ("V", "H")
-"""Sionna RT's polarisations with one port: slant angles of 0 and 90 degrees."""
+PATTERNS = (*OMNIDIRECTIONAL, "tr38901")  # Sionna RT's antenna patterns; the last is the element of 3GPP TR 38.901
+POLARIZATIONS = ("V", "H")  # Sionna RT's polarisations with one port: slant angles of 0 and 90 degrees
 FRAMES = ("world", "array")
 
 # Arrays of a Sionna RT device lie in y-z with boresight +x: array x = device y, array y = device z, array z = device x.
 DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-"""Quaternion of a frame parallel to the world's."""
-POLE = 1e-12
-"""Squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does."""
-WIDTH_RAD = math.radians(65)
-"""Half-power width of the directional element."""
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion of a frame parallel to the world's
+POLE = 1e-12  # squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does
+WIDTH_RAD = math.radians(65)  # half-power width of the directional element
 
 
 @dataclass(frozen=True)
@@ -54,14 +49,12 @@ class Antenna:
 
     def __post_init__(self) -> None:
         for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
-            if getattr(self, name) not in known:
-                text = f"antenna: {name} is {str(getattr(self, name))[:40]!r}; choose from {', '.join(known)}"
-                raise InputError(text)
+            if (value := getattr(self, name)) not in known:
+                raise InputError(f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(known)}")
         if self.pattern == "tr38901" and self.frame == "world":
-            raise InputError(
-                "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
-                "(--rx-frame array), or for transmitters and anchors one of " + ", ".join(OMNIDIRECTIONAL)
-            )
+            text = "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
+            text += "(--rx-frame array), or for transmitters and anchors one of "
+            raise InputError(text + ", ".join(OMNIDIRECTIONAL))
 
     @property
     def turned(self) -> Antenna:
@@ -82,8 +75,7 @@ class Antenna:
         Source: Sionna RT's antenna patterns; Balanis, "Antenna Theory" (1997), equations 4-26a and 4-84; 3GPP
         TR 38.901, table 7.3-1 and equations 7.3-4 and 7.3-5.
         """
-        u = np.asarray(directions, float)
-        return np.stack(self.components(np, *np.moveaxis(u, -1, 0)), axis=-1)
+        return np.stack(self.components(np, *np.moveaxis(np.asarray(directions, float), -1, 0)), axis=-1)
 
     def components(self, arrays: Any, x: Any, y: Any, z: Any) -> list[Any]:
         """Components of `field` for unit vectors, with derivatives where ``arrays`` is Dr.Jit in place of NumPy."""
@@ -116,8 +108,7 @@ class MountedAntenna:
     to_world: FloatArray
 
 
-ANTENNA = Antenna()
-"""The default: isotropic, polarised along the vertical of the world."""
+ANTENNA = Antenna()  # the default: isotropic, polarised along the vertical of the world
 
 
 @dataclass(frozen=True)
@@ -137,12 +128,10 @@ class AntennaOptions:
     def replaced(self, antenna: Antenna, end: Literal["rx", "tx"]) -> Antenna:
         """An antenna of the data, of a receiver or a transmitter, with the attributes that are stated for this end.
 
-        Raises:
-            InputError: names that `Antenna` refuses.
+        `InputError`: names that `Antenna` refuses.
         """
         stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
         return replace(antenna, **{name: value for name, value in stated.items() if value is not None})
 
 
-AS_STATED = AntennaOptions()
-"""Antennas as in the data."""
+AS_STATED = AntennaOptions()  # antennas as in the data

@@ -19,42 +19,31 @@ from .digest import content_digest
 from .files import atomic_file
 from .memory import require_memory
 
-CHECKSUM = "wrf_mi/sha256"
-"""Key of the SHA-256 of all other arrays."""
-MOST_DEFLATED = 1032
-"""Largest ratio of DEFLATE (zlib's documentation, "Maximum compression factor")."""
+CHECKSUM = "wrf_mi/sha256"  # key of the SHA-256 of all other arrays
+MOST_DEFLATED = 1032  # largest ratio of DEFLATE (zlib's documentation, "Maximum compression factor")
 RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: MOST_DEFLATED}
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 REMEDY = "read it on a machine with more memory"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
-    """Write an ``.npz`` file of plain arrays atomically.
-
-    `stored_arrays` compares the checksum.
-    """
-    stored = dict(arrays)
+    """Write an ``.npz`` file of plain arrays atomically. `stored_arrays` compares the checksum."""
+    stored = {name: np.asanyarray(values) for name, values in arrays.items()}
     if checksum:
-        stored = {name: np.asarray(values) for name, values in arrays.items()}
         stored[CHECKSUM] = np.asarray(content_digest(stored))
     how = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     with atomic_file(path) as part, zipfile.ZipFile(part, "w", how) as archive:
         for name, values in stored.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+                np.lib.format.write_array(member, values, allow_pickle=False)
     return path
 
 
 def stored_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Arrays of an ``.npz`` file; call it within `wrf_mi.core.files.readable`.
+    """Arrays of an ``.npz`` file: those of some names that are there, or all (None), compared with their checksum.
 
-    Args:
-        path: the file.
-        names: arrays that are read if they are there; None: all, which are compared with the checksum if there is one.
-
-    Raises:
-        InputError: they do not fit into memory.
-        Exception: of a dozen kinds for a damaged file.
+    Call it within `wrf_mi.core.files.readable`: a damaged file raises a dozen kinds of error. `InputError` for arrays
+    that do not fit into memory.
     """
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:

@@ -8,18 +8,10 @@ from .angles import FloatArray
 
 
 def planar_array(rows: int, columns: int, spacing_m: float) -> FloatArray:
-    """Element positions of a uniform planar array, centred on its origin.
+    """Element positions [rows * columns, 3] of a uniform planar array, metres, centred on its origin in z = 0.
 
-    Args:
-        rows: elements along y.
-        columns: elements along x.
-        spacing_m: distance between neighbours along both axes, metres.
-
-    Returns:
-        Shape [rows * columns, 3] in metres, x fastest, z = 0.
-
-    Raises:
-        ValueError: fewer than one row or column, or a spacing that is not positive.
+    Rows follow each other along y and columns along x, which runs fastest, ``spacing_m`` apart. `ValueError` for fewer
+    than one row or column, or a spacing that is not positive.
     """
     if rows < 1 or columns < 1 or not spacing_m > 0:
         raise ValueError(f"planar_array: {rows} x {columns} elements {spacing_m} m apart; all three must be positive")

@@ -11,18 +11,14 @@ from numpy.typing import NDArray
 from .angles import FloatArray
 from .types import IntArray
 
-FREQUENCY = "frequency_hz"
-"""Column of a file, or array, with the carrier of each row in Hz."""
+FREQUENCY = "frequency_hz"  # column of a file, or array, with the carrier of each row in Hz
 MOST_NAMED = 4
 
 
 def by_carrier(
     carriers_hz: FloatArray, of_carrier: Callable[[float, IntArray], NDArray[Any]], axis: int = 0
 ) -> NDArray[Any]:
-    """Values of rows with carriers [m], Hz, computed carrier by carrier by ``of_carrier(carrier_hz, rows)``.
-
-    They are in the order of the rows, which ``axis`` counts.
-    """
+    """Values of rows, counted by ``axis``, computed carrier by carrier [m], Hz, by ``of_carrier(carrier_hz, rows)``."""
     every = rows_of_carriers(carriers_hz)
     values = np.concatenate([of_carrier(carrier, rows) for carrier, rows in every], axis=axis)
     # Rows came out carrier by carrier; the inverse permutation puts them back.

@@ -15,14 +15,9 @@ from .errors import InputError
 
 
 def content_digest(*values: Any) -> str:
-    """SHA-256 (hex) of values.
+    """SHA-256 (hex) of arrays, data classes (fields that count in comparisons), mappings, tuples, lists, plain values.
 
-    Args:
-        values: arrays, data classes (fields that count in comparisons), mappings, tuples and lists of these, and plain
-            values. A path stands for the names and contents of the files there.
-
-    Raises:
-        InputError: a path that does not exist.
+    A path stands for the names and contents of the files there; `InputError`: it does not exist.
     """
     digest = hashlib.sha256()
     for value in values:
@@ -52,9 +47,8 @@ def _add(digest: Any, value: Any) -> None:
     elif value is None or isinstance(value, (str, int, float, np.generic)):
         digest.update(f"{value!r}\n".encode())
     else:
-        raise TypeError(
-            f"content_digest: {type(value).__name__} has no digest; give arrays, data classes or plain values"
-        )
+        text = f"content_digest: {type(value).__name__} has no digest"
+        raise TypeError(f"{text}; give arrays, data classes or plain values")
 
 
 def _add_files(digest: Any, path: Path) -> None:

@@ -17,8 +17,7 @@ import psutil
 
 from .errors import DataFault, InputError
 
-MOST_MESSAGE = 400
-"""Characters that are shown of another library's message: some repeat the content of a file."""
+MOST_MESSAGE = 400  # characters that are shown of another library's message: some repeat the content of a file
 
 
 def one_line(error: object) -> str:
@@ -68,15 +67,13 @@ def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:
     return f"{text}; {remedy}" if remedy else text
 
 
-MOST_NAME = 1024
-"""Characters of a name that another file states; systems take 4096 of a whole path."""
+MOST_NAME = 1024  # characters of a name that another file states; systems take 4096 of a whole path
 
 
 def inside(folder: Path, name: object, source: str | Path) -> Path:
     """The path in a folder of the file that another file, the ``source``, names.
 
-    Raises:
-        InputError: no name, or one that leaves the folder.
+    `InputError`: no name, or one that leaves the folder.
     """
     if not isinstance(name, str) or not name or "\0" in name or len(name) > MOST_NAME:
         raise DataFault(source, f"{one_line(repr(name))[:60]} is no name of a file; correct it")
@@ -87,11 +84,7 @@ def inside(folder: Path, name: object, source: str | Path) -> Path:
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a UTF-8 text file without line ends and trailing blank lines.
-
-    Raises:
-        InputError: the file is missing or not text.
-    """
+    """The lines of a UTF-8 text file without line ends and trailing blank lines; `InputError`: missing, or no text."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -105,11 +98,7 @@ def text_lines(path: Path) -> list[str]:
 
 @contextmanager
 def readable(path: Path, missing: str | InputError, remedy: str) -> Iterator[None]:
-    """Turn any error of a block that reads a file into one line: ``missing``, or for a damaged file the ``remedy``.
-
-    Raises:
-        InputError: naming the file.
-    """
+    """Turn any error of a block that reads a file into `InputError`: ``missing``, or for a damaged file ``remedy``."""
     try:
         yield
     except FileNotFoundError:
@@ -167,14 +156,12 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its name if the block succeeds and is removed otherwise.
 
-    Raises:
-        InputError: ``path`` exists and may not be replaced, or cannot be written.
+    `InputError`: ``path`` exists and may not be replaced, or cannot be written.
     """
     remove_leftovers(path.parent, path.name)
     if path.exists() and not replace:
         raise InputError(f"{path}: exists; remove it or choose another folder")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    part, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("part", "old"))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
@@ -186,8 +173,8 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
             os.replace(path, old)
         os.replace(part, path)
     finally:
-        shutil.rmtree(part, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+        for folder in (part, old):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_atomically(path: Path, content: bytes | str) -> Path:

@@ -24,17 +24,18 @@ _fitting = threading.RLock()
 def locked_folder(folder: Path) -> Iterator[None]:
     """A block that alone writes into a folder, without the temporary files of processes that ended in theirs.
 
-    The lock file remains where `KeyboardInterrupt` ends the block.
-
-    Raises:
-        InputError: another process, or another block of this process, writes into it.
+    The lock file remains where `KeyboardInterrupt` ends the block. `InputError`: another process, or another block of
+    this process, writes into it.
     """
     file = folder / LOCK
     lock = FileLock(file, timeout=0, thread_local=False)
     try:
         lock.acquire()
     except Timeout:
-        who = f"process {pid}" if (pid := _holder(file)) else "another process"
+        who = "another process"
+        with suppress(OSError, UnicodeDecodeError):
+            if (text := file.read_text().strip()).isdecimal():
+                who = f"process {text}"
         raise InputError(f"{folder}: {who} writes into it; wait for its end, or stop it") from None
     remains = False
     try:
@@ -52,23 +53,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
             lock.release()
 
 
-def _holder(file: Path) -> str:
-    """Number of the process that holds a lock file; empty where it is not known."""
-    try:
-        text = file.read_text().strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
-    return text if text.isdecimal() else ""
-
-
 @contextmanager
 def alone_in_process() -> Iterator[None]:
     """A block that no other thread of this process may be in.
 
     Dr.Jit's threads, flags and recorded kernels belong to the process: two fits at a time would change each other.
-
-    Raises:
-        InputError: another thread is in such a block.
+    `InputError`: another thread is in such a block.
     """
     if not _fitting.acquire(blocking=False):
         text = "another thread of this process fits or scores a model"

@@ -16,11 +16,9 @@ import psutil
 
 from .errors import InputError
 
-SMALL_BYTES = 1 << 26
-"""Allocations up to 64 MiB are not compared: an estimate of what is free is no better."""
+SMALL_BYTES = 1 << 26  # allocations up to 64 MiB are not compared: an estimate of what is free is no better
 _CGROUP = Path("/sys/fs/cgroup")
-_UNLIMITED = 1 << 60
-"""Control groups of version 1 state about 2^63 where there is no limit."""
+_UNLIMITED = 1 << 60  # control groups of version 1 state about 2^63 where there is no limit
 
 
 def peak_memory_mb() -> float:
@@ -57,11 +55,7 @@ def _cgroup_bytes() -> Iterator[int]:
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Refuse an allocation of ``needed`` bytes for ``what`` (the file or setting) that does not fit.
-
-    Raises:
-        InputError: more than is free.
-    """
+    """Refuse by `InputError` an allocation of ``needed`` bytes for ``what`` (a file or setting) that does not fit."""
     if needed > SMALL_BYTES and needed > (free := free_bytes()):
         gib = f"{needed / 2**30:,.3g}" if needed < 2**40 else f"{needed / 2**30:,.0f}"
         raise InputError(f"{what} takes {gib} GiB, and {free / 2**30:.3g} GiB of memory are free; {remedy}")

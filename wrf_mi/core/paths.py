@@ -16,8 +16,7 @@ from .errors import InputError
 from .files import readable
 from .types import IntArray
 
-FORMAT = 1
-"""Version of the file format."""
+FORMAT = 1  # version of the file format
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,7 @@ class Paths:
     @property
     def bounces(self) -> IntArray:
         """Number of interactions of each path, shape [p]."""
-        result: IntArray = np.count_nonzero(self.interactions, axis=1)
-        return result
+        return np.asarray(np.count_nonzero(self.interactions, axis=1))
 
     def select(self, which: NDArray[Any]) -> Paths:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -95,11 +93,7 @@ def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None =
 
 
 def load_paths(file: str | Path) -> Paths:
-    """Read a file of `save_paths`.
-
-    Raises:
-        InputError: missing, damaged, or of another format version.
-    """
+    """Read a file of `save_paths`; `InputError`: missing, damaged, or of another format version."""
     return read_paths_file(file)[0]
 
 
@@ -107,14 +101,10 @@ def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
     """The paths of a file and the further arrays beside them (`load_paths`)."""
     path = Path(file)
     with readable(path, f"{path}: missing; trace the paths first", "trace the paths anew"):
-        arrays = stored_arrays(path)
+        arrays: dict[str, Any] = stored_arrays(path)
         version = int(arrays.pop("format"))
-        if version == FORMAT:
-            names = tuple(str(name) for name in arrays.pop("object_names"))
-            counts = int(arrays.pop("n_tx")), int(arrays.pop("n_rx"))
-            paths = Paths(
-                **{name: arrays.pop(name) for name in ARRAYS}, object_names=names, n_tx=counts[0], n_rx=counts[1]
-            )
-    if version != FORMAT:
-        raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
-    return paths, arrays
+        if version != FORMAT:
+            raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+        facts: dict[str, Any] = {"object_names": tuple(str(name) for name in arrays.pop("object_names"))}
+        facts |= {name: int(arrays.pop(name)) for name in ("n_tx", "n_rx")}
+        return Paths(**facts | {name: arrays.pop(name) for name in ARRAYS}), arrays

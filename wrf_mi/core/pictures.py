@@ -16,11 +16,9 @@ PICTURE_ERRORS = (MemoryError, OSError, SyntaxError, ValueError, struct.error, z
 
 @contextmanager
 def open_picture(path: Path, most_pixels: int) -> Iterator[Image.Image]:
-    """Open a PNG or PGM picture, whose pixels are decoded when they are first used.
+    """Open a PNG or PGM picture, whose pixels are decoded when they are first used; errors: `PICTURE_ERRORS`.
 
-    Raises:
-        ValueError: more pixels than ``most_pixels``: a small file may state any size.
-        Exception: one of `PICTURE_ERRORS` for a damaged file, also where pixels are used.
+    `ValueError` for more pixels than ``most_pixels``, as a small file may state any size.
     """
     with Image.open(path, formats=("PNG", "PPM")) as picture:
         width, height = picture.size

@@ -15,21 +15,12 @@ from .errors import InputError
 from .files import one_line
 from .types import Receiver
 
-SHOWN = 20
-"""Largest number of names in an error message."""
-UNKNOWN = -1
-"""Stored number of elements of a receiver without a known array."""
+SHOWN = 20  # largest number of names in an error message
+UNKNOWN = -1  # stored number of elements of a receiver without a known array
 
 
 def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
-    """Index of a receiver.
-
-    Args:
-        receivers: receivers in the record's order.
-        receiver: name (a string), or number from 0 (an integer).
-
-    Raises:
-        InputError: no such receiver, or several of that name.
+    """Index of a receiver by its name (a string) or number from 0 (an integer); `InputError`: none, or several.
 
     >>> import numpy as np
     >>> both = [Receiver(name, np.zeros(3), np.array([0.0, 0, 0, 1])) for name in ("kitchen", "0")]
@@ -72,12 +63,7 @@ def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
 
 
 def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]:
-    """Receivers from the arrays of `receiver_arrays`.
-
-    Raises:
-        KeyError: an array is missing.
-        InputError: an invalid antenna.
-    """
+    """Receivers from the arrays of `receiver_arrays`; `KeyError`: one is missing, `InputError`: an invalid antenna."""
     counts = arrays["receiver_elements"]
     split = np.split(arrays["receiver_elements_m"], np.cumsum(np.maximum(counts, 0))[:-1])
     elements = [None if count == UNKNOWN else array_m for count, array_m in zip(counts, split, strict=True)]

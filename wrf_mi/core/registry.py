@@ -21,10 +21,8 @@ def resolve(address: str) -> Any:
 class Registry(Mapping[str, Entry], Generic[Entry]):
     """Objects by name; an entry is imported at its first use.
 
-    Args:
-        what: noun for an entry, for messages.
-        group: group of the entry points by which installed packages add entries.
-        builtin: entries of this package by name, or their addresses ``module:attribute``.
+    ``what`` is the noun for an entry in messages, ``group`` that of the entry points by which installed packages add
+    entries, and ``builtin`` has the entries of this package by name, or their addresses ``module:attribute``.
     """
 
     def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str]) -> None:
@@ -34,11 +32,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         self._modules = {name: entry.partition(":")[0] for name, entry in builtin.items() if isinstance(entry, str)}
 
     def add(self, name: str, entry: Entry) -> None:
-        """Add an entry for this process.
-
-        Raises:
-            InputError: the name is taken.
-        """
+        """Add an entry for this process; `InputError`: the name is taken."""
         if name in self:
             raise InputError(f"{self._what} {name!r}: there is one of that name; choose another")
         self._known[name] = entry

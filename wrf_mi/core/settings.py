@@ -26,14 +26,12 @@ Share = Annotated[float, Field(ge=0, le=1, description="0 to 1")]
 ShareBelow1 = Annotated[float, Field(ge=0, lt=1, description="0 or more and less than 1")]
 Inside = Annotated[float, Field(gt=0, lt=1, description="more than 0 and less than 1")]
 Finite = Annotated[float, Field(description="a finite number")]
-NOT_NEGATIVE = Field(ge=0, description="0 or more")
-"""Range of numbers for which a class of settings states no other."""
+NOT_NEGATIVE = Field(ge=0, description="0 or more")  # range of numbers for which a class of settings states no other
 
 FORMER_NAMES = {"max_depth": "depth", "max_reflections": "reflections"}
 """Names that settings had, which stored runs and scripts still state."""
 
-Settings = TypeVar("Settings")
-"""A frozen dataclass of plain values or of such dataclasses."""
+Settings = TypeVar("Settings")  # a frozen dataclass of plain values or of such dataclasses
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -60,19 +58,14 @@ def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Refuse numbers of settings that are not finite or out of their range, and unknown words; nested ones included.
-
-    Raises:
-        InputError: naming the setting, its value and the range.
-    """
+    """Refuse by `InputError` numbers of (nested) settings that are not finite or out of their range, or other words."""
     kind: Any = type(settings)
     hints = typing.get_type_hints(kind)
     for name, (adapter, words) in _ranges(kind).items():
         value = getattr(settings, name)
-        words_known = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is typing.Literal else ()
-        if words_known and value not in words_known:
-            known = ", ".join(map(str, words_known))
-            raise InputError(f"setting {prefix}{name}: {value!r}; choose from {known}")
+        known = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is typing.Literal else (value,)
+        if value not in known:
+            raise InputError(f"setting {prefix}{name}: {value!r}; choose from {', '.join(map(str, known))}")
         if dataclasses.is_dataclass(value):
             check(value, f"{prefix}{name}.")
         elif isinstance(value, int | float):
@@ -94,11 +87,7 @@ def settings_from(kind: type[Settings], values: Mapping[str, Any], source: str) 
     """Settings of a dataclass from a nested dictionary; what it does not name keeps its default.
 
     Settings of earlier versions that are constants now, in the mapping ``FIXED`` of the class, must have that value.
-
-    ``source`` names the file or option in messages.
-
-    Raises:
-        InputError: an unknown name, or a value of the wrong type or out of its range.
+    `InputError`, which names the ``source``: an unknown name, or a value of the wrong type or out of its range.
     """
     return cast(Settings, _build(kind, values, source, ""))
 
@@ -131,18 +120,14 @@ def _number(value: Any) -> Any:
     return value
 
 
-def _plain(value: Any) -> Any:
-    """Values that JSON lacks: arrays as lists, others as text."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
 def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
     """A value of the type ``hint``."""
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
         # JSON has lists in place of tuples and arrays; else nothing is converted.
-        return _adapter(hint).validate_json(json.dumps(value, default=_plain), strict=True)
+        text = json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
+        return _adapter(hint).validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
     text = f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
@@ -156,10 +141,7 @@ def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
-    """Settings with ``key=value`` applied in order; keys dotted, values YAML.
-
-    Raises:
-        InputError: no ``=``, an unknown key, or a value of the wrong type or out of its range.
+    """Settings with ``key=value`` applied in order; keys dotted, values YAML; `InputError`: any that does not fit.
 
     >>> from wrf_mi import TrainConfig
     >>> config = with_settings(TrainConfig(), ["steps=200", "initial.gaussians=500"])

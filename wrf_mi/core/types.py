@@ -36,11 +36,7 @@ class Prediction:
 
     @property
     def stated_std(self) -> FloatArray:
-        """The standard deviation of a model that states one.
-
-        Raises:
-            ValueError: the model states none.
-        """
+        """The standard deviation of a model that states one; `ValueError`: the model states none."""
         if self.std is None:
             raise ValueError("Prediction: the model states no standard deviation")
         return self.std
@@ -51,21 +47,13 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Inputs:
-    """Known quantities of m rows to predict; never their observations.
+    """Known quantities of m rows to predict; never their observations."""
 
-    Attributes:
-        tx_pos_m: positions of the transmitter [m, 3], metres; NaN where unknown.
-        tx_heading_rad: headings of the transmitter [m], or None.
-        uplink: uplink channel coefficients [m, antennas, subcarriers], complex64, or None.
-        first_row: number of the first row, for messages.
-        carriers_hz: carrier of each row [m], Hz, or None where the data have a single carrier.
-    """
-
-    tx_pos_m: FloatArray
-    tx_heading_rad: FloatArray | None = None
-    uplink: NDArray[Any] | None = None
-    first_row: int = 0
-    carriers_hz: FloatArray | None = None
+    tx_pos_m: FloatArray  # positions of the transmitter [m, 3], metres; NaN where unknown
+    tx_heading_rad: FloatArray | None = None  # headings of the transmitter [m], or None
+    uplink: NDArray[Any] | None = None  # uplink channel coefficients [m, antennas, subcarriers], complex64, or None
+    first_row: int = 0  # number of the first row, for messages
+    carriers_hz: FloatArray | None = None  # carrier of each row [m], Hz, or None where the data have a single carrier
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -190,11 +178,7 @@ class Record:
         return replace(self, receivers=tuple(replace(receiver, array_m=array_m) for receiver in self.receivers))
 
     def with_antennas(self, options: AntennaOptions) -> Record:
-        """The record with antennas whose attributes are those that the options state.
-
-        Raises:
-            InputError: names that `Antenna` refuses.
-        """
+        """The record with the antennas' attributes that options state; `InputError`: names that `Antenna` refuses."""
         if not options:
             return self
         receivers = (replace(each, antenna=options.replaced(each.antenna, "rx")) for each in self.receivers)
@@ -215,7 +199,7 @@ class Record:
         return replace(self, **self._of_receivers(hidden))
 
     def _of_receivers(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
-        """Results of a function of the arrays whose first axis counts receivers, by the names of the attributes."""
+        # Of the arrays whose first axis counts receivers, by the names of the attributes.
         arrays = {name: getattr(self, name) for name in ("observation", "truth", "std", "n_readings")}
         return {name: None if values is None else function(values) for name, values in arrays.items()}
 
@@ -235,13 +219,11 @@ class Record:
         return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
 
     def precision(self, rows: IntArray) -> FloatArray | None:
-        """Inverse variance of the noise of some rows' observations, relative to a typical reading's.
+        """Inverse variance [n_rx, m] of the noise of m rows' observations, relative to a typical reading's.
 
         (median of ``std`` / ``std``)^2 where the data state ``std``, with the median over the observations received in
-        these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance.
-
-        Returns:
-            Shape [n_rx, m] for m rows, 1 where nothing was received; None where the data state neither.
+        these rows; else ``n_readings``: a mean of n independent readings has an n-th of their variance. 1 where nothing
+        was received; None where the data state neither.
         """
         if self.std is None:
             return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)

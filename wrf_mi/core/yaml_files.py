@@ -56,8 +56,7 @@ class _Loader(yaml.SafeLoader):
 def read_yaml(path: Path) -> dict[Any, Any]:
     """The mapping of a YAML file; empty where it holds anything else.
 
-    Raises:
-        InputError: missing, not text, not YAML, with an impossible date or number, or too large with its aliases.
+    `InputError`: missing, not text, not YAML, with an impossible date or number, or too large with its aliases.
     """
     text = "\n".join(text_lines(path))
     try:

@@ -16,8 +16,8 @@ ENTRY_POINTS = "wrf_mi.exports"
 SCENES = (SCENE, RUN)  # a run stands for its corrected scene, or else for the scene that it was traced in
 _TRACED = ("tx_pos_m", "rx_pos_m", "frequency_hz", "material", "kinds", "depth")
 _WRITERS: dict[str, tuple[tuple[str, ...], str, str, tuple[str, ...]]] = {
-    "3dgs": ((RUN,), ".ply", "gaussians:write_3dgs", ("tx_pos_m", "frequency_hz")),
-    "field": ((RUN,), ".npz", "field_file:write_field", ()),
+    "3dgs": ((RUN,), ".ply", "fields:write_3dgs", ("tx_pos_m", "frequency_hz")),
+    "field": ((RUN,), ".npz", "fields:write_field", ()),
     "paths": ((RUN, SCENE), ".csv", "paths_table:write_paths", _TRACED),
     "deepmimo": ((RUN,), "", "paths_table:write_scenario", ()),
     "sionna": (SCENES, "", "scenes:write_sionna", ("frequency_hz", "material")),
@@ -70,16 +70,16 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
         raise InputError(f"format {format!r}: unknown; choose from {', '.join(FORMATS)}")
     from .source import Source, Write, kinds_of  # imports tracer and models, which the list of formats does without
 
-    asked, given = FORMATS[format], options or ExportOptions()
-    asked.check(Path(out), given)
+    form, stated = FORMATS[format], options or ExportOptions()
+    form.check(Path(out), stated)
     kinds = kinds_of(source)
-    kind = next((kind for kind in kinds if kind in asked.kinds), None)
+    kind = next((kind for kind in kinds if kind in form.kinds), None)
     if kind is None:
         others = [name for name, other in FORMATS.items() if set(other.kinds) & set(kinds)]
-        text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(asked.kinds)}"
+        text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(form.kinds)}"
         raise InputError(f"{text}; choose from {', '.join(others)}")
-    write: Write = resolve(asked.writer) if isinstance(asked.writer, str) else asked.writer
-    return write(Source(str(source), kind), Path(out), given)
+    write: Write = resolve(form.writer) if isinstance(form.writer, str) else form.writer
+    return write(Source(str(source), kind), Path(out), stated)
 
 
 __all__ = ["BUILT_IN", "DATASET", "ENTRY_POINTS", "FORMATS", "RUN", "SCENE", "ExportOptions", "Format", "export"]

@@ -15,27 +15,16 @@ RUN, SCENE, DATASET = "run", "scene", "data set"  # kinds of sources
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of an export; None where they are not given.
+    """Options of an export; None where they are not stated."""
 
-    Attributes:
-        tx_pos_m: positions of transmitters [n, 3], metres.
-        rx_pos_m: positions of receivers [m, 3], metres.
-        frequency_hz: carrier, Hz.
-        material: radio material of a bare mesh.
-        kinds: kinds of path, separated by commas.
-        depth: largest number of interactions of a path.
-        replace: replace an existing folder.
-        progress: show bars on standard error where a tracer takes time.
-    """
-
-    tx_pos_m: FloatArray | None = None
-    rx_pos_m: FloatArray | None = None
-    frequency_hz: float | None = None
-    material: str | None = None
-    kinds: str | None = None
-    depth: int | None = None
-    replace: bool = False
-    progress: bool = False
+    tx_pos_m: FloatArray | None = None  # positions of transmitters [n, 3], metres
+    rx_pos_m: FloatArray | None = None  # positions of receivers [m, 3], metres
+    frequency_hz: float | None = None  # carrier, Hz
+    material: str | None = None  # radio material of a bare mesh
+    kinds: str | None = None  # kinds of path, separated by commas
+    depth: int | None = None  # largest number of interactions of a path
+    replace: bool = False  # replace an existing folder
+    progress: bool = False  # show bars on standard error where a tracer takes time
 
 
 NAMES = {"tx_pos_m": "--tx", "rx_pos_m": "--rx", "frequency_hz": "--frequency"}
@@ -45,23 +34,14 @@ NAMES |= {"material": "--material", "kinds": "--paths", "depth": "--depth"}
 
 @dataclass(frozen=True)
 class Format:
-    """A format to export to.
+    """A format to export to."""
 
-    Attributes:
-        name: name, as in ``wrf-mi export --format``.
-        kinds: kinds of sources that it takes.
-        suffix: ending of the file; "": a folder.
-        writer: ``module:function`` of type `wrf_mi.exports.source.Write`, or the function.
-        options: names of fields of `ExportOptions` that it takes.
-        text: what is written, for the help of the command.
-    """
-
-    name: str
-    kinds: tuple[str, ...]
-    suffix: str
-    writer: str | Callable[..., dict[str, Any]]
-    options: tuple[str, ...]
-    text: str
+    name: str  # name, as in ``wrf-mi export --format``
+    kinds: tuple[str, ...]  # kinds of sources that it takes
+    suffix: str  # ending of the file; "": a folder
+    writer: str | Callable[..., dict[str, Any]]  # function of type `wrf_mi.exports.source.Write`, or its address
+    options: tuple[str, ...]  # names of fields of `ExportOptions` that it takes
+    text: str  # what is written, for the help of the command
 
     def check(self, out: Path, options: ExportOptions) -> None:
         """Refuse a name of the file, or options, that do not belong to the format; `InputError`: naming them."""

@@ -81,8 +81,7 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
 def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
     """Write paths of a run or a scene as CSV (`wrf_mi.exports.source.Write`).
 
-    Raises:
-        InputError: a run without stored paths, a scene without transmitters, receivers or frequency.
+    `InputError`: a run without stored paths, a scene without transmitters, receivers or frequency.
     """
     traced = _traced(source, options)
     if not len(traced.paths):
@@ -103,10 +102,8 @@ def read_paths(file: str | Path) -> Paths:
     """Paths of a table of `write_paths`.
 
     Gains, lengths and vertices are those that were written; directions, which are stored as angles, to 1e-15. Numbers
-    of transmitters and receivers are those up to the last one with a path.
-
-    Raises:
-        InputError: a file that is missing, or has a column or a field less or another kind of value.
+    of transmitters and receivers are those up to the last one with a path. `InputError`: a file that is missing, or has
+    a column or a field less or another kind of value.
     """
     table = read_csv(Path(file))
     tx, rx = (table.numbers(name).astype(np.int64) for name in ("tx", "rx"))
@@ -126,9 +123,8 @@ def read_paths(file: str | Path) -> Paths:
                 interactions[path, k], objects[path, k] = codes[kind], names.index(name)
                 vertices[path, k] = [float(number) for number in point.split()]
         except (ValueError, KeyError):
-            raise InputError(
-                f"{file}, row {path + 1}: interactions, vertices and objects do not fit; restore it"
-            ) from None
+            text = "interactions, vertices and objects do not fit"
+            raise InputError(f"{file}, row {path + 1}: {text}; restore it") from None
     gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
     directions = _directions(table, "departure"), _directions(table, "arrival")
     bounces: Any = (interactions, vertices, objects, tuple(names))

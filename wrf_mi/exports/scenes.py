@@ -24,6 +24,7 @@ from .format import ExportOptions
 from .source import Source
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
+GLTF_LOOKS: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
 
 
 def _parts(scene: Any) -> list[tuple[Surface, str]]:
@@ -47,10 +48,8 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     ``scene.xml`` opens with ``sionna.rt.load_scene``: materials of ITU-R P.2040 follow the frequency and have the
     scene's thicknesses; materials with constants, and those that are not in the range of ITU-R P.2040, have the
     constants of the carrier. ``mitsuba.xml`` has colours alone, for ``mi.load_file`` in any variant. ``materials.json``
-    lists the constants at the carrier, and exponents of conductivities.
-
-    Raises:
-        InputError: an unknown carrier, a material that is neither slab nor absorber, or a folder that exists.
+    lists the constants at the carrier, and exponents of conductivities. `InputError`: an unknown carrier, a material
+    that is neither slab nor absorber, or a folder that exists.
     """
     frequency_hz = source.carrier_hz() if options.frequency_hz is None else options.frequency_hz
     if frequency_hz is None:
@@ -77,11 +76,9 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
             new_name = name if itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
             renamed[name] = plain_name(new_name, ODD_IN_FILES, renamed.values())
             constants[renamed[name]] = values
-        listed[renamed[name]] = {
-            **values,
-            "conductivity_exponent": conductivity_exponent(material, frequency_hz),
-            "follows_frequency": renamed[name] in slabs,
-        }
+        exponent = conductivity_exponent(material, frequency_hz)
+        facts = {"conductivity_exponent": exponent, "follows_frequency": renamed[name] in slabs}
+        listed[renamed[name]] = values | facts
     files = dict[str, tuple[Surface, str]]()
     for surface, material in parts:
         files[plain_name(surface.name, ODD_IN_FILES, files)] = surface, material
@@ -93,8 +90,8 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
             mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
         write_atomically(folder / XML, scene_xml(materials, constants, slabs))
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
-        facts = {"frequency_hz": frequency_hz, "materials": listed}
-        write_atomically(folder / FACTS, json.dumps(facts, indent=1) + "\n")
+        text = json.dumps({"frequency_hz": frequency_hz, "materials": listed}, indent=1)
+        write_atomically(folder / FACTS, f"{text}\n")
     fixed = ", ".join(constants) or "none"
     return {"surfaces": len(parts), "materials": len(listed), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
 
@@ -106,16 +103,9 @@ def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, An
     has y up, coordinates x, y, z of the scene are x, z, -y there.
     """
     parts = _parts(_loaded(source, options)[0])
-    materials = {
-        name: trimesh.visual.material.PBRMaterial(
-            name=name,
-            baseColorFactor=[*_colour_bytes(name).tolist(), 255],
-            metallicFactor=0.0,
-            roughnessFactor=1.0,
-            doubleSided=True,
-        )
-        for name in dict.fromkeys(material for _, material in parts)
-    }
+    colours = {name: [*_colour_bytes(name).tolist(), 255] for name in dict.fromkeys(material for _, material in parts)}
+    looks = trimesh.visual.material.PBRMaterial
+    materials = {name: looks(name=name, baseColorFactor=rgba, **GLTF_LOOKS) for name, rgba in colours.items()}
     scene = trimesh.Scene()
     for surface, material in parts:
         mesh = trimesh.Trimesh(trimesh.transform_points(surface.vertices_m, Y_UP), surface.faces, process=False)
@@ -153,8 +143,5 @@ def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, A
 
 
 def _counts(parts: list[tuple[Surface, str]]) -> dict[str, Any]:
-    return {
-        "surfaces": len(parts),
-        "faces": sum(len(surface.faces) for surface, _ in parts),
-        "materials": len({material for _, material in parts}),
-    }
+    faces, materials = sum(len(surface.faces) for surface, _ in parts), {material for _, material in parts}
+    return {"surfaces": len(parts), "faces": faces, "materials": len(materials)}

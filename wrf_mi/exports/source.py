@@ -48,11 +48,7 @@ class Source:
         return load_trace(path)
 
     def scene(self) -> tuple[str, str | None]:
-        """Scene file, folder or name, and the material of a bare mesh where a run states it.
-
-        Raises:
-            InputError: a run without a scene.
-        """
+        """Scene file, folder or name, and the material of a bare mesh that a run states; `InputError`: it has none."""
         if self.kind != RUN:
             return self.name, None
         corrected, config = Path(self.name) / CORRECTED, self.run.config
@@ -90,7 +86,6 @@ def kinds_of(name: str | Path) -> tuple[str, ...]:
     if not any(kinds.values()):
         known = ", ".join(scenes())
         ways = f"a run folder, a scene (a folder, XML, mesh, or of {known}) or a data set (`wrf-mi data list`)"
-        raise InputError(
-            f"{name}: {'a file of another kind' if path.exists() else 'no such file or name'}; give {ways}"
-        )
+        what = "a file of another kind" if path.exists() else "no such file or name"
+        raise InputError(f"{name}: {what}; give {ways}")
     return tuple(kind for kind, fits in kinds.items() if fits)

@@ -47,20 +47,9 @@ from ..receivers.spreads import PathStatistics
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
+from . import grid
 from .coverage import coverage_probability
 from .dataset import map_dataset, maps_package
-from .grid import (
-    HEADINGS,
-    Grid,
-    SurfaceMesh,
-    area_of,
-    check_height,
-    grid_over,
-    outside_solids,
-    surface_of,
-    usual_height,
-    warn_of_points_outside,
-)
 
 if TYPE_CHECKING:
     import xarray
@@ -130,13 +119,11 @@ def _check(run: Run, task: Task, surface: Any, height_m: float | None, transmit_
         raise InputError(f"{run.folder}: {run.config.model} predicts from the uplink, not from positions; no map of it")
     if surface is not None and height_m is not None:
         raise InputError("map: a height belongs to a grid; omit it, or the surface")
-    numbers = (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold))
-    for name, value in numbers:
+    for name, value in (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold)):
         if value is not None and not np.isfinite(value):
             raise InputError(f"{name} {value:g}: give a finite number")
     if task.level_kind == "relative" and transmit_dbm:
-        text = f"its {task.name} observations state no power in dBm"
-        raise InputError(f"{run.folder}: {text}; omit the transmit power")
+        raise InputError(f"{run.folder}: its {task.name} observations are not in dBm; omit the transmit power")
 
 
 def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
@@ -146,34 +133,31 @@ def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
         if heading_deg is not None:
             raise InputError(f"{run.folder}: its predictions do not depend on the heading; omit it")
         return ()
-    turns = np.arange(HEADINGS) / HEADINGS * 2 * np.pi if heading_deg is None else [np.radians(heading_deg)]
+    turns = np.arange(grid.HEADINGS) / grid.HEADINGS * 2 * np.pi if heading_deg is None else [np.radians(heading_deg)]
     return tuple(map(float, turns))
 
 
-def _places(run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None) -> Grid | SurfaceMesh:
+def _places(
+    run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None
+) -> grid.Grid | grid.SurfaceMesh:
     known = run.problem.record.tx_pos_m
     if surface is not None:
-        mesh = surface_of(surface, step_m)
-        warn_of_points_outside(run, mesh.positions_m, known)
+        mesh = grid.surface_of(surface, step_m)
+        grid.warn_of_points_outside(run, mesh.positions_m, known)
         return mesh
-    height = usual_height(run, known) if height_m is None else height_m
-    check_height(run, height, known)
-    return grid_over(*area_of(run, known), STEP_M if step_m is None else step_m, height)
+    height = grid.usual_height(run, known) if height_m is None else height_m
+    grid.check_height(run, height, known)
+    return grid.grid_over(*grid.area_of(run, known), STEP_M if step_m is None else step_m, height)
 
 
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
     """Attributes of the whole dataset."""
-    config, headings = run.config, conditions.headings_rad
+    config, headings, name = run.config, conditions.headings_rad, run.problem.record.name
     absolute = task.level_kind != "relative"
-    attributes: dict[str, Any] = {
-        "title": f"Radio map of {run.problem.record.name} by {config.model}",
-        "source": f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}",
-        "dataset": run.problem.record.name,
-        "model": config.model,
-        "task": task.name,
-        "level": task.level_note or task.quantity,
-        "level_is_absolute": int(absolute),
-    }
+    attributes: dict[str, Any] = {"title": f"Radio map of {name} by {config.model}"}
+    attributes["source"] = f"wrf_mi run {run.folder.resolve().name}: {config.model}, split {config.split}"
+    attributes |= {"dataset": name, "model": config.model, "task": task.name}
+    attributes |= {"level": task.level_note or task.quantity, "level_is_absolute": int(absolute)}
     if absolute:
         attributes["transmit_power_dbm"] = conditions.transmit_dbm
     if conditions.threshold_db is not None:
@@ -196,6 +180,13 @@ class Conditions:
     headings_rad: tuple[float, ...] = ()
     frequency_hz: float | None = None
 
+    def inputs(self, positions_m: FloatArray) -> Inputs:
+        """Each position [m, 3] with all headings one after the other, at the carrier."""
+        turns, hz = np.asarray(self.headings_rad), self.frequency_hz
+        positions = np.repeat(positions_m, max(len(turns), 1), axis=0)
+        headings = np.tile(turns, len(positions_m)) if len(turns) else None
+        return Inputs(positions, headings, carriers_hz=None if hz is None else np.full(len(positions), hz))
+
 
 def map_values(
     run: Run, positions_m: FloatArray, receivers: Sequence[int], conditions: Conditions, on_progress: OnProgress
@@ -203,13 +194,15 @@ def map_values(
     """Variables [receivers, m] of `wrf_mi.maps.dataset.VARIABLES` that a run's model states at positions [m, 3] in
     metres, computed chunk by chunk; NaN inside solid objects of the scene.
 
-    Raises:
-        InputError: inputs that the model does not predict from.
+    `InputError`: inputs that the model does not predict from.
     """
-    size = _chunk_size(run, len(conditions.headings_rad))
+    each = int(np.prod(run.problem.record.observation.shape[2:]))
+    size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * each))
+    size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
+    size = max(1, size // max(len(conditions.headings_rad), 1))
     variables = dict[str, NDArray[np.float32]]()
     scene = run.problem.opened_scene
-    outside = np.ones(len(positions_m), bool) if scene is None else outside_solids(scene, positions_m)
+    outside = np.ones(len(positions_m), bool) if scene is None else grid.outside_solids(scene, positions_m)
     with _each_warning_once():
         for start in range(0, len(positions_m), size):
             rows = start + np.flatnonzero(outside[start : start + size])
@@ -225,16 +218,9 @@ def map_values(
     return variables
 
 
-def _chunk_size(run: Run, headings: int) -> int:
-    values = int(np.prod(run.problem.record.observation.shape[2:]))
-    size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * values))
-    size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
-    return max(1, size // max(headings, 1))
-
-
 def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:
     task, count = task_of(run.problem.record), len(positions_m)
-    inputs = _inputs(positions_m, conditions)
+    inputs = conditions.inputs(positions_m)
     run.check_inputs(inputs)
     parts = run.fitted.decompose(inputs, receiver)
     added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0
@@ -249,14 +235,11 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
         # The law of total variance: within a heading, and between headings.
         std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
         variables["power_std_db"] = std_db
-        if conditions.threshold_db is not None:
-            probability = coverage_probability(variables["power_dbm"], std_db, conditions.threshold_db)
-            variables["coverage_probability"] = probability
+        if (limit := conditions.threshold_db) is not None:
+            variables["coverage_probability"] = coverage_probability(variables["power_dbm"], std_db, limit)
     if parts.traced is not None and parts.learned is not None:
-        traced, learned = (
-            of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added
-            for side in (parts.traced, parts.learned)
-        )
+        sides = parts.traced, parts.learned
+        traced, learned = (of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added for side in sides)
         variables |= {"traced_share": traced, "learned_share": learned, "share_difference_db": traced - learned}
     if parts.paths is not None:
         names = [field.name for field in fields(PathStatistics)]
@@ -266,23 +249,14 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
     return variables
 
 
-def _inputs(positions_m: FloatArray, conditions: Conditions) -> Inputs:
-    """Each position with all headings one after the other, at the carrier."""
-    turns = np.asarray(conditions.headings_rad)
-    positions = np.repeat(positions_m, max(len(turns), 1), axis=0)
-    headings = np.tile(turns, len(positions_m)) if len(turns) else None
-    hz = conditions.frequency_hz
-    return Inputs(positions, headings, carriers_hz=None if hz is None else np.full(len(positions), hz))
-
-
 @contextmanager
 def _each_warning_once() -> Iterator[None]:
     """Chunks would repeat the tracer's warnings of antennas near surfaces and outside the scene."""
-    logger, seen = logging.getLogger("wrf_mi.tracing.search.devices"), set[str]()
+    logger, messages = logging.getLogger("wrf_mi.tracing.search.devices"), set[str]()
 
     def new(record: logging.LogRecord) -> bool:
-        known = record.msg in seen
-        seen.add(record.msg)
+        known = record.msg in messages
+        messages.add(record.msg)
         return not known
 
     logger.addFilter(new)

@@ -35,24 +35,16 @@ def coverage_probability(level_db: ArrayLike, std_db: ArrayLike, threshold_db: f
 
 @dataclass(frozen=True)
 class Reliability:
-    """Predicted probabilities of coverage against observed shares, in bins of the probability; NaN in empty bins.
+    """Predicted probabilities of coverage against observed shares, in bins of the probability; NaN in empty bins."""
 
-    Attributes:
-        predicted: mean predicted probability in each bin [b].
-        observed: share of the measured levels above the threshold [b].
-        count: number of pairs of an observation and a threshold [b].
-        error: mean of abs(observed - predicted) over all pairs (expected calibration error).
-        brier: mean of (predicted - 0 or 1)^2 over all pairs. Source: Brier, "Verification of forecasts expressed in
-            terms of probability" (1950).
-        threshold_db: thresholds [t].
-    """
-
-    predicted: FloatArray
-    observed: FloatArray
-    count: NDArray[np.int64]
-    error: float
+    predicted: FloatArray  # mean predicted probability in each bin [b]
+    observed: FloatArray  # share of the measured levels above the threshold [b]
+    count: NDArray[np.int64]  # number of pairs of an observation and a threshold [b]
+    error: float  # mean of abs(observed - predicted) over all pairs (expected calibration error)
+    # Mean of (predicted - 0 or 1)^2 over all pairs: Brier, "Verification of forecasts expressed in terms of
+    # probability" (1950).
     brier: float
-    threshold_db: FloatArray
+    threshold_db: FloatArray  # thresholds [t]
 
 
 def reliability(
@@ -82,12 +74,8 @@ def reliability(
 def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) -> Reliability:
     """Reliability of probabilities of coverage on the test rows of a run, those of all its folds.
 
-    Args:
-        folder: run folder of a model that states standard deviations.
-        threshold_db: thresholds in the unit of `wrf_mi.tasks.Task.level`; None: quantiles of the measured levels.
-
-    Raises:
-        InputError: not a finished run, or its model states no standard deviation.
+    Thresholds are in the unit of `wrf_mi.tasks.Task.level`; None: quantiles of the measured levels. `InputError`: not a
+    finished run, or its model states no standard deviation.
     """
     results = read_run(folder)
     if results.std is None:

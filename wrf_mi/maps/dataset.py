@@ -82,15 +82,10 @@ def map_dataset(
     ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are ``triangle`` (point, corner, axis). Metres,
     in the frame of the data.
     """
-    xr = maps_package("xarray")
-    at = np.stack([receiver.position_m for receiver in receivers])
-    coordinates: dict[str, Any] = {
-        "receiver": ("receiver", [receiver.name for receiver in receivers], {"long_name": "name of the receiver"}),
-        **{
-            f"receiver_{axis}": ("receiver", at[:, k], _metres(f"{axis} of the receiver"))
-            for k, axis in enumerate("xyz")
-        },
-    }
+    xr, names = maps_package("xarray"), [receiver.name for receiver in receivers]
+    coordinates: dict[str, Any] = {"receiver": ("receiver", names, {"long_name": "name of the receiver"})}
+    for axis, values_m in zip("xyz", np.stack([receiver.position_m for receiver in receivers], axis=1), strict=True):
+        coordinates[f"receiver_{axis}"] = "receiver", values_m, _metres(f"{axis} of the receiver")
     data: dict[str, Any] = {}
     if isinstance(places, Grid):
         dims: tuple[str, ...] = ("y", "x")
@@ -119,7 +114,7 @@ def map_dataset(
         "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
         "flag_values": np.arange(-1, len(receivers), dtype=np.int32),
         # Meanings are separated by spaces.
-        "flag_meanings": " ".join(["none", *("_".join(receiver.name.split()) for receiver in receivers)]),
+        "flag_meanings": " ".join(["none", *("_".join(name.split()) for name in names)]),
     }
     data[BEST] = dims, best.reshape(shape), flags
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
@@ -133,9 +128,7 @@ def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:
     """Write a map atomically as NetCDF 4, Zarr (format 2) or CSV, by the suffix of the name.
 
     CSV has a row for each receiver and position, with the name of the best receiver; empty where nothing is known.
-
-    Raises:
-        InputError: another suffix, a missing package, or a file that cannot be written.
+    `InputError`: another suffix, a missing package, or a file that cannot be written.
     """
     path = Path(out)
     check_map_file(path)
@@ -148,7 +141,7 @@ def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:
             if path.suffix.lower() == CSV:
                 _write_csv(dataset, part)
             else:
-                packed = {name: COMPRESSION for name in dataset.data_vars}
+                packed = dict.fromkeys(dataset.data_vars, COMPRESSION)
                 dataset.to_netcdf(part, engine="h5netcdf", format="NETCDF4", encoding=packed)
     except OSError as error:
         raise InputError(os_failure(error, path, "cannot be written")) from None
@@ -158,8 +151,8 @@ def write_map(dataset: xarray.Dataset, out: str | Path) -> Path:
 def _write_csv(dataset: xarray.Dataset, path: Path) -> None:
     names = np.append(dataset["receiver"].values.astype(object), "")
     best = dataset[BEST].copy(data=names[dataset[BEST].values])
-    plain = dataset.drop_vars(["triangle", "axis", *(f"receiver_{axis}" for axis in "xyz")], errors="ignore")
-    plain = plain.assign({BEST: best})
+    left_out = ["triangle", "axis", *(f"receiver_{axis}" for axis in "xyz")]
+    plain = dataset.drop_vars(left_out, errors="ignore").assign({BEST: best})
     with path.open("w", encoding="utf-8", newline="") as stream:
         for number in range(plain.sizes["receiver"]):
             table = plain.isel(receiver=number).to_dataframe().reset_index()

@@ -69,10 +69,8 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
     """Grid over a rectangle between two corners [2 or more], metres: square cells whose centres lie in it.
 
     Where an extent is no multiple of the step, it is rounded to the nearest one, half down: of a last cell that the
-    upper side cuts, the centre decides. An extent of up to half a step has one position, in its middle.
-
-    Raises:
-        InputError: a step that is not positive and finite, or more than `LARGEST` positions.
+    upper side cuts, the centre decides. An extent of up to half a step has one position, in its middle. `InputError`: a
+    step that is not positive and finite, or more than `LARGEST` positions.
     """
     _check_step(step_m)
     low = np.asarray(low_m, float)[:2]
@@ -92,8 +90,7 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
 def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
     """Triangles of a mesh file in metres, halved until no edge is longer than a step; None: the faces as they are.
 
-    Raises:
-        InputError: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
+    `InputError`: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
     """
     if not Path(mesh).is_file():
         raise InputError(f"{mesh}: no such file; give a mesh (PLY, STL, OBJ, GLB)")
@@ -123,8 +120,7 @@ def _check_step(step_m: float) -> None:
 def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners [3], metres, of the box around a run's scene; without one around positions [n, 3] and `MARGIN_M`.
 
-    Raises:
-        InputError: no scene, and no position that is known.
+    `InputError`: no scene, and no position that is known.
     """
     if (scene := run.problem.opened_scene) is not None:
         box = scene.mi_scene.bbox()
@@ -137,12 +133,8 @@ def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
     """Median height of positions [n, 3], metres; that of the middle of the run's area where none is known."""
-    heights = tx_pos_m[:, 2]
-    heights = heights[np.isfinite(heights)]
-    if len(heights):
-        return float(np.median(heights))
-    low, high = area_of(run, tx_pos_m)
-    return float(low[2] + high[2]) / 2
+    heights = tx_pos_m[np.isfinite(tx_pos_m[:, 2]), 2]
+    return float(np.median(heights) if len(heights) else np.mean([corner[2] for corner in area_of(run, tx_pos_m)]))
 
 
 def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
@@ -156,8 +148,7 @@ def outside_solids(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
 def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
     """Refuse a plane that the scene's floor or ceiling hides from all receivers; warn of one outside of what is known.
 
-    Raises:
-        InputError: a height above or below a scene with a surface between it and every receiver, with the scene's.
+    `InputError`: a height above or below a scene with a surface between it and every receiver, with the scene's.
     """
     scene, low, high = run.problem.opened_scene, *(float(corner[2]) for corner in area_of(run, tx_pos_m))
     if low <= height_m <= high:
@@ -168,8 +159,14 @@ def check_height(run: Run, height_m: float, tx_pos_m: FloatArray) -> None:
             *(height_m, low + MARGIN_M, high - MARGIN_M),
         )
         return
+    import mitsuba as mi
+
     text = f"height {height_m:g} m: outside of the scene, which spans z = {low:.2f} to {high:.2f} m"
-    if _hidden(scene, [receiver.position_m for receiver in run.receivers], height_m > high):
+    up = 1 if height_m > high else -1
+    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.search.devices.before_surfaces`).
+    start = np.stack([receiver.position_m for receiver in run.receivers]) - np.array([0.0, 0.0, up * MOUNTED_M])
+    ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
+    if np.all(np.array(scene.mi_scene.ray_test(ray), bool)):
         raise InputError(f"{run.folder}: {text}; give a height in between")
     logger.warning("%s", text)  # as above the roofs of a city
 
@@ -181,17 +178,6 @@ def warn_of_points_outside(run: Run, positions_m: FloatArray, tx_pos_m: FloatArr
     if outside:
         what = "data, so values are extrapolated" if run.problem.opened_scene is None else "scene"
         logger.warning("%d of %d points of the surface lie outside of the %s", outside, len(positions_m), what)
-
-
-def _hidden(scene: Any, positions_m: list[FloatArray], above: bool) -> bool:
-    """Whether a surface lies above, or below, every one of some positions [3], metres."""
-    import mitsuba as mi
-
-    up = 1 if above else -1
-    # Receivers are mounted on ceilings, or up to 1 cm behind them (`wrf_mi.tracing.search.devices.before_surfaces`).
-    start = np.stack(positions_m) - np.array([0.0, 0.0, up * MOUNTED_M])
-    ray = mi.Ray3f(to_vectors(start, mi.Point3f), mi.Vector3f(0, 0, up))
-    return bool(np.all(np.array(scene.mi_scene.ray_test(ray), bool)))
 
 
 @dataclass(frozen=True)
@@ -226,9 +212,7 @@ def candidates_of(run: Run, step_m: float | None = None, height_m: float | None 
     """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
 
     By default their step is `CANDIDATE_STEP_M`, more for large areas, and their height the training rows' median.
-
-    Raises:
-        InputError: a step that is not positive or too small, no candidate, or neither scene nor known positions.
+    `InputError`: a step that is not positive or too small, no candidate, or neither scene nor known positions.
     """
     scene, record = run.problem.opened_scene, run.problem.record
     known = record.tx_pos_m[load_rows(run.folder, record).all_train]

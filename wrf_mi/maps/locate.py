@@ -63,9 +63,8 @@ class Positions:
 
     def neighbours_error_m(self, true_m: FloatArray) -> FloatArray | None:
         """Distances [m] of nearest neighbours from true positions, likewise; None without training rows."""
-        if self.neighbours_m is None:
-            return None
-        return np.asarray(np.linalg.norm(self.neighbours_m[:, :2] - true_m[:, :2], axis=1))
+        near_m = self.neighbours_m
+        return None if near_m is None else np.asarray(np.linalg.norm(near_m[:, :2] - true_m[:, :2], axis=1))
 
     def covers(self, true_m: FloatArray) -> NDArray[np.bool_]:
         """Whether each region holds the candidate nearest to the true position [m]."""
@@ -75,9 +74,8 @@ class Positions:
 def located_run(run: str | Path | Run) -> Run:
     """The run of a folder, checked to be one that positions can be found with.
 
-    Raises:
-        InputError: not a finished run of a model of powers in decibels at one carrier for receivers that it was trained
-            on, or a run of several folds.
+    `InputError`: not a finished run of a model of powers in decibels at one carrier for receivers that it was trained
+    on, or a run of several folds.
     """
     opened = open_run(run) if not isinstance(run, Run) else run
     record = opened.problem.record
@@ -148,15 +146,13 @@ def locate(
     >>> shutil.rmtree(folder)
     """
     run = located_run(run)
-    record = run.problem.record
-    observed = np.asarray(observed_dbm, float)
+    record, observed = run.problem.record, np.asarray(observed_dbm, float)
     _check(run, observed, level, offset_db)
     candidates = candidates_of(run, step_m, height_m)
     session = Session(run.folder, run.folder, on_progress, stop)
-    headings = headings_of(run)
     try:
         report = partial(session.report, "predicting candidates")
-        predicted = predict_candidates(run.fitted, len(observed), headings, candidates, report)
+        predicted = predict_candidates(run.fitted, len(observed), headings_of(run), candidates, report)
         calibration = calibration_of(run, candidates, session)
     except InputError as error:
         raise InputError(f"{run.folder}: {error}") from None
@@ -176,11 +172,9 @@ def locate(
         probability[number] = probabilities
         estimate[number, :2] = candidates.positions_m[best, :2]
         session.report("locating", (number + 1) / m)
-    area = inside.sum(axis=1) * candidates.cell_m2
-    near = None
-    if calibration.neighbours is not None:
-        near = calibration.neighbours.locate(record, load_rows(run.folder, record).all_train, observed)
-    return Positions(estimate, radius, area, probability, inside, near, level, candidates, calibration)
+    area, near = inside.sum(axis=1) * candidates.cell_m2, calibration.neighbours
+    near_m = None if near is None else near.locate(record, load_rows(run.folder, record).all_train, observed)
+    return Positions(estimate, radius, area, probability, inside, near_m, level, candidates, calibration)
 
 
 def _check(run: Run, observed_dbm: FloatArray, level: float, offset_db: float | None) -> None:

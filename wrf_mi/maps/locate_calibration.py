@@ -15,12 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
-from scipy.stats import norm
 from scipy.stats import t as student_t
 from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
@@ -114,19 +112,18 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
         with readable(file, f"{file}: missing", "remove it"):
             stored = json.loads(file.read_text(encoding="utf-8"))
             if stored.pop("key") == key:
-                return _restored(stored)
+                form, near = stored.pop("likelihood"), Neighbours(**stored.pop("neighbours"))
+                silence = None if form["silence"] is None else Silence(**form["silence"])
+                return Calibration(Likelihood(**form | {"silence": silence}), near, **stored)
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
     folds = folds_of(record, split)
     if not folds:
         return Calibration(Likelihood())
-    parts = []
+    parts, most = [], max(1, MOST_ROWS // len(folds))
     for number, fold in enumerate(folds):
-        label = f"calibrating, fold {number + 1} of {len(folds)}"
-        receivers, predicted = _predicted_fold(
-            run, fold, run.folder / FOLDER / f"fold{number}", candidates, session, label
-        )
+        label, folder = f"calibrating, fold {number + 1} of {len(folds)}", run.folder / FOLDER / f"fold{number}"
+        receivers, predicted = _predicted_fold(run, fold, folder, candidates, session, label)
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
-        most = max(1, MOST_ROWS // len(folds))
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
         parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
     neighbours, error_m = choose_neighbours(record, folds)
@@ -161,15 +158,6 @@ def folds_of(record: Record, split: Split) -> list[Split]:
     """Hold-outs of other seeds (`hold_out`), whose likelihoods are compared; none where no rows can be held out."""
     folds = [hold_out(record, replace(split, seed=split.seed + number)) for number in range(FOLDS)]
     return [fold for fold in folds if fold is not None]
-
-
-def _restored(stored: dict[str, Any]) -> Calibration:
-    form = stored.pop("likelihood")
-    silence = form.pop("silence")
-    neighbours = Neighbours(**stored.pop("neighbours"))
-    return Calibration(
-        Likelihood(**form, silence=None if silence is None else Silence(**silence)), neighbours, **stored
-    )
 
 
 def choose(
@@ -229,9 +217,8 @@ def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelih
     """
     best = scores[int(np.argmax([of_form.mean() for of_form in scores]))]
     able = [form for form, of_form in zip(forms, scores, strict=True) if _clear_gain(best - of_form) <= 0]
-    return max(
-        able, key=lambda form: form.scale * (norm() if form.degrees is None else student_t(form.degrees)).ppf(WIDE)
-    )
+    # Student's t of infinitely many degrees of freedom is normal.
+    return max(able, key=lambda form: form.scale * student_t(form.degrees or np.inf).ppf(WIDE))
 
 
 def _clear_gain(difference: FloatArray) -> float:
@@ -262,8 +249,7 @@ def _scores(record: Record, part: Located, form: Likelihood, candidates: Candida
 def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
     """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
     mean = np.concatenate([part.predicted[0][:, :, part.truth].mean(axis=0).ravel() for part in parts])
-    heard = [np.isfinite(record.observation[part.receivers][:, part.rows]).ravel() for part in parts]
-    received = np.concatenate(heard)
+    received = np.concatenate([np.isfinite(record.observation[p.receivers][:, p.rows]).ravel() for p in parts])
     if received.all() or not received.any():
         return None
     middle, spread = float(mean.mean()), float(mean.std()) or 1.0

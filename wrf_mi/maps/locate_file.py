@@ -40,10 +40,8 @@ def read_observations(
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
     needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
     true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
-
-    Raises:
-        InputError: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver,
-            a field that is no number, or a row without any strength.
+    `InputError`: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver, a
+    field that is no number, or a row without any strength.
     """
     table = read_csv(Path(path), skip_blank=True)
     names = [receiver.name for receiver in receivers]
@@ -100,11 +98,7 @@ def write_positions_file(out: Path, located: Positions, true_m: FloatArray | Non
     ``true_x``, ``true_y``, ``error_m`` and ``inside``, 1 where the region holds the true position.
     """
     columns: dict[str, Any] = dict(zip("xyz", located.tx_pos_m.T, strict=True))
-    columns |= {
-        "radius_m": located.radius_m,
-        "area_m2": located.area_m2,
-        "level": np.full(len(located), located.level),
-    }
+    columns |= {"radius_m": located.radius_m, "area_m2": located.area_m2, "level": np.full(len(located), located.level)}
     if located.neighbours_m is not None:
         columns |= {"knn_x": located.neighbours_m[:, 0], "knn_y": located.neighbours_m[:, 1]}
     if true_m is not None:
@@ -134,8 +128,7 @@ def figures_of(located: Positions, true_m: FloatArray | None = None) -> dict[str
         figures["held_out"] = {name: getattr(chosen, name) for name in names}
     if true_m is not None:
         figures |= {"error_m": summary(located.error_m(true_m)), "inside": float(located.covers(true_m).mean())}
-        near = located.neighbours_error_m(true_m)
-        if near is not None:
+        if (near := located.neighbours_error_m(true_m)) is not None:
             figures["neighbours_error_m"] = summary(near)
     return figures
 
@@ -164,7 +157,20 @@ def draw_positions(run: Run, located: Positions, true_m: FloatArray | None = Non
         axes.set_visible(False)
     figure.supxlabel("x (m)", fontsize=8)
     figure.supylabel("y (m)", fontsize=8)
-    figure.legend(handles=_legend(located, true_m is not None), loc="outside upper center", ncols=4, fontsize=8)
+    dot: dict[str, Any] = {"linestyle": "none"}
+    handles: list[Any] = [
+        Patch(color="tab:green", alpha=0.6, label="probability"),
+        Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
+        Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
+        Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
+    ]
+    if located.calibration.neighbours is not None:
+        name = f"{located.calibration.neighbours.count} nearest neighbours"
+        handles.append(Line2D([], [], marker="s", color=NEIGHBOURS, label=name, **dot))
+    if true_m is not None:
+        handles.append(Line2D([], [], marker="+", color=TRUTH, markeredgewidth=2, label="true position", **dot))
+    handles.append(Line2D([], [], marker="^", color="tab:blue", label="receiver", **dot))
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=8)
     return figure
 
 
@@ -189,21 +195,3 @@ def _draw_row(axes: Axes, arrays: dict[str, Any], located: Positions, row: int, 
         axes.plot(*true_m[row], "+", color=TRUTH, markersize=11, markeredgewidth=2)
         title += f", error {located.error_m(true_m)[row]:.2f} m"
     axes.set_title(title, fontsize=9)
-
-
-def _legend(located: Positions, with_truth: bool) -> list[Any]:
-    dot: dict[str, Any] = {"linestyle": "none"}
-    handles: list[Any] = [
-        Patch(color="tab:green", alpha=0.6, label="probability"),
-        Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
-        Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
-        Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
-    ]
-    if located.neighbours_m is not None:
-        k = located.calibration.neighbours
-        name = "nearest neighbours" if k is None else f"{k.count} nearest neighbours"
-        handles.append(Line2D([], [], marker="s", color=NEIGHBOURS, label=name, **dot))
-    if with_truth:
-        handles.append(Line2D([], [], marker="+", color=TRUTH, markeredgewidth=2, label="true position", **dot))
-    handles.append(Line2D([], [], marker="^", color="tab:blue", label="receiver", **dot))
-    return handles

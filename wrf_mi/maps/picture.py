@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -78,8 +77,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     strongest = np.fmax.reduce(power, axis=0)
     for place, (axes, (name, number)) in enumerate(zip(grid.flat, panels, strict=False)):
         values = strongest if number is None else power[number]
-        draw = _draw_plan if flat else _draw_mesh
-        draw(axes, dataset, values, colours, walls)
+        _draw_plan(axes, dataset, values, colours, walls) if flat else _draw_mesh(axes, dataset, values, colours)
         _draw_points(axes, dataset, None if number is None else measured[number], number, colours)
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=6)
@@ -125,10 +123,8 @@ def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
 
 
 def _aspect(dataset: xarray.Dataset) -> float:
-    if "point" in dataset.sizes:
-        return 0.9
-    x, y = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
-    return float(np.clip(y / x, 0.3, 1.6))
+    x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
+    return 0.9 if "point" in dataset.sizes else float(np.clip(y_m / x_m, 0.3, 1.6))
 
 
 def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
@@ -137,21 +133,15 @@ def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
     return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
 
 
-def _draw_plan(
-    axes: Axes, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Sequence[FloatArray]
-) -> None:
-    x, y = dataset["x"].values, dataset["y"].values
+def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
     shades: Any = {"cmap": colours.cmap, "norm": colours.norm}
-    axes.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
+    axes.pcolormesh(dataset["x"].values, dataset["y"].values, values, shading="nearest", rasterized=True, **shades)
     for lines in walls:
-        if len(lines):
-            axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
+        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
     axes.set_aspect("equal")
 
 
-def _draw_mesh(
-    axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Sequence[FloatArray]
-) -> None:
+def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable) -> None:
     triangles = dataset["triangle"].values
     area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     largest = np.argsort(-area, kind="stable")[:MOST_FACES]

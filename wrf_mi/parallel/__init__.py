@@ -6,9 +6,8 @@
 ``docs/cluster.md`` says how to start workers on several machines, and what they must share.
 """
 
-from .children import run_module
 from .scheduler import PartsProgress, Scheduler, SchedulerFailed, open_scheduler, row_parts
-from .worker import worker_threads
+from .worker import run_module, worker_threads
 
 __all__ = [
     "PartsProgress",

@@ -228,9 +228,8 @@ def open_scheduler(text: str | None) -> Scheduler:
         try:
             return Scheduler(Client(address, timeout=CONNECT_S, set_as_default=False))
         except (OSError, ValueError, RuntimeError) as error:
-            raise InputError(
-                f"--scheduler {text}: no Dask scheduler answers there ({one_line(error)}); start one: docs/cluster.md"
-            ) from None
+            reason = f"no Dask scheduler answers there ({one_line(error)})"
+            raise InputError(f"--scheduler {text}: {reason}; start one: docs/cluster.md") from None
     cluster = LocalCluster(
         n_workers=count,
         threads_per_worker=1,
@@ -246,10 +245,8 @@ def open_scheduler(text: str | None) -> Scheduler:
 
 def _local_workers(text: str) -> int | None:
     name, colon, number = text.partition(":")
-    if name != "local":
-        return None
-    if not colon:
-        return processors()
+    if name != "local" or not colon:
+        return processors() if name == "local" else None
     if not number.isdecimal() or int(number) < 1:
         raise InputError(f"--scheduler {text}: give the number of workers, 1 or more, such as local:2")
     return int(number)

@@ -26,8 +26,7 @@ from .scene_view import scene_view
 INDEX = "index.html"
 QUANTILES = (0.1, 0.5, 0.9)  # quantiles of the first run's score at which spectra of test rows are shown
 
-Picture = tuple[str, str, Figure]
-"""File name, heading, figure."""
+Picture = tuple[str, str, Figure]  # file name, heading, figure
 
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProgress = quiet) -> Path:
@@ -99,31 +98,23 @@ def _groups(runs: Sequence[Results]) -> dict[str, list[Results]]:
 def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     """Pictures of the runs of a data set; ``slug`` begins the names of their files."""
     task = TASKS[runs[0].task]
-    cdf = figures.score_cdf(
-        {run.name: run.score for run in runs},
-        {name: run.reference_scores[key] for name, (run, key) in references(runs).items()},
-        task.label,
-    )
+    of_references = {name: run.reference_scores[key] for name, (run, key) in references(runs).items()}
+    cdf = figures.score_cdf({run.name: run.score for run in runs}, of_references, task.label)
     samples = _spectra(runs) if task.image else _maps(runs)
-    drawn: list[Picture] = [
-        (f"{slug}-cdf.png", f"{task.label} over test rows", cdf),
-        (f"{slug}-samples.png", *samples),
-    ]
+    drawn: list[Picture] = [(f"{slug}-cdf.png", f"{task.label} over test rows", cdf), (f"{slug}-samples.png", *samples)]
     better = "higher" if task.higher_is_better else "lower"
     medians = {run.name: run.metrics[task.block]["median"] for run in runs}
     times = {"ms per sample": "ms_per_sample", "training time (s)": "train_seconds"}
     panels = {words: {run.name: float(run.metrics[key]) for run in runs} for words, key in times.items()}
     scatter = figures.time_scatter(panels, medians, f"median {task.label}\n({better} is better)")
     drawn.append((f"{slug}-time.png", "Time against error", scatter))
-    staged = {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}
-    if staged:
+    if staged := {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}:
         drawn.append((f"{slug}-stages.png", "What each stage contributes", figures.stage_steps(staged, task.label)))
     if np.isfinite(runs[0].tx_pos_m).all():
         drawn += _error_maps(slug, runs)
     if (view := _scene(runs)) is not None:
         drawn.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
-    curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
-    if curves:
+    if curves := {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}:
         drawn.append((f"{slug}-training.png", "Training", figures.training_curves(curves, task.label)))
     return drawn
 
@@ -159,21 +150,18 @@ def _scene(runs: Sequence[Results]) -> Figure | None:
     traced = next((run for run in runs if (run.path / PATHS).exists()), None)
     if traced is None:
         return None
-    learned = (run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists())
-    field = next(learned, None)
+    field = next((run.path for run in runs if run.metrics.get("gaussians") and (run.path / FITTED).exists()), None)
     row = traced.row[np.argsort(np.nanmean(traced.score, axis=0))[len(traced.row) // 2]]
     try:
         return scene_view(traced.path, int(row), field)
-    except InputError as error:
-        # A run folder outlives the scene that it was traced in.
+    except InputError as error:  # a run folder outlives the scene that it was traced in
         print(f"no picture of the scene of {traced.name}: {error}", file=sys.stderr)
         return None
 
 
 def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
     """Heading and picture of a few test rows, chosen among those that all runs predict, else the first run's."""
-    first = runs[0]
-    positions = indices(runs)
+    first, positions = runs[0], indices(runs)
     shared = (positions >= 0).all(axis=0)
     candidates = np.flatnonzero(shared if shared.any() else np.ones_like(shared))
     score = first.score[:, candidates]
@@ -183,9 +171,8 @@ def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
         receiver, chosen = np.unravel_index(order[round(quantile * (len(order) - 1))], score.shape)
         m = candidates[chosen]
         name = f"row {first.row[m]}" + (f", {first.receivers[receiver]}" if len(first.truth) > 1 else "")
-        predicted = [
-            None if p < 0 else run.prediction[receiver, p] for run, p in zip(runs, positions[:, m], strict=True)
-        ]
+        columns = zip(runs, positions[:, m], strict=True)
+        predicted = [None if p < 0 else run.prediction[receiver, p] for run, p in columns]
         rows.append((name, [first.truth[receiver, m], *predicted, first.reference[receiver, m]]))
     percent = ", ".join(f"{100 * q:g}" for q in QUANTILES)
     heading = f"Test rows at the {percent} % quantiles of the score of {first.name}"

@@ -77,18 +77,12 @@ def page(sections: Sequence[Section], folder: Path) -> str:
 
 
 def _section(section: Section) -> str:
-    task = TASKS[section.runs[0].task]
     shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in CONSTANT}
-    scores = _table(shown, section.scores, NUMERIC)
-    gains = difference_rows(section.differences)
-    numeric = frozenset(("rows", "difference", "low", "high"))
+    gains = _table(DIFFERENCES, difference_rows(section.differences), frozenset(("rows", "difference", "low", "high")))
     images = "\n".join(_image(path, title) for path, title in section.pictures)
     best = best_run(section.runs).name
-    configs = [known_config(run.path) for run in section.runs]
-    commands = "\n".join(
-        f"# {run.name}: config.yaml is missing" if config is None else command(config, run.path)
-        for run, config in zip(section.runs, configs, strict=True)
-    )
+    configs = [(run, known_config(run.path)) for run in section.runs]
+    lines = [f"# {run.name}: config.yaml is missing" if c is None else command(c, run.path) for run, c in configs]
     rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
     return f"""
 <h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
@@ -96,17 +90,17 @@ def _section(section: Section) -> str:
 <h3>Models</h3>
 {_models(section.runs)}
 <h3>Scores</h3>
-<p class="note">{_text(task.label)}, {_better(section.runs[0])}. Click a heading to sort.</p>
-{scores}
+<p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.</p>
+{_table(shown, section.scores, NUMERIC)}
 <h3>Paired differences</h3>
 <p class="note">Each run against {_text(rival)}its reference, on the test rows that both have: mean difference per row,
 positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of rows. {BETTER} and {WORSE}: the
 interval excludes zero, in all seeds; else a tie. Rows along a path resemble each other, and the interval is then too
 narrow.</p>
-{_table(DIFFERENCES, gains, numeric)}
+{gains}
 {images}
 <h3>Commands</h3>
-<pre>{_text(commands)}</pre>
+<pre>{_text(chr(10).join(lines))}</pre>
 """
 
 
@@ -119,25 +113,18 @@ def _facts(runs: Sequence[Results]) -> str:
     first, task = runs[0], TASKS[runs[0].task]
     known = {dataset.name: dataset for dataset in KNOWN}.get(first.dataset)
     origin = f"{first.dataset or 'unknown'}" + ("" if known is None else f" ({known.licence}; {known.origin})")
-    rows = dict.fromkeys(
-        f"{run.metrics['split']}: {run.metrics['n_train']} training rows, {run.metrics['n_test']} test rows"
-        for run in runs
-    )
+    form = "{split}: {n_train} training rows, {n_test} test rows"
     count = len(first.receivers)
     receivers = f"{count} receivers" if count > 1 else "1 receiver"
     facts = {"data": origin, "task": f"{task.heading}, {receivers}"}
     facts["score"] = f"{task.label}, {_better(first)}. {task.note}"
-    facts["rows"] = "; ".join(rows)
+    facts["rows"] = "; ".join(dict.fromkeys(form.format_map(run.metrics) for run in runs))
     if len(runs) > 1:
-        keys = common(runs)
-        count = len({row for _, row in keys})
-        text = f"{count} test rows are common to all runs"
-        facts["common"] = text + (
-            "; pairs are compared on the rows that both have" if count else ", so means differ in rows"
-        )
+        count = len({row for _, row in common(runs)})
+        text = "; pairs are compared on the rows that both have" if count else ", so means differ in rows"
+        facts["common"] = f"{count} test rows are common to all runs{text}"
     facts["reference"] = "; ".join(dict.fromkeys(run.reference_name for run in runs)) + " (of the same training rows)"
-    scenes = dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene"))
-    if scenes:
+    if scenes := dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene")):
         facts["scene"] = "; ".join(scenes)
     return _definitions(facts)
 
@@ -156,7 +143,8 @@ def _models(runs: Sequence[Results]) -> str:
             rows.append({"run": run.name, "model": run.metrics["model"], "settings": "not stored", "scene": None})
             continue
         changed = ", ".join(f"{name}={value}" for name, value in changed_settings(config).items())
-        words = f"{config.model}: {model_words(config)}" + (", calibrated intervals" if config.intervals else "")
+        described = config.entry.described(config.scene is not None)
+        words = f"{config.model}: {described}" + (", calibrated intervals" if config.intervals else "")
         rows.append({"run": run.name, "model": words, "settings": changed or "none", "scene": config.scene})
     return _table(columns, rows, frozenset())
 
@@ -175,14 +163,11 @@ def _versions(runs: Sequence[Results]) -> str:
 def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
     """Table that sorts by a click on a heading; columns without a value are left out."""
     filled = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
-    head = "".join(
-        f'<th scope="col"{_class(key, numeric)}><button type="button">{_text(title)}</button></th>'
-        for key, title in filled.items()
-    )
+    buttons = {key: f'<button type="button">{_text(title)}</button>' for key, title in filled.items()}
+    head = "".join(f'<th scope="col"{_class(key, numeric)}>{button}</th>' for key, button in buttons.items())
     body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in filled) + "</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
-    )
+    table = f'<table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>'
+    return f'<div class="scroll">{table}</div>'
 
 
 def _class(key: str, numeric: frozenset[str]) -> str:
@@ -201,10 +186,9 @@ def _cell(key: str, value: Any, numeric: frozenset[str]) -> str:
 
 
 def _image(path: Path, title: str) -> str:
-    content = path.read_bytes()
     with Image.open(path) as picture:
         width, height = picture.size
-    data = base64.b64encode(content).decode()
+    data = base64.b64encode(path.read_bytes()).decode()
     # On a telephone a wide picture keeps half its size, at which its texts are legible, and scrolls.
     size = f'width="{width}" height="{height}" style="--least: {width // 2}px"'
     image = f'<img src="data:image/png;base64,{data}" {size} alt="{_text(title)}">'
@@ -215,21 +199,13 @@ def _text(value: Any) -> str:
     return html.escape(str(value))
 
 
-def model_words(config: RunConfig) -> str:
-    """The model in words, with its scene."""
-    return config.entry.described(config.scene is not None)
-
-
 def changed_settings(config: RunConfig) -> dict[str, Any]:
     """Settings, by dotted name, that differ from the model's defaults for these data; not arguments of `train`."""
     entry = config.entry
     stated = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
     standard = dict(flat(asdict(default_settings(entry, (), stated))))
-    return {
-        name: value
-        for name, value in flat(asdict(config.settings))
-        if value != standard[name] and name not in entry.train_arguments
-    }
+    settings = {name: value for name, value in flat(asdict(config.settings)) if name not in entry.train_arguments}
+    return {name: value for name, value in settings.items() if value != standard[name]}
 
 
 def command(config: RunConfig, folder: Path) -> str:

@@ -15,36 +15,14 @@ from ..tasks.scores import bootstrap
 from .folder import known_config
 from .results import Results
 
-COLUMNS = {
-    "run": "run",
-    "model": "model",
-    "dataset": "data set",
-    "split": "split",
-    "seed": "seed",
-    "n_train": "training rows",
-    "n_test": "test rows",
-    "metric": "score",
-    "median": "median",
-    "mean": "mean",
-    "p10": "p10",
-    "p90": "p90",
-    "common_mean": "mean, common rows",
-    "inside_90": "inside 90 %",
-    "crps": "CRPS",
-    "ms_per_sample": "ms per sample",
-    "train_seconds": "training (s)",
-    "peak_memory_mb": "peak memory (MB)",
-}
+COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
+COLUMNS |= {"n_train": "training rows", "n_test": "test rows", "metric": "score"}
+COLUMNS |= {key: key for key in ("median", "mean", "p10", "p90")} | {"common_mean": "mean, common rows"}
+COLUMNS |= {"inside_90": "inside 90 %", "crps": "CRPS", "ms_per_sample": "ms per sample"}
+COLUMNS |= {"train_seconds": "training (s)", "peak_memory_mb": "peak memory (MB)"}
 """Columns of ``compare.csv`` and their headings on the page."""
-DIFFERENCES = {
-    "run": "run",
-    "against": "against",
-    "verdict": "verdict",
-    "difference": "difference",
-    "low": "95 % from",
-    "high": "to",
-    "rows": "common rows",
-}
+DIFFERENCES = {key: key for key in ("run", "against", "verdict", "difference")}
+DIFFERENCES |= {"low": "95 % from", "high": "to", "rows": "common rows"}
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
 FEWEST = 2  # least number of common rows of a difference with an interval
@@ -71,10 +49,8 @@ def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
 
     def same(key: tuple[str, int]) -> bool:
         truth = first.truth[rows[0][key]]
-        return all(
-            key in of and np.array_equal(run.truth[of[key]], truth, equal_nan=True)
-            for run, of in zip(runs[1:], rows[1:], strict=True)
-        )
+        others = zip(runs[1:], rows[1:], strict=True)
+        return all(key in of and np.array_equal(run.truth[of[key]], truth, equal_nan=True) for run, of in others)
 
     return [key for key in rows[0] if same(key)]
 
@@ -82,9 +58,7 @@ def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
 def common_means(runs: Sequence[Results]) -> dict[str, float]:
     """Mean score over the observations that all runs score, by the runs' names; empty without any."""
     keys = common(runs)
-    if not keys:
-        return {}
-    return {run.name: float(np.mean([run.score[of[key]] for key in keys])) for run in runs for of in [run.scored]}
+    return {run.name: float(np.mean([run.score[run.scored[key]] for key in keys])) for run in runs if keys}
 
 
 def best_run(runs: Sequence[Results]) -> Results:
@@ -137,9 +111,9 @@ def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
 
 
 def _paired(run: Results, other: Results) -> FloatArray:
-    ours, theirs = run.scored, other.scored
     keys = common([run, other])
-    return _per_row(run, [key[1] for key in keys], [run.score[ours[k]] - other.score[theirs[k]] for k in keys])
+    change = [run.score[run.scored[key]] - other.score[other.scored[key]] for key in keys]
+    return _per_row(run, [row for _, row in keys], change)
 
 
 def _to_reference(run: Results) -> tuple[str, FloatArray]:
@@ -153,9 +127,8 @@ def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatAr
     if not len(row):
         return np.zeros(0)
     _, which = np.unique(row, return_inverse=True)
-    sums = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
-    result: FloatArray = sums if TASKS[run.task].higher_is_better else -sums
-    return result
+    means = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
+    return np.asarray(means if TASKS[run.task].higher_is_better else -means)
 
 
 def _method(run: Results) -> Any:
@@ -186,10 +159,8 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
 
 def difference_rows(differences: Sequence[Difference]) -> list[dict[str, Any]]:
     """Rows of the table of differences."""
-    return [
-        asdict(gain) | {"verdict": gain.verdict + (f" ({gain.seeds} seeds)" if gain.seeds > 1 else "")}
-        for gain in differences
-    ]
+    seeds = [f" ({gain.seeds} seeds)" if gain.seeds > 1 else "" for gain in differences]
+    return [asdict(gain) | {"verdict": gain.verdict + words} for gain, words in zip(differences, seeds, strict=True)]
 
 
 def references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:

@@ -26,9 +26,8 @@ from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
-from .constant import CONSTANT, SCORES, against_constant, constant_scores
 from .folder import METRICS, PREDICTIONS, RunConfig
-from .results import Observations, reference_key
+from .results import CONSTANT, SCORES, Observations, against_constant, constant_scores, reference_key
 
 Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
 """Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
@@ -75,7 +74,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
-        (`wrf_mi.runs.constant.against_constant`), for several receivers ``receivers``, with standard deviations
+        (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with standard deviations
         ``inside_90`` and ``crps``, ``n_train``, ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of
         ``predictions.npz``. An observation that is not finite is not scored: its truth is NaN; so are all of the
         trained receivers in a split that holds out others.

@@ -94,17 +94,14 @@ def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, labe
             axes = grid[r, c]
             axes.set_aspect("equal")
             axes.tick_params(labelsize=6)
-            if r == 0:
-                axes.set_title(title, fontsize=8)
-            if c == 0:
-                axes.set_ylabel(f"{name}\ny (m)", fontsize=7)
-            if r == len(rows) - 1:
-                axes.set_xlabel("x (m)", fontsize=7)
+            axes.set_title(title if r == 0 else "", fontsize=8)
+            axes.set_ylabel(f"{name}\ny (m)" if c == 0 else "", fontsize=7)
+            axes.set_xlabel("x (m)" if r == len(rows) - 1 else "", fontsize=7)
             if values is None:
                 axes.set_axis_off()
-                continue
-            size = float(np.clip(POINTS_AREA / len(x), 6, 40))
-            axes.scatter(x, y, c=np.asarray(values), s=size, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+            else:
+                size = float(np.clip(POINTS_AREA / len(x), 6, 40))
+                axes.scatter(x, y, c=np.asarray(values), s=size, cmap="viridis", vmin=low, vmax=high, linewidths=0)
         colours = ScalarMappable(Normalize(low, high), cmap="viridis")
         bar = figure.colorbar(colours, ax=list(grid[r]), shrink=0.9)
         bar.set_label(label, fontsize=7)
@@ -174,8 +171,7 @@ def score_cdf(scores: Mapping[str, ArrayLike], references: Mapping[str, ArrayLik
         style = "--" if number >= len(scores) else ("-", "-.", ":")[number // COLOURS % 3]
         axes.ecdf(values, label=name, linestyle=style, color=f"C{number % COLOURS}")
     axes.set_xlim(min(np.quantile(v, TAIL) for v in shown), max(np.quantile(v, 1 - TAIL) for v in shown))
-    axes.set_xlabel(label)
-    axes.set_ylabel("share of test rows below")
+    axes.set(xlabel=label, ylabel="share of test rows below")
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, loc="outside right upper")
     return figure
@@ -186,10 +182,8 @@ def training_curves(curves: Mapping[str, Sequence[tuple[float, float]]], label: 
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for name, points in curves.items():
-        seconds, score = zip(*points, strict=True)
-        axes.plot(seconds, score, marker=".", label=name)
-    axes.set_xlabel("training time (s)")
-    axes.set_ylabel(f"{label} on held-out validation rows")
+        axes.plot(*zip(*points, strict=True), marker=".", label=name)
+    axes.set(xlabel="training time (s)", ylabel=f"{label} on held-out validation rows")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure
@@ -219,8 +213,7 @@ def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = 
                 at, text = (order.index(report["stage"]), score), ", ".join(costs)
                 axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
     axes.set_xticks(range(len(order)), order)
-    axes.set_xlim(-0.2, len(order) - 0.5)  # the last label lies beside its point
-    axes.set_ylabel(f"mean {label}")
+    axes.set(xlim=(-0.2, len(order) - 0.5), ylabel=f"mean {label}")  # the last label lies beside its point
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -50,8 +50,7 @@ CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
 
 
-Settings = Iterable[str] | object
-"""``key=value`` of the model's settings, or all settings as its dataclass."""
+Settings = Iterable[str] | object  # ``key=value`` of the model's settings, or all settings as its dataclass
 GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # arguments of `train` that may be settings, too
 
 
@@ -102,28 +101,15 @@ class RunConfig:
 def package_versions() -> dict[str, str]:
     """Versions of this package, of the numerical packages below it, and of Python."""
     packages = ("mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image", "scikit-learn")
-    return {
-        "wrf-mi": __version__,
-        **{name: importlib.metadata.version(name) for name in packages},
-        "python": platform.python_version(),
-    }
+    below = {name: importlib.metadata.version(name) for name in packages}
+    return {"wrf-mi": __version__, **below, "python": platform.python_version()}
 
 
 def versions() -> dict[str, str]:
     """Versions of packages, backend and device."""
     backend = init()
-    return {
-        **package_versions(),
-        "backend": f"{backend.name} {backend.llvm_version or ''}".strip(),
-        "device": backend.device,
-    }
-
-
-def write_config(folder: Path, config: RunConfig) -> None:
-    """Write ``config.yaml``."""
-    content = {"format": FORMAT, **asdict(config), "versions": versions()}
-    plain = json.loads(json.dumps(content))  # YAML has no tuples
-    write_atomically(folder / CONFIG, yaml.safe_dump(plain, sort_keys=False))
+    name = f"{backend.name} {backend.llvm_version or ''}".strip()
+    return {**package_versions(), "backend": name, "device": backend.device}
 
 
 def read_config(folder: Path) -> RunConfig:
@@ -167,22 +153,16 @@ def stored_versions(folder: Path) -> dict[str, str]:
 
 def check_format(folder: Path) -> None:
     """Refuse a run of another format by `InputError`; an unreadable configuration passes."""
-    try:
+    content: dict[Any, Any] = {}
+    with suppress(InputError):
         content = read_yaml(folder / CONFIG)
-    except InputError:
-        content = {}
-    stated = content.get("format") if content else FORMAT
-    if stated != FORMAT:
+    if content and (stated := content.get("format")) != FORMAT:
         text = f"format {stated or 'not stated'}, this version reads {FORMAT}"
         raise InputError(f"{folder / CONFIG}: {text}; train it anew, or use the version that wrote it")
 
 
 def check_new(folder: Path) -> None:
-    """Refuse a file, or a folder that is neither empty nor that of a run killed before its configuration was written.
-
-    Raises:
-        InputError: naming the folder.
-    """
+    """Refuse a file, or a folder that is neither empty nor of a run killed before its configuration was written."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not _is_begun(folder):
         remedy = f"choose another --out, or go on with train --resume {folder}"
         raise InputError(f"{folder}: exists and is not empty; {remedy}")
@@ -213,10 +193,11 @@ def start_run(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
 
 def write_configs(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
     """Write ``config.yaml`` of a run and of its folds."""
-    for part, rows in _folders(folder, splits):
-        if part != folder:
-            write_config(part, replace(config, split=rows.name))
-    write_config(folder, config)  # last: a folder with a configuration has all its splits
+    of_folds = [(part, replace(config, split=rows.name)) for part, rows in _folders(folder, splits) if part != folder]
+    for part, stated in [*of_folds, (folder, config)]:  # last: a folder with a configuration has all its splits
+        content = {"format": FORMAT, **asdict(stated), "versions": versions()}
+        plain = json.loads(json.dumps(content))  # YAML has no tuples
+        write_atomically(part / CONFIG, yaml.safe_dump(plain, sort_keys=False))
 
 
 def _folders(folder: Path, splits: Sequence[Split]) -> list[tuple[Path, Split]]:
@@ -255,8 +236,7 @@ def write_fitted(folder: Path, arrays: Arrays, seconds: float) -> Path:
 def read_fitted(folder: Path, entry: Model) -> tuple[Arrays, float]:
     """Arrays of ``model.npz`` of a model, and the training time in seconds.
 
-    Raises:
-        InputError: missing, damaged, of another format, or NaN or infinity where the model has no `Model.gaps`.
+    `InputError`: missing, damaged, of another format, or NaN or infinity where the model has no `Model.gaps`.
     """
     path = folder / FITTED
     missing = f"{path}: missing, the fit was stopped; finish it with train --resume"

@@ -36,14 +36,24 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
 
     A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
     [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
-
-    Raises:
-        InputError: the file is missing, or a row is not made of finite numbers.
+    `InputError`: the file is missing, or a row is not made of finite numbers.
     """
     path = Path(csv_file if csv_file is not None else npz_file or "")
     if not path.is_file():
         raise InputError(f"{path}: no such file; give positions x, y, z in metres")
-    inputs = _from_csv(path) if csv_file is not None else _from_npz(path)
+    if csv_file is not None:
+        table = read_csv(path, skip_blank=True)
+        table = replace(table, header=[name.lower() for name in table.header])
+        positions = np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
+        heading, hz = (table.numbers(name) if name in table.header else None for name in (HEADING, FREQUENCY))
+        inputs = Inputs(positions, heading, carriers_hz=hz)
+    else:
+        inputs = _from_npz(path)
+    _check_finite(path, inputs)
+    return inputs
+
+
+def _check_finite(path: Path, inputs: Inputs) -> None:
     positions, uplink = inputs.tx_pos_m, inputs.uplink
     if uplink is not None:
         if uplink.ndim != 3 or uplink.dtype.kind != "c":
@@ -55,21 +65,12 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
         if len(bad):
             raise InputError(f"{path}, row {bad[0] + 1}: uplink is not finite; correct or remove the row")
         if np.isnan(positions).all() and len(positions):
-            return inputs
+            return
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
     if len(bad):
         raise InputError(f"{path}, row {bad[0] + 1}: not a finite number; give x, y, z in metres")
     if len(positions) == 0:
         raise InputError(f"{path}: no positions; give one row x, y, z in metres for each")
-    return inputs
-
-
-def _from_csv(path: Path) -> Inputs:
-    table = read_csv(path, skip_blank=True)
-    table = replace(table, header=[name.lower() for name in table.header])
-    positions = np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)
-    heading, hz = (table.numbers(name) if name in table.header else None for name in (HEADING, FREQUENCY))
-    return Inputs(positions, heading, carriers_hz=hz)
 
 
 def _from_npz(path: Path) -> Inputs:
@@ -135,11 +136,8 @@ def write_prediction_file(
     Returns:
         The arrays as an ``.npz`` file has them.
     """
-    arrays: dict[str, Any] = {
-        "row": np.arange(len(inputs)),
-        "tx_pos": inputs.tx_pos_m,
-        "receiver_name": np.asarray(receivers),
-    }
+    arrays: dict[str, Any] = {"row": np.arange(len(inputs)), "tx_pos": inputs.tx_pos_m}
+    arrays["receiver_name"] = np.asarray(receivers)
     if inputs.carriers_hz is not None:
         arrays[FREQUENCY] = inputs.carriers_hz
     if out.suffix.lower() == NPZ:

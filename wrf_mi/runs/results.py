@@ -1,4 +1,4 @@
-"""Scores and predictions of a finished run, read from its folder."""
+"""Scores and predictions of a finished run, read from its folder, and what they are against a constant prediction."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.files import readable
 from ..core.types import IntArray
 from ..tasks import TASKS, Task
+from ..tasks.scores import summary
 from ..training.checkpoint import LOG
 from .folder import METRICS, PREDICTIONS, check_format
 
@@ -25,6 +26,9 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 """Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
 
 REMEDY = "run evaluate to write it anew"
+CONSTANT = "constant"  # key of the block in ``metrics.json``
+SCORES = "constant_score"
+"""Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
 
 
 def reference_key(name: str) -> str:
@@ -91,8 +95,7 @@ class Results:
 def read_run(path: str | Path, name: str | None = None) -> Results:
     """Read a run folder (with folds, the pooled scores); ``name`` is for tables, by default that of the folder.
 
-    Raises:
-        InputError: not a run folder, or a file in it that is missing or damaged.
+    `InputError`: not a run folder, or a file in it that is missing or damaged.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -125,8 +128,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
 def read_runs(paths: Sequence[str | Path]) -> list[Results]:
     """Read several run folders; where names coincide, parent folders are added to tell them apart.
 
-    Raises:
-        InputError: no folder, a folder given twice, or a folder that is not a run.
+    `InputError`: no folder, a folder given twice, or a folder that is not a run.
     """
     resolved = [Path(p).resolve() for p in paths]
     if not resolved:
@@ -145,8 +147,7 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     with readable(path, missing, REMEDY):
         metrics = json.loads(path.read_text())
     needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
-    absent = [key for key in needed if key not in metrics]
-    if absent:
+    if absent := [key for key in needed if key not in metrics]:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     if metrics["task"] not in TASKS:
         raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
@@ -164,8 +165,7 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     observed = ["prediction", "truth", *map(reference_key, references)]
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
-    absent = [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]
-    if absent:
+    if absent := [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]:
         raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
     observed += ["std"] if "std" in stored else []
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
@@ -195,3 +195,51 @@ def _read_log(path: Path) -> list[tuple[float, float]]:
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
     return points
+
+
+def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> FloatArray:
+    """Scores [n_rx, m] of a constant prediction (`wrf_mi.tasks.Task.constant`) of the test rows' truth [n_rx, m, ...].
+
+    The constant is that of the training rows, validation rows included, that a receiver received; a receiver without
+    any, which the split holds out, takes that of all receivers. Truth is NaN where it is not scored.
+    """
+    task, rows = TASKS[record.task], split.all_train
+    observed = record.seen(split).observation[:, rows]
+    received = np.asarray(np.isfinite(observed).reshape(*observed.shape[:2], -1).all(axis=2))
+    scores = []
+    for values, known, expected in zip(observed, received, truth, strict=True):
+        constant = task.constant(values[known] if known.any() else observed[received])
+        scores.append(task.of_rows(np.broadcast_to(constant, expected.shape)[None], expected[None])[0])
+    return np.stack(scores)
+
+
+def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> dict[str, Any]:
+    """Block of ``metrics.json``: whether a model's scores [n_rx, m] are clearly better than the constant prediction's.
+
+    Returns:
+        `wrf_mi.tasks.scores.summary` of the constant prediction, ``gain``, by which the model's mean score is better,
+        its standard error ``gain_error``, and ``beaten``.
+    """
+    sign = 1 if task.higher_is_better else -1
+    # Limited, as a few exact or absurd predictions would decide a mean of decibels.
+    gains = sign * (np.clip(scores, *task.limits) - np.clip(constant, *task.limits))
+    gains = gains[np.isfinite(gains)]
+    gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
+    # More than the standard error, so that chance seldom passes for a gain, and more than the last digit that is shown,
+    # so that predicting all but zero does not either.
+    clear = gain > max(error, 10.0**-task.digits)
+    # The median is the score that tables show first.
+    beaten = clear and sign * float(np.nanmedian(scores) - np.nanmedian(constant)) > 0
+    return {**summary(constant + 0.0), "gain": gain, "gain_error": error, "beaten": beaten}
+
+
+def unbeaten(metrics: dict[str, Any]) -> str | None:
+    """Line about a model whose scores are not better than those of the constant prediction; None where they are."""
+    block = metrics.get(CONSTANT)
+    if block is None or block["beaten"]:
+        return None
+    task = TASKS[metrics["task"]]
+    both = [f"{key} {metrics[task.block][key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
+    gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
+    what = f"{metrics['model']} is no better than predicting {task.constant_words}"
+    return f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores"

@@ -23,21 +23,14 @@ WEAKEST = 1e-6  # lower limit of drawn signals: -120 dB
 
 
 def scene_view(traced: str | Path, row: int, field: str | Path | None = None) -> Figure:
-    """Mesh, traced paths and optionally the Gaussians of a learned field for a transmitter position.
+    """Mesh, traced paths and optionally the Gaussians of a learned field for the transmitter of a row of the data.
 
-    Args:
-        traced: run folder of the ray tracer.
-        row: row of the data set; the paths and Gaussians of its transmitter are drawn.
-        field: run folder of a field that was trained on the same data, or None.
-
-    Raises:
-        InputError: not such run folders, or a scene that no longer exists.
+    ``traced`` is a run folder of the ray tracer, ``field`` that of a field which was trained on the same data, or None.
+    `InputError`: not such run folders, or a scene that no longer exists.
     """
     run, trace = open_run(traced), load_trace(Path(traced) / PATHS)
-    scene = run.problem.open_scene(trace.frequency_hz)
-    transmitter = trace.tx_pos_m[row]
-    paths = trace.paths.select(trace.paths.tx == row)
-    cloud = None
+    scene, transmitter = run.problem.open_scene(trace.frequency_hz), trace.tx_pos_m[row]
+    paths, cloud = trace.paths.select(trace.paths.tx == row), None
     if field is not None:
         cloud = gaussian_cloud(open_run(field).predictor().gaussians(transmitter[None])).strongest(SHOWN_GAUSSIANS)
     return draw_scene(
@@ -64,9 +57,8 @@ def surfaces_of(scene: Any) -> list[Surface]:
 
 def gaussian_cloud(gaussians: Gaussians) -> GaussianCloud:
     """Gaussians for a transmitter, coloured by opacity times magnitude of all signals, in dB."""
-    position, scale, rotation = (
-        np.array(a, float).T for a in (gaussians.position, gaussians.scale, gaussians.rotation)
-    )
+    shapes = gaussians.position, gaussians.scale, gaussians.rotation
+    position, scale, rotation = (np.array(values, float).T for values in shapes)
     strength = np.sqrt(np.square(np.array(gaussians.signal, float)).sum(axis=0))
     if gaussians.opacity is not None:
         strength = strength * np.array(gaussians.opacity, float)

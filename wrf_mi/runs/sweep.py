@@ -47,17 +47,9 @@ FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"
 SCORES = ("median", "mean", "p10", "p90")
-HEADINGS = {
-    "score": "score",
-    **{key: key for key in SCORES},
-    "reference_median": "reference median",
-    "n_train": "training rows",
-    "n_test": "test rows",
-    "train_seconds": "training, s",
-    "ms_per_sample": "ms per sample",
-    "peak_memory_mb": "peak memory, MB",
-    "status": "status",
-}
+HEADINGS = {key: key for key in ("score", *SCORES)} | {"reference_median": "reference median"}
+HEADINGS |= {"n_train": "training rows", "n_test": "test rows", "train_seconds": "training, s"}
+HEADINGS |= {"ms_per_sample": "ms per sample", "peak_memory_mb": "peak memory, MB", "status": "status"}
 """Headings of the table's columns after the varied settings."""
 
 
@@ -228,15 +220,13 @@ def _files(sweep: Sweep) -> dict[str, list[Path]]:
 def dataset_files(name_or_folder: str) -> list[Path]:
     """Folder or file of a data set; empty where it is not on this machine; `InputError`: no such data set."""
     path = Path(name_or_folder)
-    place = path if path.exists() else locate(name_or_folder)
-    return [] if place is None else [place]
+    return [path] if path.exists() else [place for place in (locate(name_or_folder),) if place is not None]
 
 
 def scene_files(scene: str | Path) -> list[Path]:
     """Folder or file of a scene, with the files that a Mitsuba XML names; empty for the name of an embedded scene.
 
-    Raises:
-        InputError: an XML that cannot be read.
+    `InputError`: an XML that cannot be read.
     """
     path = Path(scene)
     if not path.exists():
@@ -260,9 +250,8 @@ def _run(run: SweepRun) -> dict[str, Any]:
         shutil.rmtree(folder)  # stopped before its configuration was there: nothing to go on from
     arguments = ("train", "--resume", str(folder)) if resumable else (*run.arguments, "--out", str(folder))
     status, message = run_module("wrf_mi.cli", arguments)
-    if status == 0 and (folder / METRICS).exists():
-        return _row(run, "done")
-    return _row(run, message.removeprefix("wrf-mi: ") or f"ended with status {status}")
+    done = status == 0 and (folder / METRICS).exists()
+    return _row(run, "done" if done else message.removeprefix("wrf-mi: ") or f"ended with status {status}")
 
 
 def _row(run: SweepRun, status: str) -> dict[str, Any]:
@@ -273,14 +262,12 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
     task, references = TASKS[metrics["task"]], metrics["reference"]
     row |= {"score": task.label, "reference_median": references[task.headline(references)]["median"]}
     row |= {key: metrics[task.block][key] for key in SCORES}
-    row |= {key: metrics[key] for key in HEADINGS if key in metrics}
-    return row | {"metrics": metrics}
+    return row | {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
 
 
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
     """Raise `SweepFailed` with the names of runs without scores."""
-    failed = [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]
-    if failed:
+    if failed := [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]:
         raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {'; '.join(failed)}")
 
 

@@ -46,14 +46,9 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     >>> record.task, record.observation.shape[2:]
     ('spectrum', (90, 360))
     """
-    makers: dict[str, Callable[..., Record]] = {
-        LABORATORY: laboratory_record,
-        ROOM: traced_room,
-        BANDS: traced_room_bands,
-        FLOOR_STRENGTHS: traced_floor_strengths,
-        FLOOR_CHANNELS: traced_floor_channels,
-        **{f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES},
-    }
+    makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: traced_room}
+    makers |= {BANDS: traced_room_bands, FLOOR_STRENGTHS: traced_floor_strengths, FLOOR_CHANNELS: traced_floor_channels}
+    makers |= {f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES}
     if not Path(name_or_folder).is_dir() and str(name_or_folder) in makers:
         return makers[str(name_or_folder)](progress=progress)
     return load(name_or_folder)

@@ -46,25 +46,17 @@ ORIENTATION = (0.5, 0.5, 0.5, 0.5)
 
 @dataclass(frozen=True)
 class Walk(Searches):
-    """Parameters of a floor's channels, beside those of `Searches`.
+    """Parameters of a floor's channels, beside those of `Searches`."""
 
-    Attributes:
-        rows, columns: numbers of the base station's antennas.
-        users, places: numbers of users on each route, and of positions of each user.
-        wander_m: largest deviation of users from the route, along x and along y.
-        height_m, sway_m: height of a user's antenna and its largest deviation.
-        snr_db: signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers.
-    """
-
-    rows: int = 8
-    columns: int = 13
-    users: int = 2
-    places: int = 80
+    rows: int = 8  # rows of the base station's array
+    columns: int = 13  # columns of the base station's array
+    users: int = 2  # number of users on each route
+    places: int = 80  # number of positions of each user
     scattered_depth: int | None = 2
-    wander_m: float = 0.12
-    height_m: float = 1.2
-    sway_m: float = 0.15
-    snr_db: float = 25.0
+    wander_m: float = 0.12  # largest deviation of users from the route, along x and along y
+    height_m: float = 1.2  # height of a user's antenna
+    sway_m: float = 0.15  # largest deviation of that height
+    snr_db: float = 25.0  # signal-to-noise ratio of each row's uplink and downlink, mean over antennas and subcarriers
 
 
 DEFAULT = Walk()
@@ -73,35 +65,17 @@ DEFAULT = Walk()
 def walked_channels(
     place: str, folder: str | Path | None = None, walk: Walk = DEFAULT, progress: bool = False
 ) -> Record:
-    """A floor's uplink and downlink channels: read from an earlier call, or traced now and stored.
+    """Uplink and downlink channels of the floor ``flat`` or ``office``; `InputError`: another place.
 
-    The official split is a seeded random split of 80 and 20 %.
-
-    Args:
-        place: ``flat`` or ``office``.
-        folder: folder of the channels in the layout of NeRF2's channels; by default ``traced-csi-<place>/`` below
-            ``WRF_MI_DATA`` if it exists, else in the user's cache.
-        walk: parameters.
-        progress: show a progress bar on standard error.
-
-    Returns:
-        A record with ``task="csi"``: ``observation`` and ``truth`` [1, n, antennas, 26], ``uplink`` [n, antennas, 26].
-
-    Raises:
-        InputError: no such place.
+    They are read or made in a folder in the layout of NeRF2's channels (`wrf_mi.synthetic.stored.stored`). The official
+    split is a seeded random split of 80 and 20 %. The record has ``task="csi"``: ``observation`` and ``truth``
+    [1, n, antennas, 26], ``uplink`` [n, antennas, 26]. ``progress`` shows a bar on standard error.
     """
     if place not in PLACES:
         raise InputError(f"place {place!r}: unknown; give one of {', '.join(PLACES)}")
     name, plan = f"{PREFIX}{place}", PLACES[place]()
-    facts = {
-        "format": FORMAT,
-        "place": place,
-        "station_m": plan.station_m,
-        "routes_m": plan.routes,
-        **asdict(walk),
-        "frequency_hz": CARRIER_HZ,
-        "subcarrier_spacing_hz": SPACING_HZ,
-    }
+    facts = {"format": FORMAT, "place": place, "station_m": plan.station_m, "routes_m": plan.routes, **asdict(walk)}
+    facts |= {"frequency_hz": CARRIER_HZ, "subcarrier_spacing_hz": SPACING_HZ}
 
     def write(folder: Path, scene_folder: Path, extra: Files) -> None:
         write_nerf2_csi(folder, _trace(scene_folder, name, plan, walk, progress), replace=True, extra=extra)
@@ -159,8 +133,7 @@ def with_noise(channel: NDArray[np.complex128], snr_db: float, rng: np.random.Ge
 
 
 def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress: bool) -> Record:
-    scene = open_scene(scene_folder, CARRIER_HZ)
-    rng = np.random.default_rng([walk.seed, 0])
+    scene, rng = open_scene(scene_folder, CARRIER_HZ), np.random.default_rng([walk.seed, 0])
     ways = [users_way(route, walk, rng) for route in plan.routes for _ in range(walk.users)]
     positions = np.concatenate(ways)
     array_m = planar_array(walk.rows, walk.columns, speed_of_light / CARRIER_HZ / 2)

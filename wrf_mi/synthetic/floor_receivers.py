@@ -40,8 +40,7 @@ from .stored import Files, scan_file
 NAME = "traced-floor-receivers"
 CHANNELS = f"{NAME}-csi"
 FORMAT = 3  # version of the files, to be raised when they change for equal parameters
-CANDIDATES = 1000
-"""Free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2."""
+CANDIDATES = 1000  # free points of the ceiling among which the receivers' places are chosen: one in 0.2 m^2
 SCANNER_X_M = (1.6, 5.4, 8.2, 11.5, 14.5, 3.65, 14.5, 1.6, 6.2, 10.6, 15.0)
 SCANNER_Y_M = (2.7, 4.85, 0.8, 3.0, 4.8, 6.2, 6.2, 7.7, 7.7, 7.7, 7.7)
 SCANNER_M = tuple((x, y, 1.5) for x, y in zip(SCANNER_X_M, SCANNER_Y_M, strict=True))
@@ -50,36 +49,23 @@ SCANNER_M = tuple((x, y, 1.5) for x, y in zip(SCANNER_X_M, SCANNER_Y_M, strict=T
 
 @dataclass(frozen=True)
 class FloorReceivers(Searches):
-    """Parameters of the floor's receivers, beside those of `Searches`.
+    """Parameters of the floor's receivers, beside those of `Searches`; lengths in metres."""
 
-    Attributes:
-        columns, rows: numbers of receivers along x and y, one in each cell of a grid over the floor.
-        train, test: numbers of training and test positions of the transmitter.
-        mount_m: height of the receivers, metres.
-        low_m, high_m: bounds of the transmitter's height, metres.
-        clear_m, from_receiver_m: least distances of antennas from surfaces, and of transmitters from receivers, metres.
-        power_dbm: power that the transmitter radiates.
-        sensitivity_dbm: signal strength below which nothing is received.
-        offset_db: standard deviation of the receivers' offsets, each the same for all rows.
-        noise_db: standard deviation of the noise of each signal strength.
-        subcarriers, bandwidth_hz: number of the channels' subcarriers, from the carrier upwards, and their bandwidth.
-    """
-
-    columns: int = 4
-    rows: int = 4
-    train: int = 320
-    test: int = 80
-    mount_m: float = 2.85
-    low_m: float = 0.8
-    high_m: float = 1.6
-    clear_m: float = 0.1
-    from_receiver_m: float = 0.5
-    power_dbm: float = 0.0
-    sensitivity_dbm: float = -75.0
-    offset_db: float = 1.0
-    noise_db: float = 1.0
-    subcarriers: int = 16
-    bandwidth_hz: float = 20e6
+    columns: int = 4  # number of receivers along x, one in each cell of a grid over the floor
+    rows: int = 4  # number of receivers along y
+    train: int = 320  # number of training positions of the transmitter
+    test: int = 80  # number of its test positions
+    mount_m: float = 2.85  # height of the receivers
+    low_m: float = 0.8  # least height of the transmitter
+    high_m: float = 1.6  # largest height of the transmitter
+    clear_m: float = 0.1  # least distance of antennas from surfaces
+    from_receiver_m: float = 0.5  # least distance of transmitters from receivers
+    power_dbm: float = 0.0  # power that the transmitter radiates
+    sensitivity_dbm: float = -75.0  # signal strength below which nothing is received
+    offset_db: float = 1.0  # standard deviation of the receivers' offsets, each the same for all rows
+    noise_db: float = 1.0  # standard deviation of the noise of each signal strength
+    subcarriers: int = 16  # number of the channels' subcarriers, from the carrier upwards
+    bandwidth_hz: float = 20e6  # bandwidth of the channels
 
 
 DEFAULT = FloorReceivers()
@@ -88,18 +74,11 @@ DEFAULT = FloorReceivers()
 def traced_floor_strengths(
     folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
 ) -> Record:
-    """Signal strengths on the floor: read from an earlier call, or traced now and stored.
+    """Signal strengths on the floor, read or made in a folder of the BLE layout (`wrf_mi.synthetic.stored.stored`).
 
-    The official split is the first ``train`` rows and the rest; positions are drawn independently.
-
-    Args:
-        folder: folder in the layout of the BLE data; by default ``traced-floor-receivers/`` below ``WRF_MI_DATA`` if it
-            exists, else in the user's cache.
-        floor: parameters.
-        progress: show a progress bar on standard error.
-
-    Returns:
-        A record with ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity.
+    The record has ``task="rssi"``: ``observation`` [receivers, n] in dBm, NaN below the sensitivity. Its official split
+    is the first ``train`` rows and the rest; positions are drawn independently. ``progress`` shows a bar on standard
+    error.
     """
 
     def write(folder: Path, traced: TraceResult, extra: Files) -> None:
@@ -111,16 +90,9 @@ def traced_floor_strengths(
 def traced_floor_channels(
     folder: str | Path | None = None, floor: FloorReceivers = DEFAULT, progress: bool = False
 ) -> Record:
-    """Channels of single antennas on the floor, without noise: read from an earlier call, or traced now and stored.
+    """Channels of single antennas on the floor, without noise, as `traced_floor_strengths`, of a DeepMIMO scenario.
 
-    Args:
-        folder: folder of a scenario of DeepMIMO; by default ``traced-floor-receivers-csi/``, as for
-            `traced_floor_strengths`.
-        floor: parameters.
-        progress: show a progress bar on standard error.
-
-    Returns:
-        A record with ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
+    The record has ``task="csi"``: ``observation`` [receivers, n, subcarriers], NaN where no path arrives.
     """
 
     def write(folder: Path, traced: TraceResult, extra: Files) -> None:
@@ -158,9 +130,18 @@ def trace_floor(scene_folder: Path, plan: FloorPlan, floor: FloorReceivers, prog
     scene = open_scene(scene_folder, CARRIER_HZ)
     receivers, transmitters = floor_devices(scene, plan, floor)
     set_scattering(scene, floor.scattering)
-    parts = [trace_paths(scene, transmitters, receivers, options, progress) for options in floor.options()]
-    scattered = (parts[1].paths.interactions == SCATTERING).any(axis=1)
-    return _joined(parts[0], parts[1].select(scattered))
+    specular, every = (trace_paths(scene, transmitters, receivers, options, progress) for options in floor.options())
+    scattered = every.select((every.paths.interactions == SCATTERING).any(axis=1))
+    # Two traces of the same devices, scene and depth as one, with the options of the second.
+    parts, traces = (specular.paths, scattered.paths), (specular, scattered)
+
+    def rows(of: Sequence[Any], name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in of])
+
+    order = np.lexsort([rows(parts, name) for name in ("length_m", "tx", "rx")])
+    arrays: dict[str, Any] = {name: rows(parts, name)[order] for name in ARRAYS}
+    primitives, probability = (rows(traces, name)[order] for name in ("primitives", "probability"))
+    return replace(scattered, paths=replace(parts[0], **arrays), primitives=primitives, probability=probability)
 
 
 def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[tuple[Receiver, ...], FloatArray]:
@@ -188,19 +169,6 @@ def floor_devices(scene: Any, plan: FloorPlan, floor: FloorReceivers) -> tuple[t
     receivers = tuple(Receiver(f"anchor{k}", place, np.array(UPRIGHT)) for k, place in enumerate(receivers_m, start=1))
     count = floor.train + floor.test
     return receivers, free(floor.low_m, floor.high_m, count, (receivers_m, floor.from_receiver_m))
-
-
-def _joined(specular: TraceResult, scattered: TraceResult) -> TraceResult:
-    """Two traces of the same devices, scene and depth as one, with the options of the second."""
-    parts, traces = (specular.paths, scattered.paths), (specular, scattered)
-
-    def rows(of: Sequence[Any], name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(part, name) for part in of])
-
-    order = np.lexsort([rows(parts, name) for name in ("length_m", "tx", "rx")])
-    arrays: dict[str, Any] = {name: rows(parts, name)[order] for name in ARRAYS}
-    primitives, probability = (rows(traces, name)[order] for name in ("primitives", "probability"))
-    return replace(scattered, paths=replace(parts[0], **arrays), primitives=primitives, probability=probability)
 
 
 def strengths_of(traced: TraceResult, floor: FloorReceivers) -> Record:

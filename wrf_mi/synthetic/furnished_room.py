@@ -48,20 +48,14 @@ FORMAT = 3  # version of the files, to be raised when they change for equal para
 
 @dataclass(frozen=True)
 class TracedRoom(Searches):
-    """Parameters of the traced room, beside those of `Searches`.
+    """Parameters of the traced room, beside those of `Searches`."""
 
-    Attributes:
-        train, test: numbers of training and test rows.
-        low_m, high_m: bounds of the transmitters' height, metres.
-        clear_m, from_array_m: least distances from surfaces and from the array, metres.
-    """
-
-    train: int = 1600
-    test: int = 200
-    low_m: float = 0.5
-    high_m: float = 2.0
-    clear_m: float = 0.1
-    from_array_m: float = 0.5
+    train: int = 1600  # number of training rows
+    test: int = 200  # number of test rows
+    low_m: float = 0.5  # least height of the transmitters, metres
+    high_m: float = 2.0  # largest height of the transmitters, metres
+    clear_m: float = 0.1  # least distance of transmitters from surfaces, metres
+    from_array_m: float = 0.5  # least distance of transmitters from the array, metres
     depth: int = 4
     scattered_depth: int | None = 3
     rays: int = 1 << 16
@@ -70,28 +64,17 @@ class TracedRoom(Searches):
 
 @dataclass(frozen=True)
 class RoomBands(TracedRoom):
-    """Parameters of the furnished room at several carriers.
+    """Parameters of the furnished room at several carriers, beside those of `TracedRoom`."""
 
-    Further parameters are those of `TracedRoom`.
-
-    Attributes:
-        train, test: numbers of training and test positions, each with a row for every carrier.
-        carriers_hz: carriers, Hz.
-        searched_at_hz: carrier of the search for paths, Hz.
-        rows, columns, spacing_m: numbers of elements of both arrays, and distance of neighbours, metres: below half a
-            wavelength at the highest carrier.
-        height, width: pixels of a spectrum: 2 degrees, a sixth of the narrowest beam.
-    """
-
-    train: int = 240
-    test: int = 60
+    train: int = 240  # number of training positions, each with a row for every carrier
+    test: int = 60  # number of test positions
     carriers_hz: tuple[float, ...] = (0.9e9, 1.8e9, 2.4e9, 3.5e9, 5.8e9)
-    searched_at_hz: float = 2.4e9
-    rows: int = 8
-    columns: int = 8
-    spacing_m: float = 0.025
-    height: int = 45
-    width: int = 180
+    searched_at_hz: float = 2.4e9  # carrier of the search for paths
+    rows: int = 8  # rows of both arrays
+    columns: int = 8  # columns of both arrays
+    spacing_m: float = 0.025  # distance of neighbours, metres: below half a wavelength at the highest carrier
+    height: int = 45  # rows of a spectrum: 2 degrees each, a sixth of the narrowest beam
+    width: int = 180  # columns of a spectrum
 
 
 DEFAULT, DEFAULT_BANDS = TracedRoom(), RoomBands()
@@ -108,25 +91,18 @@ diffraction of thin boards, through which most of the wave passes."""
 
 
 def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, progress: bool = False) -> Record:
-    """The traced room's spectra: read from an earlier call, or traced now (some minutes by default) and stored.
+    """The traced room's spectra, read or made in some minutes in a folder (`wrf_mi.synthetic.stored.stored`).
 
-    The official split is the first ``train`` rows and the rest; positions are drawn independently. The folder holds the
-    scene of the measured room, `MEASURED`, and a simulated LiDAR scan of the furnished room.
-
-    Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room/`` below ``WRF_MI_DATA`` if it
-            exists, else in the user's cache.
-        room: parameters.
-        progress: show progress bars on standard error.
+    The official split is the first ``train`` rows and the rest; positions are drawn independently. The folder, in the
+    NeRF2 layout, holds the scene of the measured room, `MEASURED`, and a simulated LiDAR scan of the furnished room.
+    ``progress`` shows bars on standard error.
     """
     facts = {"frequency_hz": FREQUENCY_HZ, **ARRAY_FACTS}
 
     def trace(scene_folder: Path) -> Record:
-        scene, receiver = (
-            open_scene(scene_folder, FREQUENCY_HZ),
-            replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),
-        )
-        return _spectra(NAME, room, (receiver,), scene, {FREQUENCY_HZ: scene}, (90, 360), progress)
+        scene = open_scene(scene_folder, FREQUENCY_HZ)
+        receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
+        return _spectra(NAME, room, receivers, scene, {FREQUENCY_HZ: scene}, (90, 360), progress)
 
     return made_in_room(folder, NAME, facts, room, trace)
 
@@ -134,20 +110,11 @@ def traced_room(folder: str | Path | None = None, room: TracedRoom = DEFAULT, pr
 def traced_room_bands(
     folder: str | Path | None = None, bands: RoomBands = DEFAULT_BANDS, progress: bool = False
 ) -> Record:
-    """Spectra of the furnished room at several carriers: read from an earlier call, or traced now and stored.
+    """Spectra of the furnished room at several carriers, read or made in a folder like that of `traced_room`.
 
-    Rows are ordered by position, then by carrier. The official split holds out the last ``test`` positions with all
-    their rows; positions are drawn independently. The folder holds the measured room and a simulated LiDAR scan, as
-    that of `wrf_mi.synthetic.traced_room`.
-
-    Args:
-        folder: folder of the spectra in the NeRF2 layout; by default ``traced-room-bands/`` below ``WRF_MI_DATA`` if
-            it exists, else in the user's cache.
-        bands: parameters.
-        progress: show progress bars on standard error.
-
-    Returns:
-        A record with ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1.
+    The record has ``task="spectrum"`` and ``carriers_hz`` [n]: ``observation`` [2, n, height, width] in 0..1. Rows are
+    ordered by position, then by carrier. The official split holds out the last ``test`` positions with all their rows;
+    positions are drawn independently.
     """
     poses = {rx.name: [*rx.position_m.tolist(), *rx.orientation_xyzw.tolist()] for rx in RECEIVERS}
 

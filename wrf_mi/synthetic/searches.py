@@ -23,41 +23,30 @@ from ..tracing.paths.solve import trace_paths
 from ..tracing.search.devices import solid_around
 from ..tracing.search.surfaces import scene_surfaces
 
-SCATTERING, DIFFRACTION = 2, 8
-"""Kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave."""
+SCATTERING, DIFFRACTION = 2, 8  # kinds of interaction (`wrf_mi.core.Paths`) that emit a spherical wave
 CHUNK_SIZE = 200  # transmitters that are traced together
 
 
 @dataclass(frozen=True)
 class Searches:
-    """Searches for paths, and parameters that all synthetic data have.
+    """Searches for paths, and parameters that all synthetic data have."""
 
-    Attributes:
-        depth, reflections, scattered_depth: most interactions of a path, reflections among them, and interactions of a
-            scattered path (None: the former).
-        rays, scattered_rays: numbers of rays for specular paths and diffraction, and for diffuse reflection.
-        scattering: share of the reflected amplitude that every surface scatters.
-        mesh_error_m: standard deviation of the measured surfaces' positions along each axis, metres.
-        seed: seed of positions, rays, noise, split and errors of the measured scene.
-    """
-
-    depth: int = 5
-    reflections: int = 3
-    scattered_depth: int | None = None
-    rays: int = 1 << 17
-    scattered_rays: int = 1 << 9
-    scattering: float = 0.3
-    mesh_error_m: float = 0.02
-    seed: int = 1
+    depth: int = 5  # most interactions of a path
+    reflections: int = 3  # most reflections among them
+    scattered_depth: int | None = None  # most interactions of a scattered path; None: ``depth``
+    rays: int = 1 << 17  # number of rays for specular paths and diffraction
+    scattered_rays: int = 1 << 9  # number of rays for diffuse reflection
+    scattering: float = 0.3  # share of the reflected amplitude that every surface scatters
+    mesh_error_m: float = 0.02  # standard deviation of the measured surfaces' positions along each axis, metres
+    seed: int = 1  # seed of positions, rays, noise, split and errors of the measured scene
 
     def options(self, diffraction: bool = False) -> tuple[TraceOptions, TraceOptions]:
         """Options of the search for specular, and perhaps diffracted, paths, and of that for scattered ones."""
         shared: dict[str, Any] = {"transmission": True, "seed": self.seed, "scattering_coefficient": self.scattering}
-        exact = TraceOptions(
-            diffraction=diffraction, depth=self.depth, reflections=self.reflections, rays=self.rays, **shared
-        )
-        shared["depth"] = self.scattered_depth or self.depth
-        return exact, TraceOptions(scattering=True, rays=self.scattered_rays, **shared)
+        specular: dict[str, Any] = {"depth": self.depth, "reflections": self.reflections, "diffraction": diffraction}
+        scattered: dict[str, Any] = {"depth": self.scattered_depth or self.depth, "scattering": True}
+        specular["rays"], scattered["rays"] = self.rays, self.scattered_rays
+        return TraceOptions(**specular, **shared), TraceOptions(**scattered, **shared)
 
 
 def free_positions(
@@ -99,17 +88,12 @@ def trace_channels(
     frequencies_hz: FloatArray,
     options: Sequence[TraceOptions],
     opaque: Sequence[str] = (),
-    *,
-    chunk_size: int = CHUNK_SIZE,
-    progress: str | None = None,
+    **how: Any,
 ) -> NDArray[np.complex128]:
-    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over searches for paths.
-
-    Paths are those of `searched_paths`.
-    """
+    """Channels [n, m, f] between positions [n, 3] and the m elements of a receiver, summed over `searched_paths`."""
     assert receiver.array_m is not None
     channel = np.zeros((len(positions), len(receiver.array_m), len(frequencies_hz)), complex)
-    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, chunk_size, progress):
+    for rows, traced in searched_paths(scene, receiver, positions, options, opaque, **how):
         channel[rows] += array_channels(traced.paths, receiver, receiver.array_m, frequencies_hz)
     return channel
 

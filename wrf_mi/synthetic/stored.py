@@ -6,6 +6,7 @@ import io
 import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -22,13 +23,10 @@ from ..scene.scan import simulate_scan
 
 logger = logging.getLogger(__name__)
 
-RECIPE = "traced.yml"
-"""File with the parameters of a folder's data; other parameters make them anew."""
-SCAN = "lidar/points.npz"
-"""File with the simulated LiDAR scan of the scene."""
+RECIPE = "traced.yml"  # file with the parameters of a folder's data; other parameters make them anew
+SCAN = "lidar/points.npz"  # file with the simulated LiDAR scan of the scene
 SCANNED_RAYS = 60_000
-Files = dict[str, str | bytes]
-"""Content of files by their paths in a folder."""
+Files = dict[str, str | bytes]  # content of files by their paths in a folder
 
 
 def stored(
@@ -38,16 +36,11 @@ def stored(
     write: Callable[[Path, Files], None],
     read: Callable[[Path, str], Record],
 ) -> Record:
-    """The record of a folder, which is made unless it holds data of the same parameters.
+    """The record of a name in a folder, which is made unless it holds data of the same parameters, ``facts``.
 
-    Args:
-        name: name of the record.
-        folder: folder of the data; None: the one of this name below ``WRF_MI_DATA`` if it exists, as it is, else in
-            the user's cache.
-        facts: parameters of the data.
-        write: makes the data, of a folder and the file that states the parameters. It comes last: without it the data
-            are made again.
-        read: reads the data, of a folder and a name.
+    Without a folder it is the one of this name below ``WRF_MI_DATA`` if it exists, as it is, else in the user's cache.
+    ``write`` makes the data, of a folder and the file that states the parameters, which comes last: without it the data
+    are made again. ``read`` reads them, of a folder and a name.
     """
     if folder is None:
         location = locate(name)
@@ -56,17 +49,13 @@ def stored(
         folder = user_cache() / name
     folder = Path(folder)
     recipe = yaml.safe_dump({**facts, "sionna_rt": version("sionna-rt")}, sort_keys=False)
-    if _content(folder / RECIPE) != yaml.safe_load(recipe):
+    content = None
+    with suppress(OSError, ValueError, yaml.YAMLError):  # the data are not there, or written in part
+        content = yaml.safe_load((folder / RECIPE).read_text(encoding="utf-8"))
+    if content != yaml.safe_load(recipe):
         logger.info("tracing %s into %s", name, folder)
         write(folder, {RECIPE: recipe})
     return read(folder, name)
-
-
-def _content(file: Path) -> Any:
-    try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
-        return None  # the data are not there, or written in part
 
 
 def scan_file(xml: Path, seed: int, scanner_m: Sequence[tuple[float, float, float]]) -> Files:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,7 @@ PATH_NUMBERS = 1_000_000  # coordinates of all paths of a page, at most: 2.7 MB
 WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9  # limits before logarithms
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
-OnStage = Callable[[str, float], None]
-"""Progress callback: stage and fraction done."""
+OnStage = Callable[[str, float], None]  # progress callback: stage and fraction done
 
 
 def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
@@ -59,8 +59,7 @@ def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Su
 
 def surfaces_in(scene: Any) -> tuple[list[Surface], dict[str, str]]:
     """Surfaces of a ``sionna.rt.Scene``, and the radio material of each by its name."""
-    materials = {name: thing.radio_material.name for name, thing in scene.objects.items()}
-    return surfaces_of(scene), materials
+    return surfaces_of(scene), {name: thing.radio_material.name for name, thing in scene.objects.items()}
 
 
 def scene_content(
@@ -77,7 +76,8 @@ def scene_content(
         drawn[:] = False
         drawn[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
         note = f"Mesh: the largest {most} of {len(corners)} triangles."
-    labels = np.array([material_label(materials[surface.name]) for surface in surfaces])
+    # Names of radio materials without the prefix of ITU-R P.2040's.
+    labels = np.array([re.sub("^itu[_-]", "", materials[surface.name]).replace("_", " ") for surface in surfaces])
     meshes = []
     for label in sorted(set(labels)):
         for above in (False, True):
@@ -89,11 +89,6 @@ def scene_content(
     edges = np.concatenate([free_edges(surface, creases=True) for surface in surfaces if surface.kind != "ceiling"])
     length = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=-1)
     return SceneContent(tuple(meshes), edges[np.argsort(-length, kind="stable")[:MOST_EDGES]]), note
-
-
-def material_label(material: str) -> str:
-    """Name of a radio material without the prefix of ITU-R P.2040's."""
-    return material.removeprefix("itu_").removeprefix("itu-").replace("_", " ")
 
 
 def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | None, list[str]]:
@@ -142,10 +137,8 @@ def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
     task = TASKS[results.task]
     both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}
     if task.image:
-        size = list(results.truth.shape[-2:])
-        return {"kind": "image", "size": size} | {
-            key: [[png(spectrum) for spectrum in part] for part in both[key]] for key in both
-        }
+        images = {key: [[png(spectrum) for spectrum in part] for part in values] for key, values in both.items()}
+        return {"kind": "image", "size": list(results.truth.shape[-2:])} | images
     if task.axes == 0:
         return {"kind": "level"} | {key: packed(values) for key, values in both.items()}
     return {"kind": "curve"} | {key: packed(power_db(values)) for key, values in both.items()}
@@ -185,19 +178,14 @@ def gaussians_content(
         clouds.append(gaussian_cloud(fitted.predictor.gaussians(position[None])))
     strength = np.stack([cloud.strength_db for cloud in clouds])
     order = np.argsort(-np.mean(10 ** (strength / 10), axis=0), kind="stable")[: options.gaussians]
-    scale, rotation = (
-        np.stack([getattr(cloud, name)[order] for cloud in clouds]) for name in ("scale_m", "rotation_xyzw")
-    )
+    names = "scale_m", "rotation_xyzw"
+    scale, rotation = (np.stack([getattr(cloud, name)[order] for cloud in clouds]) for name in names)
     if (scale == scale[:1]).all() and (rotation == rotation[:1]).all():
         scale, rotation = scale[:1], rotation[:1]
-    log_scale = np.log(np.maximum(scale, SMALLEST_M))
-    total = strength.shape[1]
-    notes = []
+    log_scale, total, notes = np.log(np.maximum(scale, SMALLEST_M)), strength.shape[1], []
     if len(order) < total:
-        notes.append(
-            f"Gaussians: the {len(order)} of {total} of the largest mean power over the stored transmitters "
-            "(option --gaussians)."
-        )
+        text = f"the {len(order)} of {total} of the largest mean power over the stored transmitters"
+        notes.append(f"Gaussians: {text} (option --gaussians).")
     return GaussiansContent(clouds[0].position_m[order], log_scale, rotation, strength[:, order], total), notes
 
 
@@ -253,12 +241,9 @@ def path_layer(traced: TraceResult, most: int) -> PathsContent:
     bounces = paths.bounces
     receivers_m = np.stack([receiver.position_m for receiver in traced.receivers])
     corners = [np.zeros((0, 3))]
-    for index in range(len(paths)):
-        inside = paths.vertices_m[index, : int(bounces[index])]
-        ends = traced.tx_pos_m[paths.tx[index]], receivers_m[paths.rx[index]]
-        corners += [ends[0][None], inside, ends[1][None]]
+    for tx, rx, vertices_m, count in zip(paths.tx, paths.rx, paths.vertices_m, bounces, strict=True):
+        corners += [traced.tx_pos_m[[tx]], vertices_m[:count], receivers_m[[rx]]]
     codes, kind = np.unique(paths.interactions, axis=0, return_inverse=True)
     words = tuple(", ".join(KINDS[int(code)] for code in row if code) or "line of sight" for row in codes)
-    return PathsContent(
-        paths.tx, paths.rx, bounces, kind.reshape(-1), words, gain_db, paths.length_m, np.concatenate(corners)
-    )
+    kinds = kind.reshape(-1), words
+    return PathsContent(paths.tx, paths.rx, bounces, *kinds, gain_db, paths.length_m, np.concatenate(corners))

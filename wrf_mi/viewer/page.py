@@ -125,9 +125,5 @@ def packed(values: ArrayLike) -> dict[str, Any]:
     step = 1.0 if exact or high - low < SMALLEST_RANGE else (high - low) / LARGEST
     codes = np.full(array.shape, MISSING, "<u2")
     codes[finite] = np.round((known - low) / step)
-    return {
-        "shape": list(array.shape),
-        "low": low,
-        "step": step,
-        "codes": base64.b64encode(codes.tobytes()).decode("ascii"),
-    }
+    text = base64.b64encode(codes.tobytes()).decode("ascii")
+    return {"shape": list(array.shape), "low": low, "step": step, "codes": text}

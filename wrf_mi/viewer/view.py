@@ -20,18 +20,9 @@ from ..runs.folder import CONFIG
 from ..runs.results import read_run
 from ..runs.run import Run, open_run
 from ..tasks.conditions import scene_carrier
+from . import layers
 from .content import SHOWN_GAUSSIANS, SHOWN_PATHS, STORED_TRANSMITTERS, ViewContent, ViewOptions
-from .layers import (
-    OnStage,
-    gaussians_content,
-    paths_content,
-    read_scene,
-    rows_content,
-    run_scene,
-    scene_content,
-    surfaces_in,
-)
-from .map_layer import is_map, read_map, thinned
+from .map_layer import SUFFIXES, read_map, thinned
 from .page import page, plotly_js
 
 Source = str | Path | Run | Any
@@ -77,11 +68,11 @@ class _Gathered:
 
     options: ViewOptions
     material: str | None
-    on_stage: OnStage
+    on_stage: layers.OnStage
     progress: bool
     content: ViewContent = field(default_factory=lambda: ViewContent(""))
     titles: list[str] = field(default_factory=list)
-    scene: tuple[Any, dict[str, str]] | None = None
+    scenes: list[tuple[Any, dict[str, str]]] = field(default_factory=list)  # the first is shown
     material_used: bool = False
 
     def add(self, source: Source) -> None:
@@ -92,18 +83,18 @@ class _Gathered:
             self._add_map(source)
         elif hasattr(source, "mi_scene"):
             self.titles.append("scene")
-            self._take_scene(*surfaces_in(source))
+            self.scenes.append(layers.surfaces_in(source))
         elif not Path(source).exists() and str(source) not in scenes():
             known = ", ".join(scenes())
             raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {known})")
         elif (Path(source) / CONFIG).is_file():
             self._add_run(open_run(source))
-        elif is_map(Path(source)):
+        elif Path(source).suffix.lower() in SUFFIXES:
             self._add_map(source)
         else:
             self.on_stage("opening the scene", 0.0)
             self.titles.append(Path(source).name)
-            self._take_scene(*read_scene(source, self.material))
+            self.scenes.append(layers.read_scene(source, self.material))
             self.material_used = True
 
     def _add_map(self, source: Any) -> None:
@@ -111,10 +102,6 @@ class _Gathered:
         self.content.maps.append(content)
         self.content.notes += notes
         self.titles.append(content.name)
-
-    def _take_scene(self, surfaces: Any, materials: dict[str, str]) -> None:
-        if self.scene is None:
-            self.scene = surfaces, materials
 
     def _add_run(self, run: Run) -> None:
         """Add what a run has and no earlier one: rows, scene, Gaussians, paths."""
@@ -124,13 +111,13 @@ class _Gathered:
         if first:
             content.receivers = results.receivers
             content.receivers_m = np.stack([receiver.position_m for receiver in record.receivers])
-            content.rows, notes = rows_content(results, self.options)
+            content.rows, notes = layers.rows_content(results, self.options)
             content.notes += notes
         scene = None
         if run.config.scene is not None:
             self.on_stage("opening the scene", 0.0)
-            scene = run_scene(run, scene_carrier(record))
-            self._take_scene(*surfaces_in(scene))
+            scene = layers.run_scene(run, scene_carrier(record))
+            self.scenes.append(layers.surfaces_in(scene))
         if content.rows is None:
             return
         stored = content.rows.stored
@@ -141,7 +128,7 @@ class _Gathered:
             content.notes.append(f"{results.name}: of other data than the first run; only its scene is shown.")
             return
         if content.gaussians is None:
-            content.gaussians, notes = gaussians_content(run, positions, self.options, self.on_stage)
+            content.gaussians, notes = layers.gaussians_content(run, positions, self.options, self.on_stage)
             content.notes += notes
         if content.paths is None:
             self._add_paths(run, numbers, positions, scene)
@@ -149,9 +136,8 @@ class _Gathered:
     def _add_paths(self, run: Run, numbers: IntArray, positions: FloatArray, scene: Any) -> None:
         limits = self.options, self.on_stage, self.progress
         try:
-            self.content.paths, notes = paths_content(run, numbers, positions, scene, *limits)
-        except InputError as error:
-            # A transmitter inside a solid, for example, hides paths but nothing else.
+            self.content.paths, notes = layers.paths_content(run, numbers, positions, scene, *limits)
+        except InputError as error:  # a transmitter inside a solid, for example, hides paths but nothing else
             notes = [f"Paths: not traced, {error}"]
         self.content.notes += notes
 
@@ -197,8 +183,8 @@ def view(
     if material is not None and not gathered.material_used:
         raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
     content = gathered.content
-    if gathered.scene is not None:
-        content.scene, note = scene_content(*gathered.scene)
+    if gathered.scenes:
+        content.scene, note = layers.scene_content(*gathered.scenes[0])
         content.notes += [note] if note else []
     content.maps, notes = thinned(content.maps)
     content.notes += notes

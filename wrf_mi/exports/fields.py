@@ -1,4 +1,4 @@
-"""Gaussians of a trained field as PLY of 3D Gaussian splatting."""
+"""Fields of Gaussians: as PLY of 3D Gaussian splatting, and as one file with all parameters, which makes a run."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from matplotlib import colormaps
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.array_files import stored_arrays, write_arrays
 from ..core.carriers import carriers_text
-from ..core.files import one_line, write_atomically
+from ..core.files import atomic_folder, one_line, readable, write_atomically
 from ..gaussians.parameters import Gaussians
-from ..models.gaussian.model import FittedField
-from ..runs.run import Run
+from ..models.gaussian.model import PARAM, FittedField
+from ..models.model import keyed, under
+from ..runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new
+from ..runs.run import Run, open_run
 from .format import ExportOptions
 from .source import Source
 
@@ -23,14 +26,13 @@ DEGREE_0 = 0.28209479177387814
 """Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a viewer's colour is 0.5 + `DEGREE_0` f_dc."""
 RANGE_DB = 40.0  # range of magnitudes of the signal, below the strongest, over which colours differ
 OPAQUE = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
+FORMAT = 1  # version of the file with all parameters
+VERSION, SPLIT_ARRAYS, FITTED_ARRAYS = "export/format", "split/", "run/"
+TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}  # keys of the texts of a run folder's files
 
 
 def field_of(run: Run) -> FittedField:
-    """The trained field of Gaussians of a run, of spectra or other observations.
-
-    Raises:
-        InputError: a run of another model, or an unfinished one.
-    """
+    """The trained field of Gaussians of a run; `InputError`: a run of another model, or an unfinished one."""
     fitted = run.fitted
     if not isinstance(fitted, FittedField) or fitted.field is None:
         raise InputError(f"{run.folder}: a run of {run.config.model}, which has no Gaussians; give one of wrf-gs+")
@@ -80,8 +82,7 @@ def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:
 def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
     """Write the Gaussians of a run for one transmitter (`wrf_mi.exports.source.Write`).
 
-    Raises:
-        InputError: no Gaussians, a field that is trained on the uplink, or not one transmitter.
+    `InputError`: no Gaussians, a field that is trained on the uplink, or not one transmitter.
     """
     run = source.run
     field, tx_pos_m = field_of(run), options.tx_pos_m
@@ -95,14 +96,63 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
         gaussians = field.predictor.gaussians(tx_pos_m, log_carrier)
     columns = splat_columns(gaussians)
     where = " ".join(f"{x:.9g}" for x in tx_pos_m[0])
-    comments = [
-        f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up",
-        f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest",
-        "signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)",
-    ]
+    comments = [f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up"]
+    comments.append(f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest")
+    comments.append("signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)")
     # G. Turk, "The PLY polygon file format" (1994)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {one_line(text)}" for text in comments)]
     header += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header", ""]
     rows = np.stack(list(columns.values()), axis=1).astype("<f4")
     write_atomically(out, "\n".join(header).encode() + rows.tobytes())
     return {"Gaussians": len(rows), "properties": len(columns)}
+
+
+def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write a field of Gaussians (`wrf_mi.exports.source.Write`).
+
+    Keys: ``param/<name>``, the parameters in single precision, [k, n] each; ``form/*``, the form of the observations;
+    ``receiver_*`` and ``tx_antenna``; ``split/*`` and ``run/*`` of the run's ``split.npz`` and ``model.npz``; the texts
+    ``export/config`` and ``export/metrics``. ``docs/export.md`` has the parameters' shapes. `InputError`: no Gaussians,
+    or an unfinished run.
+    """
+    run = source.run
+    field = field_of(run)
+    form = {key: values for key, values in field.arrays().items() if not key.startswith(PARAM)}
+    model = stored_arrays(run.folder / FITTED)
+    arrays: dict[str, Any] = {VERSION: FORMAT, **keyed(PARAM, field.params), **form}
+    arrays |= {key: values for key, values in model.items() if key.startswith(FITTED_ARRAYS)}
+    arrays |= keyed(SPLIT_ARRAYS, stored_arrays(run.folder / SPLIT))
+    for name, key in TEXTS.items():
+        if (run.folder / name).exists():
+            arrays[key] = (run.folder / name).read_text(encoding="utf-8")
+    write_arrays(out, arrays, compressed=True)
+    facts = {"parameters": len(field.params), "numbers": sum(values.size for values in field.params.values())}
+    return facts | ({} if run.config.scene is None else {"scene (not included)": run.config.scene})
+
+
+def import_field(file: str | Path, out: str | Path) -> Run:
+    """Make a run folder of a file of `write_field`; its predictions are bit-identical to those of the exported run.
+
+    `InputError`: a file that is missing, damaged or of another kind, or a folder that exists and is not empty.
+    """
+    path, folder = Path(file), Path(out)
+    check_new(folder)
+    with readable(path, f"{path}: missing; give a file of export --format field", "export it again"):
+        arrays = stored_arrays(path)
+        if VERSION not in arrays:
+            raise InputError(f"{path}: not written by export --format field; give such a file")
+        if (version := int(arrays.pop(VERSION))) != FORMAT:
+            raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
+        texts = {name: str(arrays.pop(key)) for name, key in TEXTS.items() if key in arrays}
+        split = under(SPLIT_ARRAYS, arrays)
+        model = {key: values for key, values in arrays.items() if not key.startswith(SPLIT_ARRAYS)}
+        if CONFIG not in texts or not split:
+            raise InputError(f"{path}: incomplete; export it again")
+    with atomic_folder(folder, replace=True) as part:  # `check_new` leaves nothing that could be lost
+        write_arrays(part / SPLIT, split)
+        write_arrays(part / FITTED, model, compressed=True)
+        for name, text in texts.items():
+            (part / name).write_text(text, encoding="utf-8")
+        check_format(part)
+        open_run(part)
+    return open_run(folder)
