@@ -92,7 +92,7 @@ def training_request(a: Arguments) -> RunRequest:
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
     names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
-    stated = {name: getattr(a, name) for name in names} | {"split": a.split or "official", "seed": a.seed or 0}
+    stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
     antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
     return RunRequest(model, settings=settings, antennas=antennas, **stated)
 
@@ -172,7 +172,7 @@ def _add_trace(commands: Any) -> None:
     add("--target-error", type=float, metavar="DB", help=target)
     text = "write the traced paths as a scenario of DeepMIMO, which deepmimo.load opens (docs/data.md)"
     add("--deepmimo", metavar="FOLDER", help=text)
-    add("--split", help="as for train (default: official)")
+    add("--split", help="as for train")
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
     add_scheduler(parser)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from .angles import FloatArray, rotation_matrix
 from .errors import InputError
@@ -21,6 +22,22 @@ FRAMES = ("world", "array")
 # Arrays of a Sionna RT device lie in y-z with boresight +x: array x = device y, array y = device z, array z = device x.
 DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion of a frame parallel to the world's
+
+
+def boresight_orientation(azimuth_rad: float, downtilt_rad: float = 0.0) -> FloatArray:
+    """Orientation of an array by its boresight: unit quaternion x, y, z, w, array's frame to world.
+
+    The boresight, the array's z axis, has the azimuth, from +x towards +y, and points below the horizon by the
+    downtilt; the array's y axis points upwards, as of Sionna RT's devices of that yaw and pitch.
+
+    >>> from wrf_mi.core.angles import rotation_matrix
+    >>> rotation_matrix(boresight_orientation(np.pi / 2))[:, 2].round(6) + 0.0
+    array([0., 1., 0.])
+    """
+    device = Rotation.from_euler("ZY", [azimuth_rad, downtilt_rad])
+    return np.asarray((device * Rotation.from_matrix(DEVICE_TO_ARRAY.T)).as_quat())
+
+
 POLE = 1e-12  # squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does
 WIDTH_RAD = math.radians(65)  # half-power width of the directional element
 
@@ -53,7 +70,7 @@ class Antenna:
                 raise InputError(f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(known)}")
         if self.pattern == "tr38901" and self.frame == "world":
             text = "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
-            text += "(--rx-frame array), or for transmitters and anchors one of "
+            text += "(--rx-frame array), for anchors azimuth_deg, or for transmitters one of "
             raise InputError(text + ", ".join(OMNIDIRECTIONAL))
 
     @property

@@ -306,6 +306,9 @@ class RayTracing(Model):
                 raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
             for carrier_hz in np.unique(carriers):
                 problem.open_scene(float(carrier_hz))
+        for receiver in problem.record.receivers:
+            if receiver.frequency_hz is not None:
+                problem.open_scene(receiver.frequency_hz)
         if problem.settings.calibration is not None:
             WRF_GS_PLUS.check(_graph_problem(problem), splits)
             if _changes_scene(problem):

@@ -72,7 +72,8 @@ class RayTracer:
                 searched for once. None: the instrument's carrier for all.
 
         Raises:
-            InputError: a position inside a solid object, or a material that is not known at one of the carriers.
+            InputError: a position inside a solid object, or a material that is not known at one of the carriers, among
+                them those that receivers state.
         """
         receivers, antenna = self.instrument.receivers, self.instrument.tx_antenna
         place = progress, self._prepared, first_row
