@@ -108,7 +108,7 @@ def training_request(a: Arguments) -> RunRequest:
         )
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
-    names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
+    names = ("scene", "material", "receiver", "evaluation", "n_train", "min_rows", "deterministic", "intervals")
     return RunRequest(
         model,
         settings=settings,
@@ -183,7 +183,7 @@ def _add_trace(commands: Any) -> None:
     text = "predict by ray tracing and score it like a learned field"
     parser = add_command(commands, "trace", trace_command, text)
     parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
-    parser.set_defaults(deterministic=False, intervals=False)
+    parser.set_defaults(deterministic=False, intervals=False, min_rows=None)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)

@@ -204,6 +204,10 @@ class Hybrid(Model):
         gaps = {name for part in parts for name in part.serving(task, with_scene).gaps}
         return Hybrid((*GAPS, *sorted(gaps)))
 
+    def pools_receivers(self, problem: Problem) -> bool:
+        """Whether no part is the graph of a scene's paths, which is fitted to the rows of each receiver."""
+        return problem.scene is None or problem.record.frequencies_hz is not None
+
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedHybrid:
         """Fit all parts, and choose weights and standard deviations by held-out rows.
 

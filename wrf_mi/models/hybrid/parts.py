@@ -13,6 +13,7 @@ from ...core.settings import CheckedSettings
 from ...tasks import task_of
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
+from ..few_rows import with_few_rows
 from ..model import Model, Problem, default_settings
 from .paths import InScene, Paths
 from .scene_side import FIELD, RESIDUAL, STAGES, needs_scene
@@ -101,6 +102,7 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     entry = MODELS[model].serving(problem.record.task, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
     inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
+    entry = with_few_rows(entry, problem.record.task)
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
 
