@@ -55,6 +55,9 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         if key in metrics:
             named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
             print(f"receivers with {what} (number): {named}")
+    for name, place in metrics.get("receiver_places", {}).items():
+        axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
+        print(f"{name} estimated at " + ", ".join(f"{axis} {value:.1f} +- {std:.1f} m" for axis, value, std in axes))
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
         print(f"{share}, CRPS {metrics['crps']:.3g}")

@@ -76,7 +76,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
     anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
     ids = attempt(_read_ids, anchors, complete=True)
-    anchors_m = attempt(_positions, anchors, "xyz")
+    anchors_m = attempt(_positions, anchors, "xyz", True)
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
     stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, RUN)}
@@ -202,9 +202,9 @@ def _read_ids(table: CsvTable) -> list[str]:
     return ids
 
 
-def _positions(table: CsvTable, axes: str) -> FloatArray:
-    """Coordinates [rows, axes] in metres."""
-    columns = [attempt(table.numbers, axis) for axis in axes]
+def _positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
+    """Coordinates [rows, axes] in metres; empty fields are NaN if they are allowed."""
+    columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
     return np.stack([column.value for column in columns], axis=-1)
 
 

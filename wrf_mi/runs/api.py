@@ -59,6 +59,7 @@ from ..models.calibrated import WithIntervals
 from ..models.checks import check_held_receivers, check_record
 from ..models.few_rows import with_few_rows
 from ..models.model import default_settings
+from ..models.receiver_places import check_surveyed, placed_problem, write_places
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
@@ -104,13 +105,15 @@ def plan_run(
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
     record, splits, left_out = _split_rows(record, request.split, seed, request.n_train, _least_rows(record, request))
+    if scene is not None:
+        check_surveyed(record)
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
     problem = Problem(record, settings, seed, scene, request.material, request.antennas)
     few = with_few_rows(model, record.task)
     checked = WithIntervals(few) if request.intervals else few
-    checked.check(problem, splits)
+    checked.check(placed_problem(problem.seen(splits[0]), splits[0].all_train), splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = request.split.name if isinstance(request.split, Split) else request.split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
@@ -301,7 +304,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        problem.settings = config.entry.prepare(problem, splits, session)
+        prepared = placed_problem(problem, splits[0].all_train)
+        problem.settings = config.entry.prepare(prepared, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
             write_configs(folder, config, splits)
@@ -311,7 +315,9 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
+                seen = placed_problem(problem.seen(rows), rows.all_train)
+                fitted = config.entry.fit(seen, rows, replace(session, folder=part))
+            write_places(part, seen.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time

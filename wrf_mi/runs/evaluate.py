@@ -25,6 +25,7 @@ from ..models.few_rows import with_few_rows
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
+from ..models.receiver_places import stored_places
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from .constant import CONSTANT, SCORES, against_constant, constant_scores
@@ -42,6 +43,7 @@ NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
 FEW = "receivers_with_few_rows"
 """Key of the receivers with fewer than `FEW_ROWS` training rows, each with its number of them."""
+PLACES = "receiver_places"  # key of positions that were estimated, with their standard deviations, metres
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")  # arrays of ``predictions.npz`` without an axis of receivers
@@ -221,7 +223,8 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
         return fitted.predict_rows(rows, receiver) or single(rows, receiver)
 
     metrics, arrays = evaluate(record, part.split, predict, single)
-    return metrics | _stage_scores(record, part, metrics, arrays), arrays
+    places = stored_places(part.folder)
+    return metrics | ({PLACES: places} if places else {}) | _stage_scores(record, part, metrics, arrays), arrays
 
 
 def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ...training.session import OnProgress, quiet
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
-from .strength_fit import Field, Fit, PriorMean, shift_of, widening
+from .strength_fit import AREA_M, Field, Fit, PriorMean, by_likelihood, scales, shift_of, widening
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
@@ -229,7 +229,9 @@ def fit_strengths(
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
-        if len(rows) >= settings.search_rows:
+        if scales(poses.position_m)[1] > AREA_M:
+            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters)
+        elif len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(join, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
