@@ -275,13 +275,22 @@ class Fit:
         self.ratio = np.ones(len(prior.receivers_m))
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
 
-    def held_out(self, hyperparameters: Hyperparameters, rounds: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none."""
+    def held_out(
+        self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none.
+
+        With ``unheard``, receivers are predicted from the others: every second one by the first two folds.
+        """
         mean = np.full(self._measured.value_dbm.shape, np.nan)
         std = mean.copy()
-        for stops, out in self._folds:
-            field = Field(self._prior, hyperparameters, self.ratio, stops, rounds)
-            received = [out[np.isfinite(values[out])] for values in self._measured.value_dbm]
+        for number, (stops, out) in enumerate(self._folds[:2] if unheard else self._folds):
+            hidden = (np.arange(len(mean)) % 2 == number) & unheard
+            value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
+            field = Field(self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds)
+            predicts = hidden | (not unheard)
+            measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
+            received = [out[np.isfinite(values[out])] for values in measured_dbm]
             if self._prior.traced is not None and self._prior.traced.exact:
                 self._prior.traced.traced_dbm(self._measured.poses.take(out).position_m)  # traced here, not on threads
 
