@@ -18,7 +18,8 @@ from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.digest import content_digest
 from ..core.types import IntArray
-from ..datasets.observations import LEAST_ROWS, fitted_receivers
+from ..datasets.observations import FEW_ROWS, LEAST_ROWS, fitted_receivers
+from ..tasks import task_of
 from .units import Found, is_above_0_dbm
 
 IMPOSSIBLE_DBM = -150.0  # thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver reports less
@@ -153,17 +154,20 @@ def _percent(share: float) -> str:
 
 def few_rows(record: Record) -> Found:
     """Receivers that received too few training rows to be fitted, of the official split or of all rows."""
+    strengths = task_of(record).in_decibel
+    least = FEW_ROWS if strengths else LEAST_ROWS
     train, _ = record.official or (np.arange(len(record)), None)
     split = Split("official" if record.official else "all rows", 0, train, np.zeros(0, np.int64), np.zeros(0, np.int64))
     try:
-        _, scarce = fitted_receivers(record, [split])
+        _, scarce = fitted_receivers(record, [split], least)
     except InputError as error:
         yield "few-rows", str(error)
         return
     if scarce:
         named = ", ".join(f"{name} ({rows})" for name, rows in scarce.items())
-        what = f"fewer than {LEAST_ROWS} training rows were received by {named}"
-        yield "few-rows", f"{what}: fits leave these receivers out; give more rows of theirs, or remove them"
+        what = f"fewer than {least} training rows were received by {named}"
+        fits = "predict these receivers from the others" if strengths else "leave these receivers out"
+        yield "few-rows", f"{what}: fits {fits}; give more rows of theirs, or remove them"
 
 
 def named_rows(rows: IntArray) -> str:

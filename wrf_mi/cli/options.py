@@ -60,6 +60,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     default = "none: folds in space for the scores, then all rows for the model (default: official, or else none)"
     add("--split", help=f"{text}; {default}")
     add_n_train(parser)
+    text = "leave out receivers with fewer training rows (default: 0 of signal strengths, predicted from the others; 2)"
+    add("--min-rows", type=int, metavar="N", help=text)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
     text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"

@@ -52,6 +52,13 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         _show_stages(metrics["stages"], task.label)
     if metrics.get("n_not_scored"):
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
+    for key, what in (("receivers_with_few_rows", "few training rows"), ("receivers_left_out", "too few, left out")):
+        if key in metrics:
+            named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
+            print(f"receivers with {what} (number): {named}")
+    for name, place in metrics.get("receiver_places", {}).items():
+        axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
+        print(f"{name} estimated at " + ", ".join(f"{axis} {value:.1f} +- {std:.1f} m" for axis, value, std in axes))
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
         print(f"{share}, CRPS {metrics['crps']:.3g}")

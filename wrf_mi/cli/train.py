@@ -91,7 +91,7 @@ def training_request(a: Arguments) -> RunRequest:
         raise InputError(f"{listed} belong to --model {RAY_TRACING}")
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
-    names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
+    names = ("scene", "material", "receiver", "evaluation", "n_train", "min_rows", "deterministic", "intervals")
     stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
     antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
     return RunRequest(model, settings=settings, antennas=antennas, **stated)
@@ -162,7 +162,7 @@ def _add_trace(commands: Any) -> None:
     text = "predict by ray tracing and score it like a learned field"
     parser = add_command(commands, "trace", trace_command, text)
     parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
-    parser.set_defaults(deterministic=False, intervals=False)
+    parser.set_defaults(deterministic=False, intervals=False, min_rows=None)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)

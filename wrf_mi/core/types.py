@@ -73,12 +73,13 @@ class Receiver:
 
     Attributes:
         name: name in the measurement files.
-        position_m: shape [3], world frame, metres.
+        position_m: shape [3], world frame, metres; NaN where unknown.
         orientation_xyzw: unit quaternion, receiver's frame to world.
         antenna: antenna of the receiver, or of each element of its array.
         array_m: elements of its antenna array [m, 3], receiver's frame, metres; None: a single antenna or unknown.
         frequency_hz: carrier of all that it receives, Hz, where receivers of signal strengths have different carriers;
             None: that of the record or of each row.
+        position_std_m: standard deviations [3] of a position that is estimated, metres; None: it is stated.
 
     A receiver whose frame is turned by 90 degrees about the vertical:
 
@@ -93,6 +94,12 @@ class Receiver:
     antenna: Antenna = ANTENNA
     array_m: FloatArray | None = None
     frequency_hz: float | None = None
+    position_std_m: FloatArray | None = None
+
+    @property
+    def is_surveyed(self) -> bool:
+        """Whether its position is stated."""
+        return self.position_std_m is None and bool(np.isfinite(self.position_m).all())
 
     @property
     def to_world(self) -> FloatArray:

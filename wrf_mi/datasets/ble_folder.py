@@ -73,7 +73,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     )
     anchors, *tables = (attempt(files.read_csv, file) for file in _files(folder))
     ids = attempt(read_ids, anchors, complete=True)
-    anchors_m = attempt(read_positions, anchors, "xyz")
+    anchors_m = attempt(read_positions, anchors, "xyz", True)
     orientations, receivers_hz = (
         attempt(read_orientations, anchors),
         attempt(_receiver_carriers, anchors, tables),

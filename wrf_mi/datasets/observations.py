@@ -16,8 +16,10 @@ logger = logging.getLogger(__name__)
 ROWS_PER_CHUNK = 256
 """Rows that are checked at a time, so that large records are not copied."""
 LEAST_ROWS = 2
-"""Training rows below which a receiver is left out: a level and its slope need two, as do a row that trains and another
+"""Training rows of a receiver that a fit needs: a level and its slope need two, as do a row that trains and another
 that chooses settings."""
+FEW_ROWS = 5
+"""Training rows below which strengths of a receiver are predicted by the law of distance that all receivers share."""
 
 
 def rows_received(record: Record, rows: IntArray) -> IntArray:
@@ -32,10 +34,12 @@ def rows_received(record: Record, rows: IntArray) -> IntArray:
     return np.asarray(received.astype(np.int64) @ (record.carriers_hz[rows][:, None] == carriers)).max(axis=1)
 
 
-def fitted_receivers(record: Record, splits: Sequence[Split]) -> tuple[IntArray, dict[str, int]]:
+def fitted_receivers(
+    record: Record, splits: Sequence[Split], least: int = LEAST_ROWS
+) -> tuple[IntArray, dict[str, int]]:
     """Receivers with enough training rows in every split that trains them, and those without.
 
-    Where no receiver has `LEAST_ROWS` rows, those with a row are enough: some models copy it, the others say what they
+    Where no receiver has ``least`` rows, those with a row are enough: some models copy it, the others say what they
     need. Receivers that a split holds out need no training row there.
 
     Returns:
@@ -48,9 +52,8 @@ def fitted_receivers(record: Record, splits: Sequence[Split]) -> tuple[IntArray,
     for split in splits:
         trained = np.setdiff1d(np.arange(len(counts)), split.held_receivers)
         counts[trained] = np.minimum(counts[trained], rows_received(record, split.all_train)[trained])
-    least = min(LEAST_ROWS, max(int(counts.max()), 1))
-    enough = np.flatnonzero(counts >= least)
-    if not len(enough):
+    enough = np.flatnonzero(counts >= (least if counts.max() >= least else 1))
+    if not counts.any():  # also where none is to be left out
         named = ", ".join(receiver.name for receiver in record.receivers)
         place = f"in a fold of split {splits[0].name.partition(':')[0]}" if len(splits) > 1 else "in the training rows"
         text = f"{place_of(record)}: nothing was received {place} by any receiver ({named})"
@@ -59,20 +62,20 @@ def fitted_receivers(record: Record, splits: Sequence[Split]) -> tuple[IntArray,
     return enough, {record.receivers[number].name: int(counts[number]) for number in scarce}
 
 
-def warn_of_left_out(record: Record, left_out: Mapping[str, int]) -> None:
+def warn_of_left_out(record: Record, left_out: Mapping[str, int], least: int = LEAST_ROWS) -> None:
     """Log receivers that are left out for want of training rows."""
     if left_out:
         named = ", ".join(f"{name} ({rows})" for name, rows in left_out.items())
         text = "%s: receivers with fewer than %d training rows are left out, with their number of rows: %s"
-        logger.warning(text, record.name, LEAST_ROWS, named)
+        logger.warning(text, record.name, least, named)
 
 
-def check_observations(record: Record, split: Split, complete: bool = False) -> None:
+def check_observations(record: Record, split: Split, complete: bool = False, may_be_silent: bool = False) -> None:
     """Refuse training rows that cannot be learned from, and uplinks that nothing can be predicted from.
 
     NaN throughout an observation is a row without reception, which is refused only if the data must be ``complete``,
-    for a model that is trained at every receiver on every row. Observations of test rows are not checked: those that
-    are not finite are not scored (`scorable`).
+    for a model that is trained at every receiver on every row. With ``may_be_silent``, receivers may have received no
+    training row. Observations of test rows are not checked: those that are not finite are not scored (`scorable`).
 
     Raises:
         InputError: a receiver without any training row; an observation of a training row that
@@ -81,7 +84,7 @@ def check_observations(record: Record, split: Split, complete: bool = False) -> 
     known, used = split.all_train, np.concatenate([split.all_train, split.test])
     states = [_states(observed, known) for observed in record.observation]
     for number, (receiver, (missing, _)) in enumerate(zip(record.receivers, states, strict=True)):
-        if missing.all() and not complete and number not in split.held_receivers:
+        if missing.all() and not (complete or may_be_silent) and number not in split.held_receivers:
             text = f"receiver {receiver.name}: received none of {len(known)} training rows"
             raise InputError(f"{place_of(record)}, {text}; leave it out or use another split")
     for receiver, observed, (missing, broken) in zip(record.receivers, record.observation, states, strict=True):

@@ -45,9 +45,9 @@ def read_ids(table: CsvTable) -> list[str]:
     return ids
 
 
-def read_positions(table: CsvTable, axes: str) -> FloatArray:
-    """Coordinates [rows, axes] in metres."""
-    columns = [attempt(table.numbers, axis) for axis in axes]
+def read_positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
+    """Coordinates [rows, axes] in metres; empty fields are NaN if they are allowed."""
+    columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
     return np.stack([column.value for column in columns], axis=-1)
 
 

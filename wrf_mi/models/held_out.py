@@ -17,6 +17,7 @@ from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.selection import HeldOut
 from .model import Fitted, Model, Problem, Session, inputs_of
+from .receiver_places import placed_problem
 
 
 def labelled(session: Session, label: str) -> Session:
@@ -41,7 +42,8 @@ def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> t
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
         fold = fold.at_receivers(numbers)
-    return fit_model(entry, problem.seen(fold), fold, session)[0], numbers
+    problem = placed_problem(problem.seen(fold), fold.all_train)
+    return fit_model(entry, problem, fold, session)[0], numbers
 
 
 def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int) -> Prediction:

@@ -226,6 +226,10 @@ class Model(ABC):
         """Classes of settings by the data that they are for, in words; "": all data."""
         return {"": self.settings}
 
+    def pools_receivers(self, problem: Problem) -> bool:
+        """Whether it predicts signal strengths of receivers with few training rows, or none, from the others."""
+        return False
+
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks

@@ -52,15 +52,18 @@ from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
 from ..datasets import make_splits
-from ..datasets.observations import check_observations, fitted_receivers, place_of, warn_of_left_out
+from ..datasets.observations import LEAST_ROWS, check_observations, fitted_receivers, place_of, warn_of_left_out
 from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.calibrated import WithIntervals
 from ..models.checks import check_held_receivers, check_record
+from ..models.few_rows import with_few_rows
 from ..models.model import default_settings
+from ..models.receiver_places import check_surveyed, placed_problem, write_places
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
+from ..tasks import TASKS
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.fit_plan import check_rows
 from ..training.session import Interrupted, OnProgress, quiet
@@ -105,13 +108,16 @@ def plan_run(
     if request.split is None and split == NONE:
         text = "%s: no official split, so --split none: scores are of folds held out in space, the model of all rows"
         logger.warning(text, place_of(record))
-    record, splits, left_out = _split_rows(record, split, seed, request.n_train)
+    record, splits, left_out = _split_rows(record, split, seed, request.n_train, _least_rows(record, request))
+    if scene is not None:
+        check_surveyed(record)
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
-        check_observations(record, rows, complete=model.complete)
+        check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
     problem = Problem(record, settings, seed, scene, request.material, request.antennas)
-    checked = WithIntervals(model) if request.intervals else model
-    checked.check(problem, splits)
+    few = with_few_rows(model, record.task)
+    checked = WithIntervals(few) if request.intervals else few
+    checked.check(placed_problem(problem.seen(splits[0]), splits[0].all_train), splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
@@ -134,8 +140,17 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
     return settings
 
 
+def _least_rows(record: Record, request: RunRequest) -> int:
+    """Training rows below which receivers are left out; by default no receiver of signal strengths is."""
+    if request.min_rows is None:
+        return 0 if TASKS[record.task].in_decibel else LEAST_ROWS
+    if request.min_rows < 0:
+        raise InputError(f"min_rows {request.min_rows}: give a number of training rows, 0 or more")
+    return request.min_rows
+
+
 def _split_rows(
-    record: Record, split: str | Split, seed: int, n_train: int | float | None
+    record: Record, split: str | Split, seed: int, n_train: int | float | None, least: int
 ) -> tuple[Record, list[Split], dict[str, int]]:
     """Record without receivers that have too few training rows, its splits, and those receivers' numbers of rows."""
     left_out: dict[str, int] = {}
@@ -146,7 +161,7 @@ def _split_rows(
     for rule in (*below, split):
         while True:
             splits = [rule] if isinstance(rule, Split) else make_splits(record, rule, seed, n_train)
-            numbers, scarce = fitted_receivers(record, splits)
+            numbers, scarce = fitted_receivers(record, splits, least)
             if not scarce:
                 break
             # Rows that only these receivers received are in no split any more, and a seeded draw from fewer rows may
@@ -186,6 +201,7 @@ def train(
     settings: Settings = (),
     deterministic: bool = False,
     intervals: bool = False,
+    min_rows: int | None = None,
     on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
     scheduler: Scheduler | None = None,
@@ -210,6 +226,8 @@ def train(
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
         intervals: calibrate the standard deviations of predictions on training rows that are held out in space; the
             model is fitted once more.
+        min_rows: receivers with fewer training rows are left out; None: of signal strengths none is left out, those
+            with few rows being predicted from the others; of other data those with fewer than 2.
         on_progress: progress callback: stage, fraction done, and loss, score and time where steps are taken.
         stop: called wherever nothing would be lost; True ends the run, and `resume` continues it.
         scheduler: computes parts of the work of models that have some (ray tracing), with the same result; None: this
@@ -229,10 +247,10 @@ def train(
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
     what = RunRequest(model, scene, material, antennas, receiver, evaluation, split, n_train, seed, settings)
-    request = replace(what, deterministic=deterministic, intervals=intervals)
+    request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows)
     problem, config, splits = plan_run(dataset, request, progress)
     warn_of_suspicions(problem.record)
-    warn_of_left_out(problem.record, config.left_out)
+    warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)
@@ -291,7 +309,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        problem.settings = config.entry.prepare(problem, splits, session)
+        prepared = placed_problem(problem, splits[0].all_train)
+        problem.settings = config.entry.prepare(prepared, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
             write_configs(folder, config, splits)
@@ -301,7 +320,9 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                fitted = config.entry.fit(problem.seen(rows), rows, replace(session, folder=part))
+                seen = placed_problem(problem.seen(rows), rows.all_train)
+                fitted = config.entry.fit(seen, rows, replace(session, folder=part))
+            write_places(part, seen.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time

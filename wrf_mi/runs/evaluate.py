@@ -19,11 +19,13 @@ from ..core.files import write_atomically
 from ..core.memory import peak_memory_mb
 from ..core.types import IntArray
 from ..datasets import make_splits
-from ..datasets.observations import scorable
+from ..datasets.observations import FEW_ROWS, rows_received, scorable
 from ..models import Fitted, Inputs, Problem, Session
+from ..models.few_rows import with_few_rows
 from ..models.interpolation.idw import MODEL as IDW
 from ..models.interpolation.mri import MODEL as MRI
 from ..models.model import PredictAll, default_settings, inputs_of
+from ..models.receiver_places import stored_places
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from .folder import METRICS, PREDICTIONS, RunConfig
@@ -38,6 +40,9 @@ Scores = tuple[dict[str, Any], dict[str, Any]]
 
 NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
+FEW = "receivers_with_few_rows"
+"""Key of the receivers with fewer than `FEW_ROWS` training rows, each with its number of them."""
+PLACES = "receiver_places"  # key of positions that were estimated, with their standard deviations, metres
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 CROSS_VALIDATED = "cross_validated"
@@ -111,12 +116,23 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
         arrays["std"][list(scored)] = [p.stated_std for p in stated]
+    few = _few_rows(record, split)
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
+        **({FEW: few} if few else {}),
         "n_train": len(split.all_train),
         "ms_per_sample": _milliseconds_per_sample(single or predict, rows, scored[0]),
     }
     return metrics, arrays
+
+
+def _few_rows(record: Record, split: Split) -> dict[str, int]:
+    """Receivers of signal strengths with fewer than `FEW_ROWS` training rows that a split trains, and their rows."""
+    if not TASKS[record.task].in_decibel:
+        return {}
+    counts = rows_received(record, split.all_train)
+    trained = np.setdiff1d(np.flatnonzero(counts < FEW_ROWS), split.held_receivers)
+    return {record.receivers[number].name: int(counts[number]) for number in trained}
 
 
 def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
@@ -158,8 +174,12 @@ def pool(parts: Sequence[Scores]) -> Scores:
         key: values if key == "receiver_name" else np.concatenate([a[key] for a in every], axis=int(key not in SHARED))
         for key, values in every[0].items()
     }
+    few: dict[str, int] = {}
+    for block in blocks:  # the fewest of any fold
+        few |= {name: min(count, few.get(name, count)) for name, count in block.get(FEW, {}).items()}
     metrics = score(arrays, blocks[0]["task"]) | {
         NOT_SCORED: sum(m[NOT_SCORED] for m in blocks),
+        **({FEW: few} if few else {}),
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
@@ -214,7 +234,8 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
         return fitted.predict_rows(rows, receiver) or single(rows, receiver)
 
     metrics, arrays = evaluate(record, part.split, predict, single)
-    return metrics | _stage_scores(record, part, metrics, arrays), arrays
+    places = stored_places(part.folder)
+    return metrics | ({PLACES: places} if places else {}) | _stage_scores(record, part, metrics, arrays), arrays
 
 
 def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
@@ -309,7 +330,7 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
         key, entry = (LAW, MRI) if alone else (task.reference, IDW)
         plain = replace(split, train=split.all_train, validation=split.validation[:0])
         problem = Problem(record, default_settings(entry, (), {})).seen(split)
-        fitted = entry.fit(problem, plain, Session(Path(), Path()))  # writes no file
+        fitted = with_few_rows(entry, record.task).fit(problem, plain, Session(Path(), Path()))  # writes no file
 
         def of_all(inputs: Inputs) -> NDArray[Any]:
             return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])

@@ -40,6 +40,7 @@ from ..datasets.folder_files import shown
 from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
 from ..models.calibrated import WithIntervals
+from ..models.few_rows import with_few_rows
 from ..models.model import Arrays
 from ..tasks import TASKS
 from ..training.fit_plan import check_rows
@@ -70,6 +71,7 @@ class RunRequest:
     settings: Settings = ()
     deterministic: bool = False
     intervals: bool = False
+    min_rows: int | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class RunConfig:
     @cached_property
     def entry(self) -> Model:
         """Registry entry of the model; `InputError`: no model of that name."""
-        entry = known_model(self.model).serving(self.task, self.scene is not None)
+        entry = with_few_rows(known_model(self.model).serving(self.task, self.scene is not None), self.task)
         return WithIntervals(entry) if self.intervals else entry
 
 

@@ -24,6 +24,7 @@ from ..models import Fitted, Inputs, Model, Problem
 from ..models.checks import check_inputs
 from ..models.gaussian.model import FittedField
 from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
+from ..models.receiver_places import stored_problem
 from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
@@ -74,7 +75,8 @@ class Run:
         config = self.config
         scene = config.scene, config.material, config.antennas
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        return Problem(data, config.settings, config.seed, *scene, self.operator, left_out)
+        problem = Problem(data, config.settings, config.seed, *scene, self.operator, left_out)
+        return stored_problem(problem, self.folder)
 
     @cached_property
     def fitted(self) -> Fitted:
@@ -277,7 +279,7 @@ def _inputs(
 def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted, float]:
     """Fitted model of a run or fold, and the training time in seconds; `InputError` where missing or damaged."""
     arrays, seconds = read_fitted(part, config.entry)
-    visible = problem.seen(load_split(part / SPLIT))
+    visible = stored_problem(problem, part).seen(load_split(part / SPLIT))
     with readable(part / FITTED, f"{part / FITTED}: missing", "train the run anew"):
         return config.entry.load(arrays, visible, part), seconds
 

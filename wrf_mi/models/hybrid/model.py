@@ -30,6 +30,7 @@ from ...training.by_distance import Intervals, Mixture
 from ...training.selection import HeldOut, hold_out
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
+from ..few_rows import with_few_rows
 from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions, under
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
@@ -97,6 +98,7 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     entry = MODELS[model].serving(problem.record.task, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
     inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
+    entry = with_few_rows(entry, problem.record.task)
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
 
@@ -268,6 +270,10 @@ class Hybrid(Model):
         parts = [MODELS[name] for name in (KRIGING, "wrf-gs+", *UPLINK_PARTS) if MODELS[name].serves(task)]
         gaps = {name for part in parts for name in part.serving(task, with_scene).gaps}
         return Hybrid((*by_distance.GAPS, *sorted(gaps)))
+
+    def pools_receivers(self, problem: Problem) -> bool:
+        """Whether no part is the graph of a scene's paths, which is fitted to the rows of each receiver."""
+        return problem.scene is None or problem.record.frequencies_hz is not None
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedHybrid:
         """Fit all parts, and choose weights and standard deviations by held-out rows.

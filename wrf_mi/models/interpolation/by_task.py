@@ -22,13 +22,13 @@ class StrengthKriging(GenericKriging):
 
     settings, new_receivers, gaps = StrengthSettings, True, (STOPS,)
 
-    @staticmethod
-    def _is_pooled(problem: Problem) -> bool:
+    def pools_receivers(self, problem: Problem) -> bool:
+        """Whether strengths have a single, known carrier and settings ask for no other covariance."""
         return not problem.settings.is_generic and problem.record.frequencies_hz is not None
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
         """Kriging of all receivers together where they are pooled, else of each by itself."""
-        if not self._is_pooled(problem):
+        if not self.pools_receivers(problem):
             return super().fit(problem, split, session)
         rows = problem.rows(split)
         known_positions(problem.record, rows, self.name)
@@ -41,7 +41,7 @@ class StrengthKriging(GenericKriging):
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse receivers without training rows where receivers are not pooled."""
         for split in splits:
-            if split.held_receivers and not len(split.left) and not self._is_pooled(problem):
+            if split.held_receivers and not len(split.left) and not self.pools_receivers(problem):
                 text = "kriging of each receiver alone, without a single known carrier, predicts for trained receivers"
                 raise InputError(f"split {split.name}: {text}; choose mri, or leave them rows, as receiver+20 does")
 

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.constants import speed_of_light
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
@@ -49,6 +51,12 @@ MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
 SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
 RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
+AREA_M = 40.0
+"""Extent of the training rows from which their spacing and likelihood state lengths: beyond that of a flat or floor, to
+whose rooms the default hyperparameters belong."""
+AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
+LIKELIHOOD_STOPS, LIKELIHOOD_STEPS = 400, 80
+"""Largest number of stops in the likelihood, and of its evaluations."""
 COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
@@ -98,6 +106,16 @@ class PooledProcess:
         self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
         self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of the marginal likelihood of the observations, up to a constant."""
+        # y ~ N(0, K + B S B^T), by the lemmas of inversion and determinants: rows of receivers share beta alone.
+        pairs = list(zip(self._systems, self._parts, strict=True))
+        square = sum(float(part.value @ system.solve(part.value)) for system, part in pairs)
+        square -= float(self.beta @ self._information @ self.beta)
+        volume = float(np.linalg.slogdet(self._information)[1] + 2 * np.log(self._prior_sd).sum())
+        return square + volume + sum(system.log_determinant for system in self._systems)
 
     def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
@@ -177,6 +195,11 @@ class Field:
             parts.append(Part(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
         self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
 
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant."""
+        return self._process.cost
+
     def predict(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Mean in dBm, and variance of a single report about it before calibration, [m] each."""
         h = self.hyperparameters
@@ -191,6 +214,41 @@ class Field:
         expected, columns, _ = self.prior.columns(moved, receiver)
         field = self.hyperparameters.weighted_covariance(moved, *self._process.weights(receiver))
         return expected + columns @ self._process.beta + field
+
+
+def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tuple[PriorMean, Hyperparameters]:
+    """Mean and hyperparameters over an area larger than the rooms that ``start`` is for.
+
+    Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
+    density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
+    factor e.
+    """
+    stops = stops.thinned(LIKELIHOOD_STOPS)
+    spacing_m, extent_m = scales(stops.poses.position_m)
+    middle = np.log([AREA_SHADOW_DB, np.sqrt(spacing_m * extent_m / 2), AREA_NOISE_DB, prior.rx_sd_db])
+    deviation = np.array([0.5, 1.0, 0.5, 1.0])
+    ratio = np.ones(len(prior.receivers_m))
+
+    def at(logarithms: FloatArray) -> tuple[PriorMean, Hyperparameters]:
+        shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
+        field = replace(start, shadow_db=shadow_db, shadow_m=shadow_m, drift_db=noise_db, noise_db=noise_db)
+        return replace(prior, rx_sd_db=rx_sd_db), field
+
+    def cost(logarithms: FloatArray) -> float:
+        fit = Field(*at(logarithms), ratio, stops)
+        return fit.cost + float(np.square((logarithms - middle) / deviation).sum())
+
+    simplex = np.vstack([middle, middle + np.diag(deviation)])
+    options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
+    return at(minimize(cost, middle, method="Nelder-Mead", options=options).x)
+
+
+def scales(position_m: FloatArray) -> tuple[float, float]:
+    """Median distance to the nearest other position, and diagonal of the box around positions [n, 3], metres."""
+    places = np.unique(position_m, axis=0)
+    extent_m = float(np.linalg.norm(np.ptp(places, axis=0)))
+    spacing_m = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if len(places) > 1 else 0.0
+    return spacing_m, extent_m
 
 
 def folds(count: int) -> Iterator[tuple[IntArray, IntArray]]:
@@ -219,13 +277,22 @@ class Fit:
         self.ratio = np.ones(len(prior.receivers_m))
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
 
-    def held_out(self, hyperparameters: Hyperparameters, rounds: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none."""
+    def held_out(
+        self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none.
+
+        With ``unheard``, receivers are predicted from the others: every second one by the first two folds.
+        """
         mean = np.full(self._measured.value_dbm.shape, np.nan)
         std = mean.copy()
-        for stops, out in self._folds:
-            field = Field(self._prior, hyperparameters, self.ratio, stops, rounds)
-            received = [out[np.isfinite(values[out])] for values in self._measured.value_dbm]
+        for number, (stops, out) in enumerate(self._folds[:2] if unheard else self._folds):
+            hidden = (np.arange(len(mean)) % 2 == number) & unheard
+            value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
+            field = Field(self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds)
+            predicts = hidden | (not unheard)
+            measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
+            received = [out[np.isfinite(values[out])] for values in measured_dbm]
             if self._prior.traced is not None and self._prior.traced.exact:
                 self._prior.traced.traced_dbm(self._measured.poses.take(out).position_m)  # traced here, not on threads
 

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ...datasets.observations import FEW_ROWS
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
-from .strength_fit import Field, Fit, PriorMean, shift_of, widening
+from .strength_fit import AREA_M, Field, Fit, PriorMean, by_likelihood, scales, shift_of, widening
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ CHUNK = 1024  # transmitters predicted together, which bounds the memory of thei
 MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
+LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
 SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
 STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
@@ -229,7 +231,9 @@ def fit_strengths(
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
-        if len(rows) >= settings.search_rows:
+        if scales(poses.position_m)[1] > AREA_M:
+            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters)
+        elif len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(join, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
@@ -242,6 +246,11 @@ def fit_strengths(
         residual = values - mean
         shift, ratio = shift_of(residual, skew_db), fit.ratio
         widen = widening(residual - shift, std)
+        few = np.isfinite(values).sum(axis=1) < FEW_ROWS
+        if few.any() and len(few) - few.sum() >= LEAST_HEARD:
+            # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
+            mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
+            widen[few] = np.maximum(widen, widening(values - mean - shift, std))[few]
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)

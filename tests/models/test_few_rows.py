@@ -1,0 +1,156 @@
+"""Receivers with few training rows, or none, are predicted by what the others teach, without harm to these."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import SMALL, call
+from made_building import PLACES_M, TRAINED, building
+
+from wrf_mi.core import InputError, Record
+from wrf_mi.core.types import Inputs
+from wrf_mi.datasets import write_ble_folder
+from wrf_mi.models.few_rows import SharedLaw
+from wrf_mi.runs.api import open_run, train
+
+NAMES = list(PLACES_M)
+SCARCE: dict[str, tuple[int, ...]] = {"attic": (3, 5, 41, 44, 47, 50), "cellar": tuple(range(TRAINED, TRAINED + 8))}
+"""Rows of receivers with two training rows and with none."""
+NOISE_DB = 1.0  # standard deviation of the noise of `made_building.building`
+WORSE_DB = 0.05
+"""Allowed difference of a mean absolute error: kriging learns its common terms from the few rows, too."""
+FITS: dict[str, tuple[str, ...]] = {
+    "idw": (),
+    "kriging": (),
+    "mri": (),
+    "trees": (),
+    "hybrid": (),
+    "wrf-gs+": tuple(SMALL),
+    "nerf2": ("steps=2", "validate_every=2"),
+}
+
+
+def errors_db(folder: Path) -> dict[str, Any]:
+    """Absolute errors of the test rows by the name of the receiver."""
+    stored = np.load(folder / "predictions.npz")
+    return dict(zip(stored["receiver_name"], np.abs(stored["prediction"] - stored["truth"]), strict=True))
+
+
+@pytest.mark.parametrize("model", FITS)
+def test_every_model_serves_them_and_the_others_are_as_without(model: str, tmp_path: Path) -> None:
+    intervals = model in ("idw", "trees")
+    run = train(building(**SCARCE), tmp_path / "run", model, settings=FITS[model], intervals=intervals)
+    assert run.metrics["receivers_with_few_rows"] == {"attic": 2, "cellar": 0}
+    assert "receivers_left_out" not in run.metrics
+    without = train(building(), tmp_path / "clean", model, settings=FITS[model], intervals=intervals)
+    scarce, alone = errors_db(run.folder), errors_db(without.folder)
+    assert list(scarce) == [*NAMES, "attic", "cellar"]
+    worse = [np.mean(scarce[name]) - np.mean(alone[name]) for name in NAMES]
+    assert np.mean(worse) < WORSE_DB
+    # The law of the others and two rows with noise of 1 dB: three standard deviations of the mean of four errors.
+    for name in ("attic", "cellar"):
+        assert np.nanmean(scarce[name]) < 3 * NOISE_DB
+    again = open_run(run.folder, building(**SCARCE))
+    for name in ("lab", "cellar"):
+        prediction = again.predict([[1, 2, 1.3], [5, 5, 1.3]], name)
+        assert np.isfinite(prediction.mean).all()
+        assert (prediction.std is not None) == (intervals or model in ("kriging", "hybrid"))
+
+
+def noise_free(shift_db: dict[int, float]) -> Record:
+    """The building without noise, by the law -40 - 25 log10 d, shifted for the receivers of some numbers."""
+    record = building(**SCARCE)
+    for number, receiver in enumerate(record.receivers):
+        distance_m = np.linalg.norm(record.tx_pos_m - receiver.position_m, axis=1)
+        received = np.isfinite(record.observation[number])
+        power_dbm = -40 - 25 * np.log10(distance_m) + shift_db.get(number, 0.0)
+        record.observation[number, received] = power_dbm[received]
+    return record
+
+
+def test_law_and_shift_of_data_without_noise_are_exact() -> None:
+    record = noise_free({})
+    law = SharedLaw.fit(record, np.arange(TRAINED), np.array([3, 4]))
+    np.testing.assert_allclose(law.law, [-40, -2.5], atol=1e-4)  # single precision
+    np.testing.assert_allclose(law.shift_db, 0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("number", "expected_db"), [(3, 6.0), (4, 0.0)])
+def test_shift_follows_the_rows_where_receivers_differ_more_than_rows(number: int, expected_db: float) -> None:
+    """The shift of two exact rows is theirs, and without rows it is the mean of the others."""
+    record = noise_free({0: -5.0, 1: 5.0, 3: 6.0})
+    law = SharedLaw.fit(record, np.arange(TRAINED), np.array([number]))
+    inputs = Inputs(record.tx_pos_m[:5])
+    distance_m = np.linalg.norm(inputs.tx_pos_m - record.receivers[number].position_m, axis=1)
+    error_db = law(inputs, number).mean - (-40 - 25 * np.log10(distance_m) + expected_db)
+    # The exponent absorbs a part of the differences between receivers.
+    assert np.abs(error_db).mean() < 1.5
+
+
+def test_standard_deviation_has_both_variances_and_rows_reduce_it() -> None:
+
+    record = building(**SCARCE)
+    record.observation[:3] += np.array([[-4.0], [0.0], [4.0]], np.float32)
+    law = SharedLaw.fit(record, np.arange(TRAINED), np.array([3, 4]))
+    two_rows, none = law.std_db
+    assert two_rows < none
+    # The variance between is that of three numbers, 16 dB^2, and within receivers noise of 1 dB and the law's misfit.
+    assert none == pytest.approx(np.sqrt(16 + NOISE_DB**2), rel=0.25)
+    assert two_rows == pytest.approx(np.sqrt(1.5) * NOISE_DB, rel=0.5)
+
+
+def test_a_receiver_at_an_unknown_place_has_the_mean_level() -> None:
+    record = building(**SCARCE)
+    lost = replace(record.receivers[4], position_m=np.full(3, np.nan))
+    record = replace(record, receivers=(*record.receivers[:4], lost))
+    law = SharedLaw.fit(record, np.arange(TRAINED), np.array([4]))
+    predicted = law(Inputs(record.tx_pos_m[:3]), 4)
+    received = record.observation[:, :TRAINED]
+    np.testing.assert_allclose(predicted.mean, np.nanmean(received), atol=1.0)
+    assert np.ptp(predicted.mean) == 0
+
+
+def test_several_carriers_share_the_law(tmp_path: Path) -> None:
+    record = building(**SCARCE)
+    carriers_hz = np.where(np.arange(len(record)) % 2, 9e8, 2.4e9)
+    record.observation[:] -= (20 * np.log10(carriers_hz / 2.4e9)).astype(np.float32)
+    record = replace(record, frequencies_hz=None, carriers_hz=carriers_hz)
+    run = train(record, tmp_path / "run", "kriging")
+    low, high = (run.predict([[5, 5, 1.3]], "cellar", carriers_hz=[hz]).mean[0] for hz in (9e8, 2.4e9))
+    assert low - high == pytest.approx(20 * np.log10(2.4e9 / 9e8), abs=1e-4)
+    assert np.nanmean(errors_db(run.folder)["cellar"]) < 3 * NOISE_DB
+
+
+def test_min_rows_leaves_receivers_out(tmp_path: Path) -> None:
+    record = building(**SCARCE)
+    for least, left in ((1, {"cellar": 0}), (3, {"attic": 2, "cellar": 0})):
+        run = train(record, tmp_path / f"run{least}", "mri", min_rows=least)
+        assert run.metrics["receivers_left_out"] == left
+    with pytest.raises(InputError, match="min_rows -1: give a number of training rows, 0 or more"):
+        train(record, tmp_path / "none", "mri", min_rows=-1)
+
+
+def test_commands_take_a_run_with_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    office = write_ble_folder(tmp_path / "office", building(**SCARCE))
+    tx, heard, run = tmp_path / "tx.csv", tmp_path / "heard.csv", tmp_path / "run"
+    tx.write_text("x,y,z\n1,2,1.3\n")
+    heard.write_text("rssi_hall,rssi_stairs,rssi_lab,rssi_attic,rssi_cellar\n-60,-70,-65,-80,\n")
+    status, out, _ = call(["train", office, "--model", "idw", "--intervals", "--out", run], capsys)
+    assert status == 0
+    assert "receivers with few training rows (number): attic (2), cellar (0)" in out
+    for command in (
+        ["evaluate", run],
+        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
+        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
+        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
+        ["compare", run, "--out", tmp_path / "page"],
+        ["view", run, "--out", tmp_path / "view.html"],
+    ):
+        status, _, err = call(command, capsys)
+        assert status == 0, (command, err)
+    assert json.loads((run / "metrics.json").read_text())["receivers_with_few_rows"] == {"attic": 2, "cellar": 0}

@@ -1,0 +1,168 @@
+"""Receivers at unknown places are located by their training rows, and every model of strengths without a scene runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import SMALL, call
+from made_building import TRAINED, UPRIGHT, building
+
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.datasets import load, write_ble_folder
+from wrf_mi.models.receiver_places import place_of_receiver, placed
+from wrf_mi.runs.api import open_run, train
+from wrf_mi.scene.make import make_scene
+
+UNKNOWN_M = np.full(3, np.nan)
+FITS: dict[str, tuple[str, ...]] = {
+    "idw": (),
+    "kriging": (),
+    "mri": (),
+    "trees": (),
+    "hybrid": (),
+    "wrf-gs+": tuple(SMALL),
+    "nerf2": ("steps=2", "validate_every=2"),
+}
+
+
+def unmapped(record: Record, *names: str) -> Record:
+    """The record without the positions of some receivers."""
+    receivers = tuple(
+        replace(receiver, position_m=UNKNOWN_M) if receiver.name in names else receiver for receiver in record.receivers
+    )
+    return replace(record, receivers=receivers)
+
+
+def shadowed(seed: int, rows: int = 80, noise_db: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows in a hall of 30 m x 20 m, their strengths by the law of exponent 2.8, and the receiver's position."""
+    rng = np.random.default_rng(seed)
+    tx_pos_m = np.column_stack([rng.uniform(0, 30, rows), rng.uniform(0, 20, rows), np.full(rows, 1.2)])
+    place_m = np.array([rng.uniform(3, 27), rng.uniform(3, 17), 2.6])
+    distance_m = np.linalg.norm(tx_pos_m - place_m, axis=1)
+    apart_m = np.linalg.norm(tx_pos_m[:, None] - tx_pos_m, axis=2)
+    shadow = np.linalg.cholesky(0.7 * np.exp(-apart_m / 2.0) + 0.3 * np.eye(rows)) @ rng.normal(size=rows)
+    return tx_pos_m, -42 - 28 * np.log10(distance_m) + noise_db * shadow, place_m
+
+
+def test_strengths_without_noise_locate_the_receiver() -> None:
+    """The law's least distance of 0.3 m moves them by centimetres, and so do errors of the height."""
+    for seed in range(5):
+        tx_pos_m, power_dbm, place_m = shadowed(seed)
+        found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, UNKNOWN_M)
+        np.testing.assert_allclose(found_m[:2], place_m[:2], atol=0.1)
+        assert (std_m > 0).all()
+
+
+def test_standard_deviations_cover_the_errors_under_correlated_shadowing() -> None:
+    """Of 60 receivers 68 % lie within one deviation in x and in y: of 120 numbers 0.59 to 0.76 in 95 % of draws."""
+    inside = []
+    for seed in range(60):
+        tx_pos_m, power_dbm, place_m = shadowed(seed, noise_db=5.0)
+        found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, UNKNOWN_M)
+        inside += list(np.abs(found_m - place_m)[:2] < std_m[:2])
+    assert 0.55 < np.mean(inside) < 0.85
+
+
+def test_stated_coordinates_remain() -> None:
+    tx_pos_m, power_dbm, place_m = shadowed(0)
+    found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, np.array([np.nan, np.nan, 2.6]))
+    assert (found_m[2], std_m[2]) == (2.6, 0)
+    np.testing.assert_allclose(found_m[:2], place_m[:2], atol=0.1)
+
+
+def test_one_row_says_little_of_the_place() -> None:
+    found_m, std_m = place_of_receiver(np.array([[3.0, 4.0, 1.0]]), np.array([-60.0]), 20.0, UNKNOWN_M)
+    assert np.isfinite(found_m).all()
+    assert (std_m[:2] > 5).all()
+
+
+def test_places_come_from_the_rows_that_are_named_and_others_stay() -> None:
+    record = unmapped(building(), "lab")
+    before = placed(record, np.arange(TRAINED))
+    record.observation[:, TRAINED:] = -50
+    after = placed(record, np.arange(TRAINED))
+    np.testing.assert_array_equal(before.receivers[2].position_m, after.receivers[2].position_m)
+    assert [receiver.is_surveyed for receiver in after.receivers] == [True, True, False]
+    # Estimated again from fewer rows, nothing of the first estimate remains.
+    fewer = placed(after, np.arange(10))
+    np.testing.assert_array_equal(fewer.receivers[2].position_m, placed(record, np.arange(10)).receivers[2].position_m)
+
+
+def test_without_any_row_the_place_remains_unknown() -> None:
+    record = unmapped(building(cellar=()), "cellar")
+    assert np.isnan(placed(record, np.arange(TRAINED)).receivers[3].position_m).all()
+
+
+@pytest.mark.parametrize("model", FITS)
+def test_every_model_runs(model: str, tmp_path: Path) -> None:
+    record = unmapped(building(cellar=(41, 42)), "lab", "stairs", "cellar")
+    settings, intervals = FITS[model], model == "mri"
+    run = train(record, tmp_path / "run", model, settings=settings, intervals=intervals)
+    places = run.metrics["receiver_places"]
+    assert list(places) == ["stairs", "lab"]
+    # Noise of 1 dB over 40 rows in a hall of 12 m x 8 m.
+    np.testing.assert_allclose(places["lab"]["position_m"][:2], [6.0, 7.5], atol=1.0)
+    again = open_run(run.folder, record)
+    np.testing.assert_array_equal(again.receivers[2].position_m, places["lab"]["position_m"])
+    for name in ("lab", "cellar"):
+        assert np.isfinite(again.predict([[1, 2, 1.3], [5, 5, 1.3]], name).mean).all()
+    if model in ("kriging", "mri", "hybrid"):
+        known = train(building(cellar=(41, 42)), tmp_path / "known", model, settings=settings, intervals=intervals)
+        gain = run.metrics["abs_error_db"]["mean"] - known.metrics["abs_error_db"]["mean"]
+        assert gain < 0.5
+
+
+def test_folds_locate_by_their_own_rows(tmp_path: Path) -> None:
+    run = train(unmapped(building(), "lab"), tmp_path / "run", "mri", split="blocked")
+    files = sorted(run.folder.glob("fold*/receiver_places.json"))
+    places = {tuple(json.loads(file.read_text())["lab"]["position_m"]) for file in files}
+    assert len(places) == len(files) > 1
+
+
+def test_paths_of_a_scene_need_stated_places(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.csv"
+    plan.write_text("x,y\n-1,-1\n13,-1\n13,9\n-1,9\n-1,-1\n")
+    room = make_scene(plan, tmp_path / "room", height_m=2.7).folder
+    message = "position of receiver lab, hall unknown; .* give x, y, z, or omit --scene"
+    record = unmapped(building(), "lab", "hall")
+    for model in ("ray-tracing", "hybrid"):
+        with pytest.raises(InputError, match=message.replace("lab, hall", "hall, lab")):
+            train(record, tmp_path / "run", model, scene=room)
+
+
+def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    office = write_ble_folder(tmp_path / "office", building())
+    (office / "anchors.csv").write_text("id,x,y,z\nhall,,,\nstairs,11.5,0.5,\nlab,,,2.5\n")
+    heights = [receiver.position_m[2] for receiver in load(office).receivers]
+    np.testing.assert_array_equal(heights, [np.nan, np.nan, 2.5])
+    tx, heard, run = tmp_path / "tx.csv", tmp_path / "heard.csv", tmp_path / "run"
+    tx.write_text("x,y,z\n1,2,1.3\n")
+    heard.write_text("rssi_hall,rssi_stairs,rssi_lab\n-60,-70,-65\n")
+    asked: list[Any] = ["train", office, "--model", "kriging", "--out", run]
+    status, out, _ = call(asked, capsys)
+    assert status == 0
+    assert "stairs estimated at x 11.5 +- 0.0 m, y 0.5 +- 0.0 m, z" in out
+    for command in (
+        ["data", "info", office],
+        ["data", "check", office],
+        ["evaluate", run],
+        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
+        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
+        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
+        ["compare", run, "--out", tmp_path / "page"],
+        ["view", run, "--out", tmp_path / "view.html"],
+    ):
+        status, _, err = call(command, capsys)
+        assert status == 0, (command, err)
+
+
+def test_a_position_is_written_and_read_as_unknown(tmp_path: Path) -> None:
+    record = unmapped(building(), "lab")
+    again = load(write_ble_folder(tmp_path / "office", record))
+    assert [receiver.is_surveyed for receiver in again.receivers] == [True, True, False]
+    assert Receiver("a", UNKNOWN_M, UPRIGHT).is_surveyed is False

@@ -1,0 +1,187 @@
+"""Places of receivers that nobody mapped, estimated from the signal strengths that they received.
+
+The law of distance P = T - 10 gamma log10 |x - p| is fitted to the training rows of each such receiver, rows at one
+place averaged and shadowing correlated between places: its place p, power at one metre T and exponent gamma together,
+by nonlinear least squares from several starts. A priori the exponent is that of indoor and urban measurements, the
+place somewhere about the rows, and its height, which rows at one height hardly tell, `MOUNTED_M` above them. The
+covariance is that of the linearised problem.
+
+Source: Rappaport, "Wireless Communications" (2002), section 4.9 (law and exponents); Nocedal and Wright, "Numerical
+Optimization" (2006), chapter 10.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+from scipy.spatial.distance import cdist
+
+from ..core import InputError, Record
+from ..core.angles import FloatArray
+from ..core.antenna import AS_STATED
+from ..core.files import readable, write_atomically
+from ..core.types import IntArray
+from ..tasks import task_of
+from .model import Problem
+
+PLACES = "receiver_places.json"  # file of a run with estimated positions
+
+EXPONENT = (3.0, 0.7)  # mean and standard deviation of the exponent a priori
+MOUNTED_M = (1.0, 1.0)  # mean height above the transmitters a priori, as of receivers on walls and ceilings, and its sd
+LEAST_M = 0.3  # least distance in the law: a receiver is not in the hand that holds the transmitter
+NOISE_DB = 6.0  # standard deviation of the rows about the law, until their residuals tell
+SHADOW_M, SHADOW_SHARE = 2.0, 0.05  # correlation length of shadowing, and its least share of the rows' extent
+CORRELATED = 0.7  # share of the rows' deviation from the law that shadowing has
+MOST_PLACES = 400  # places in the fit at most, evenly spaced
+STARTS = 4  # places at the strongest rows, from which the search starts beside the middle of all
+STATED_M = 0.01  # standard deviation of a coordinate that is stated
+LOUD_DB = 100.0  # standard deviation of the power at one metre, about the strongest row: any unit of decibels
+
+
+def place_of_receiver(
+    tx_pos_m: FloatArray, power_dbm: FloatArray, extent_m: float, stated_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Position [3] of a receiver and its standard deviations [3], metres.
+
+    Args:
+        tx_pos_m: positions of the rows that it received [n, 3], metres, n at least 1.
+        power_dbm: their signal strengths [n].
+        extent_m: size of the area of all rows, metres, by which the place is uncertain a priori.
+        stated_m: coordinates [3] that are known, such as a height; NaN for the others.
+    """
+    places, number = np.unique(tx_pos_m, axis=0, return_inverse=True)
+    power = np.bincount(number.ravel(), power_dbm) / np.bincount(number.ravel())  # rows at one place share its shadow
+    if len(places) > MOST_PLACES:
+        spread = np.linspace(0, len(places) - 1, MOST_PLACES).round().astype(np.int64)
+        places, power = places[spread], power[spread]
+    # Neighbouring places share shadows: as if independent, they would promise decimetres.
+    length_m = max(SHADOW_M, extent_m * SHADOW_SHARE)
+    shared = CORRELATED * np.exp(-cdist(places, places) / length_m) + (1 - CORRELATED) * np.eye(len(places))
+    lower = np.linalg.cholesky(shared)
+    middle = places.mean(axis=0)
+    middle[2] += MOUNTED_M[0]
+    loud = np.max(power)
+    mean = np.array([*middle, loud, EXPONENT[0]])
+    deviation = np.array([extent_m, extent_m, MOUNTED_M[1], LOUD_DB, EXPONENT[1]])
+    known = np.flatnonzero(np.isfinite(stated_m))
+    middle[known] = mean[known] = stated_m[known]
+    deviation[known] = STATED_M
+
+    def distance(parameters: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.square(places - parameters[:3]).sum(axis=1) + LEAST_M**2))
+
+    def residual(parameters: FloatArray, noise_db: float) -> FloatArray:
+        law = parameters[3] - 10 * parameters[4] * np.log10(distance(parameters)) - power
+        whitened = solve_triangular(lower, law, lower=True)
+        return np.concatenate([whitened / noise_db, (parameters - mean) / deviation])
+
+    def derivative(parameters: FloatArray, noise_db: float) -> FloatArray:
+        away = distance(parameters)[:, None]
+        slope = -10 * parameters[4] / np.log(10) * (parameters[:3] - places) / away**2
+        law = np.column_stack([slope, np.ones(len(places)), -10 * np.log10(away)])
+        return np.concatenate([solve_triangular(lower, law, lower=True) / noise_db, np.diag(1 / deviation)])
+
+    strongest = np.argsort(-power, kind="stable")[:STARTS]
+    # Beside the row, not at it, where the law has no slope.
+    starts = [middle, *np.where(np.isfinite(stated_m), stated_m, places[strongest] + [0.1, 0.1, MOUNTED_M[0]])]
+    noise_db = NOISE_DB
+    fits = []
+    for place in starts:
+        away = np.sqrt(np.square(places - place).sum(axis=1) + LEAST_M**2)
+        level = float(np.mean(power + 10 * EXPONENT[0] * np.log10(away)))
+        first = np.array([*place, level, EXPONENT[0]])
+        fits.append(least_squares(residual, first, derivative, args=(noise_db,)))
+    best = min(fits, key=lambda fit: float(fit.cost))
+    if len(places) > len(mean):
+        # Once the law fits, its residuals state their deviation: few of them, no less than a third of the usual one.
+        errors = residual(best.x, 1.0)[: len(places)]
+        noise_db = max(float(np.sqrt(np.square(errors).sum() / (len(places) - len(mean)))), NOISE_DB / 3)
+        best = least_squares(residual, best.x, derivative, args=(noise_db,))
+    jacobian = derivative(best.x, noise_db)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    std_m = np.sqrt(np.diag(covariance)[:3])
+    std_m[known] = 0.0
+    return np.where(np.isfinite(stated_m), stated_m, best.x[:3]), std_m
+
+
+def placed(record: Record, rows: IntArray) -> Record:
+    """The record with estimated positions of receivers that have none, by some rows; NaN remains without any row."""
+    lacking = [number for number, receiver in enumerate(record.receivers) if not receiver.is_surveyed]
+    if not lacking or not task_of(record).in_decibel:
+        return record
+    receivers, tx_pos_m = list(record.receivers), record.tx_pos_m[rows]
+    extent_m = max(float(np.linalg.norm(np.ptp(tx_pos_m[:, :2], axis=0))), 1.0) if len(rows) else 1.0
+    for number in lacking:
+        observed = np.asarray(record.observation[number, rows], float)
+        received = np.isfinite(observed)
+        if received.any():
+            receiver = receivers[number]
+            stated_m = np.asarray(receiver.position_m, float)
+            if receiver.position_std_m is not None:  # estimated from more rows, from which nothing may remain
+                stated_m = np.where(receiver.position_std_m > 0, np.nan, stated_m)
+            place_m, std_m = place_of_receiver(tx_pos_m[received], observed[received], extent_m, stated_m)
+            receivers[number] = replace(receiver, position_m=place_m, position_std_m=std_m)
+    return replace(record, receivers=tuple(receivers))
+
+
+def placed_problem(problem: Problem, rows: IntArray) -> Problem:
+    """The problem of `placed` receivers; the problem itself where all are known."""
+    if all(receiver.is_surveyed for receiver in problem.record.receivers):
+        return problem  # a new problem would open its scene anew
+    record = placed(problem.record, rows)
+    return problem if record is problem.record else replace(problem, dataset=record, antennas=AS_STATED, left_out=())
+
+
+def write_places(folder: Path, record: Record) -> None:
+    """Write estimated positions and their standard deviations, by the receiver's name, into a run's folder."""
+    places = {
+        receiver.name: {"position_m": receiver.position_m.tolist(), "std_m": receiver.position_std_m.tolist()}
+        for receiver in record.receivers
+        if receiver.position_std_m is not None
+    }
+    if places:
+        write_atomically(folder / PLACES, json.dumps(places, indent=1) + "\n")
+
+
+def stored_places(folder: Path) -> dict[str, dict[str, list[float]]]:
+    """Estimated positions and standard deviations that `write_places` stored; empty where all are stated."""
+    path = folder / PLACES
+    with readable(path, f"{path}: missing", "train the run anew"):
+        places: dict[str, dict[str, list[float]]] = json.loads(path.read_text()) if path.exists() else {}
+    return places
+
+
+def stored_problem(problem: Problem, folder: Path) -> Problem:
+    """The problem with the positions that a run in a folder has estimated."""
+    places = stored_places(folder)
+    if not places:
+        return problem
+    receivers = tuple(
+        replace(
+            receiver,
+            position_m=np.array(places[receiver.name]["position_m"]),
+            position_std_m=np.array(places[receiver.name]["std_m"]),
+        )
+        if receiver.name in places
+        else receiver
+        for receiver in problem.record.receivers
+    )
+    record = replace(problem.record, receivers=receivers)
+    return replace(problem, dataset=record, antennas=AS_STATED, left_out=())
+
+
+def check_surveyed(record: Record) -> None:
+    """Refuse receivers at unknown places, where paths of a scene are traced.
+
+    Raises:
+        InputError: naming them.
+    """
+    lacking = [receiver.name for receiver in record.receivers if not receiver.is_surveyed]
+    if lacking and task_of(record).in_decibel:
+        text = f"position of receiver {', '.join(lacking)} unknown; paths of a scene lead to stated positions"
+        raise InputError(f"{record.source or record.name}: {text}: give x, y, z, or omit --scene")
