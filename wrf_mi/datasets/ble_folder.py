@@ -76,7 +76,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
     anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
     ids = attempt(_read_ids, anchors, complete=True)
-    anchors_m = attempt(_positions, anchors, "xyz")
+    anchors_m = attempt(_positions, anchors, "xyz", True)
     rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
     plane = [attempt(_positions, table, "xy") for table in tables]
     stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, RUN)}
@@ -112,12 +112,16 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
 
 
 def write_ble_folder(
-    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
+    path: str | Path,
+    record: Record,
+    replace: bool = False,
+    extra: Mapping[str, str | bytes] | None = None,
+    further: Mapping[str, NDArray[Any]] | None = None,
 ) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
     The official split assigns rows to the files, so they are read in the order of that split. ``extra`` is the content
-    of further files by their paths in the folder.
+    of further files by their paths in the folder, ``further`` columns [n] of the rows that are not read.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -137,7 +141,7 @@ def write_ble_folder(
         positions = np.stack([receiver.position_m for receiver in record.receivers])
         columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated}
         write_csv(part / ANCHORS, columns, zip(*columns.values(), strict=True))
-        of_rows = _columns(record, ids, carriers)
+        of_rows = {**_columns(record, ids, carriers), **(further or {})}
         for file, rows in zip((TRAINING, TEST), official, strict=True):
             write_csv(part / file, of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
         write_extra(part, extra)
@@ -202,9 +206,9 @@ def _read_ids(table: CsvTable) -> list[str]:
     return ids
 
 
-def _positions(table: CsvTable, axes: str) -> FloatArray:
-    """Coordinates [rows, axes] in metres."""
-    columns = [attempt(table.numbers, axis) for axis in axes]
+def _positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
+    """Coordinates [rows, axes] in metres; NaN where they are empty and may be so."""
+    columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
     return np.stack([column.value for column in columns], axis=-1)
 
 
