@@ -25,6 +25,7 @@ from .further import further_columns
 from .options import ImportOptions
 from .picture import plan_picture
 from .places import (
+    POSITION_DIGITS,
     LocalFrame,
     find_frame,
     finite_columns,
@@ -55,8 +56,7 @@ MOST_CELLS = 50_000_000
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
 
 
-POSITION_DIGITS, STRENGTH_DIGITS = 6, 4
-"""Decimals that are written: sums of equal positions are not exact, and means of whole dB no more so."""
+STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
 @dataclass(frozen=True)

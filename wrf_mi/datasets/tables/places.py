@@ -20,6 +20,8 @@ FAR_M = 10_000.0
 """Largest coordinate without a shift: single precision resolves a millimetre to 16 km."""
 ROUND_M, ROUND_DEG = 10.0, 1e-4
 """Origins are rounded to these."""
+POSITION_DIGITS = 6
+"""Decimals of metres that are written: the mean of equal positions is not exactly theirs."""
 WIDEST_DEG, AWAY = 1.0, 20.0
 """Largest extent of a place in degrees, and its least distance from the origin in extents, where x and y are not called
 longitude and latitude: a room in metres is not a metre wide and twenty metres away."""

@@ -14,7 +14,7 @@ from ...core.files import one_line
 from ..unknown import RECEIVER
 from .columns import MOST_FLOORS, named_columns, shown_names, unit_of
 from .files import Table, package
-from .places import LocalFrame, plane_columns, unit_scale
+from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
 from .readings import listed, normal_id
 
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
@@ -118,7 +118,7 @@ def receiver_positions(
     row_of = _rows_by_id(table)
     stated_m, has_z = _stated_positions(table, frame, units, height_m)
     known = [number for number, name in enumerate(ids) if name in row_of]
-    positions[known] = stated_m[[row_of[ids[number]] for number in known]]
+    positions[known] = stated_m[[row_of[ids[number]] for number in known]].round(POSITION_DIGITS)
     positions[np.isnan(positions).any(axis=1)] = np.nan
     return positions, _position_notes(table, ids, positions, list(row_of), None if has_z else height_m)
 
@@ -126,7 +126,10 @@ def receiver_positions(
 def _stated_positions(table: Table, frame: LocalFrame, units: str, height_m: float) -> tuple[FloatArray, bool]:
     """Positions [rows, 3] of a table of receivers, and whether it states heights."""
     of = named_columns(list(table.frame.columns), {})
-    first, second, _ = plane_columns(of, table)
+    first, second, geographic = plane_columns(of, table)
+    if geographic and not frame.crs:
+        text = "longitude and latitude, but the positions of the measurements are in metres"
+        raise DataFault(table.files[0][0], f"{text}; give both in one reference system", line=1)
     if not frame.crs and (unit := unit_of(first) or units):
         frame = replace(frame, scale_m=unit_scale(unit, "--units"))
     plane_m = frame.local_m(np.column_stack([table.numbers(name) for name in (first, second)]))

@@ -91,7 +91,7 @@ def without_not_heard(readings: Readings, stated: Sequence[float] | None) -> tup
     """Readings without numbers for "not heard", what was found in words, and these numbers.
 
     Numbers are the ``stated`` ones; for None those apart from all strengths of a receiver or of all together, and
-    customary ones (-100, -101, ...) at the lower end that adjoin the strengths but are far more frequent.
+    customary ones (-100, -101, ...) at the lower end of all that adjoin the strengths but are far more frequent.
     """
     notes = []
     if stated is None:
@@ -112,10 +112,11 @@ def _marks(readings: Readings) -> tuple[list[float], list[float]]:
     ends = np.searchsorted(readings.receiver[order], np.arange(1, len(readings.ids)))
     apart: set[float] = set()
     unclear: set[float] = set()
-    for values in [readings.dbm, *np.split(readings.dbm[order], ends)]:
-        lowest = values.min(initial=np.inf)
-        for value in suspicious_values(values):
-            customary = value.dbm in CUSTOMARY_DBM and value.dbm == lowest
+    lowest = readings.dbm.min(initial=np.inf)
+    for part in [readings.dbm, *np.split(readings.dbm[order], ends)]:
+        for value in suspicious_values(part):
+            # One receiver's strengths may pile up at -100 dBm by chance, those of all receivers do not.
+            customary = value.dbm in CUSTOMARY_DBM and value.dbm == lowest and len(part) == len(readings.dbm)
             (unclear if value.adjoins and not customary else apart).add(value.dbm)
     return sorted(apart), sorted(unclear - apart)
 
