@@ -88,7 +88,7 @@ def test_bad_data_and_folders_are_refused(
         (["train", "rfid-lab", "--out", tmp_path / "out"], "wrf-mi data fetch rfid-lab"),
         (
             ["train", tmp_path / "empty", "--out", tmp_path / "out"],
-            "empty: an empty folder; a data set is a folder with anchors.csv",
+            "empty: an empty folder; a data set is a folder with receivers.csv",
         ),
         (["train", folder, "--model", "wrf-gs+", "--out", folder], "exists and is not empty; choose another --out"),
         (["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "file", *SET], "file: exists and is not empty"),

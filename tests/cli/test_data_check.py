@@ -88,5 +88,5 @@ def test_data_sets_that_do_not_exist(
     (tmp_path / "empty").mkdir()
     status, out, _ = call(["data", "check", tmp_path / "empty"], capsys)
     assert status == 2
-    assert "empty: an empty folder; a data set is a folder with anchors.csv" in out
+    assert "empty: an empty folder; a data set is a folder with receivers.csv" in out
     shutil.rmtree(tmp_path / "empty")

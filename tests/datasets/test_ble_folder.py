@@ -154,12 +154,8 @@ WRONG: dict[str, tuple[Change, str, str]] = {  # each is refused, see test_fault
     "anchor twice": (text("anchors.csv", "^1", "3"), "anchors.csv", "row 2: id '3' gives the name anchor3, as row 1"),
     "anchor twice in another form": (text("anchors.csv", "^1", "03.0"), "anchors.csv", "row 2: id '03.0' gives the na"),
     "anchor with the name of a number": (text("anchors.csv", "^1", "anchor3"), "anchors.csv", "row 2: id 'anchor3' gi"),
-    "anchor with half a number": (text("anchors.csv", "^1", "1.5"), "anchors.csv", "row 2: id '1.5' is neither a who"),
     "anchor without an id": (text("anchors.csv", "^1", " "), "anchors.csv", "row 2: id ' ' is empty"),
-    "anchor of pandas without an id": (text("anchors.csv", "^1", "nan"), "anchors.csv", "row 2: id 'nan' is neither"),
-    "anchor named like a path": (text("anchors.csv", "^1", "../up"), "anchors.csv", r"row 2: id '\.\./up' cannot name"),
-    "anchor named like a Windows path": (text("anchors.csv", "^1", r"a\\b"), "anchors.csv", "row 2: id .* cannot name"),
-    "anchor named like a folder": (text("anchors.csv", "^1", ".."), "anchors.csv", r"row 2: id '\.\.' cannot name a"),
+    "anchor of pandas without an id": (text("anchors.csv", "^1", "nan"), "anchors.csv", "row 2: id 'nan' is pandas"),
     "anchor with a tab in it": (text("anchors.csv", "^1", "a\tb"), "anchors.csv", "row 2: id .* does not go into one"),
     "no ids": (text("anchors.csv", "id", "number"), "anchors.csv", "has no column id"),
     "NaN anchor": (text("anchors.csv", "-1", "nan"), "anchors.csv", "row 2: y is 'nan'"),
@@ -167,7 +163,7 @@ WRONG: dict[str, tuple[Change, str, str]] = {  # each is refused, see test_fault
 
 
 def test_not_a_folder(tmp_path: Path):
-    with pytest.raises(InputError, match=r"not a folder; give one that holds anchors\.csv"):
+    with pytest.raises(InputError, match=r"not a folder; give one that holds receivers\.csv"):
         read_ble_folder(tmp_path / "nothing")
 
 
@@ -293,13 +289,12 @@ def test_written_record_is_read_again(folder: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"official": None}, "it needs signal strengths with an official split"),
         ({"official": (np.arange(4), np.arange(4))}, "each row must be in one part of the official split"),
         ({"frequencies_hz": None}, r"its carrier is not known; set Record\.frequencies_hz"),
         ({"folds": np.zeros(5, int)}, "has folds, which this layout does not state; set Record.folds to None"),
         ({"tx_pos_m": np.full((5, 3), np.nan)}, "a position, heading or signal strength is not finite"),
         ({"name of a receiver": "anchor03"}, r"receiver 'anchor03' would be read as another; rename it"),
-        ({"name of a receiver": "a/b"}, r"receiver 'a/b' cannot name a file; rename it"),
+        ({"name of a receiver": "a\tb"}, r"the name of receiver .* does not go into one line; rename it"),
         ({"array_m": np.zeros((1, 3))}, "receiver anchor3: it states no array"),
     ],
 )

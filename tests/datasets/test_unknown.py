@@ -21,7 +21,7 @@ SCANS = """time,x,y,BSSID,RSSI
 2,2.5,3.5,aa:02,-75
 3,3.5,3.5,aa:01,-64
 """
-WANTED = r"columns x,y and rssi_<id> of each receiver, in calibration_df\.csv \(training\) and test_robot_df\.csv"
+WANTED = r"columns x,y and rssi_<id> of each receiver, in train\.csv and test\.csv, or in measurements\.csv, beside"
 PIVOT = "pivot it by "
 
 
@@ -84,9 +84,9 @@ def test_other_content_is_named_with_what_is_wanted(tmp_path: Path, capsys: pyte
     (tmp_path / "wide" / "damaged.csv").write_bytes(b"\xff\xfe\x00")
     write_flat(tmp_path / "parent" / "office")
     for dataset, message in (
-        ("empty", r"an empty folder; a data set is a folder with anchors\.csv, calibration_df\.csv"),
-        ("documents", r"holds scans\.xlsx and is no data set itself; a data set is a folder with anchors\.csv"),
-        ("documents/scans.xlsx", r"a file of no known layout; a data set is a folder with anchors\.csv"),
+        ("empty", r"an empty folder; a data set is a folder with receivers\.csv, train\.csv"),
+        ("documents", r"holds scans\.xlsx and is no data set itself; a data set is a folder with receivers\.csv"),
+        ("documents/scans.xlsx", r"a file of no known layout; a data set is a folder with receivers\.csv"),
         ("wide", rf"holds all\.csv,damaged\.csv and .*; all\.csv has the columns X,Y,AP1,AP2; .*{WANTED}"),
         ("wide/all.csv", rf"a table, where a folder is wanted; all\.csv has the columns X,Y,AP1,AP2; .*{WANTED}"),
         ("wide/damaged.csv", "a file of no known layout"),

@@ -68,7 +68,7 @@ def test_record_has_the_stated_rows_and_receivers(record: Record, folder: Path) 
 
 
 def test_data_are_stored_and_reproducible(record: Record, traced: TraceResult, folder: Path) -> None:
-    file = folder / "rssi" / "calibration_df.csv"
+    file = folder / "rssi" / "train.csv"
     before = file.stat().st_mtime_ns
     again = traced_floor_strengths(folder / "rssi", SMALL)
     assert file.stat().st_mtime_ns == before

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from .angles import FloatArray, rotation_matrix
 from .errors import InputError
@@ -24,6 +25,22 @@ FRAMES = ("world", "array")
 DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 """Quaternion of a frame parallel to the world's."""
+
+
+def boresight_orientation(azimuth_rad: float, downtilt_rad: float = 0.0) -> FloatArray:
+    """Orientation of an array by its boresight: unit quaternion x, y, z, w, array's frame to world.
+
+    The boresight, the array's z axis, has the azimuth, from +x towards +y, and points below the horizon by the
+    downtilt; the array's y axis points upwards, as of Sionna RT's devices of that yaw and pitch.
+
+    >>> from wrf_mi.core.angles import rotation_matrix
+    >>> rotation_matrix(boresight_orientation(np.pi / 2))[:, 2].round(6) + 0.0
+    array([0., 1., 0.])
+    """
+    device = Rotation.from_euler("ZY", [azimuth_rad, downtilt_rad])
+    return np.asarray((device * Rotation.from_matrix(DEVICE_TO_ARRAY.T)).as_quat())
+
+
 POLE = 1e-12
 """Squared sine of the zenith angle below which the azimuth is taken to be zero, as Sionna RT does."""
 WIDTH_RAD = math.radians(65)
@@ -60,7 +77,7 @@ class Antenna:
         if self.pattern == "tr38901" and self.frame == "world":
             raise InputError(
                 "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
-                "(--rx-frame array), or for transmitters and anchors one of " + ", ".join(OMNIDIRECTIONAL)
+                "(--rx-frame array), for anchors azimuth_deg, or for transmitters one of " + ", ".join(OMNIDIRECTIONAL)
             )
 
     @property

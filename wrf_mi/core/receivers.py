@@ -19,6 +19,7 @@ SHOWN = 20
 """Largest number of names in an error message."""
 UNKNOWN = -1
 """Stored number of elements of a receiver without a known array."""
+CARRIERS = "receiver_frequency_hz"
 
 
 def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
@@ -58,9 +59,10 @@ def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
     """Arrays of n receivers by name.
 
     Shapes, in the order below: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of
-    each array; [all, 3] positions of all elements in the receivers' frames, metres.
+    each array; [all, 3] positions of all elements in the receivers' frames, metres; [n] carriers in Hz, if stated.
     """
     arrays = [receiver.array_m for receiver in receivers]
+    carriers = np.array([np.nan if receiver.frequency_hz is None else receiver.frequency_hz for receiver in receivers])
     return {
         "receiver_name": np.array([receiver.name for receiver in receivers]),
         "receiver_position_m": np.stack([receiver.position_m for receiver in receivers]),
@@ -68,6 +70,7 @@ def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
         "receiver_antenna": np.array([astuple(receiver.antenna) for receiver in receivers]),
         "receiver_elements": np.array([UNKNOWN if array is None else len(array) for array in arrays]),
         "receiver_elements_m": np.concatenate([np.zeros((0, 3)), *(array for array in arrays if array is not None)]),
+        **({} if np.isnan(carriers).all() else {CARRIERS: carriers}),
     }
 
 
@@ -81,6 +84,7 @@ def stored_receivers(arrays: Mapping[str, NDArray[Any]]) -> tuple[Receiver, ...]
     counts = arrays["receiver_elements"]
     split = np.split(arrays["receiver_elements_m"], np.cumsum(np.maximum(counts, 0))[:-1])
     elements = [None if count == UNKNOWN else array_m for count, array_m in zip(counts, split, strict=True)]
+    carriers = [None if np.isnan(hz) else float(hz) for hz in arrays.get(CARRIERS, np.full(len(counts), np.nan))]
     names = ("name", "position_m", "orientation_xyzw", "antenna")
-    columns = zip(*(arrays[f"receiver_{name}"] for name in names), elements, strict=True)
-    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), array_m) for n, p, q, words, array_m in columns)
+    columns = zip(*(arrays[f"receiver_{name}"] for name in names), elements, carriers, strict=True)
+    return tuple(Receiver(str(n), p, q, Antenna(*map(str, words)), m, hz) for n, p, q, words, m, hz in columns)

@@ -88,6 +88,8 @@ class Receiver:
         orientation_xyzw: unit quaternion, receiver's frame to world.
         antenna: antenna of the receiver, or of each element of its array.
         array_m: elements of its antenna array [m, 3], receiver's frame, metres; None: a single antenna or unknown.
+        frequency_hz: carrier of all that it receives, Hz, where receivers of signal strengths have different carriers;
+            None: that of the record or of each row.
 
     A receiver whose frame is turned by 90 degrees about the vertical:
 
@@ -101,6 +103,7 @@ class Receiver:
     orientation_xyzw: FloatArray
     antenna: Antenna = ANTENNA
     array_m: FloatArray | None = None
+    frequency_hz: float | None = None
 
     @property
     def to_world(self) -> FloatArray:
@@ -125,7 +128,7 @@ class Record:
         official: training and test rows (from 0) that came with the data, or None.
         folds: the spatial block of each row, shape [n], or None.
         frequencies_hz: frequency of the carrier, shape [1], or of each subcarrier of ``observation``; None where
-            unknown, and with ``carriers_hz``.
+            unknown, and with ``carriers_hz``. Where receivers state their carriers, the middle one of these.
         tx_heading_rad: yaw of the transmitter's body about +z, from +x towards +y, shape [n], or None.
         tx_antenna: antenna of the transmitter.
         uplink: channel coefficients at the uplink's frequencies, known for every row, from which the downlink's in
@@ -224,14 +227,31 @@ class Record:
         return replace(self, receivers=chosen, **self._of_receivers(lambda values: values[list(receivers)]))
 
     def at_carrier(self, carrier_hz: float) -> Record:
-        """The record with one carrier in Hz for every row."""
-        return replace(self, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
+        """The record with one carrier in Hz for every row and receiver."""
+        receivers = tuple(replace(receiver, frequency_hz=None) for receiver in self.receivers)
+        return replace(self, receivers=receivers, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
 
     def at_carriers(self, carriers_hz: FloatArray) -> Record:
         """The record with the carrier in Hz of each row, [n]."""
         if len(np.unique(carriers_hz)) == 1:
             return self.at_carrier(carriers_hz[0])
         return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
+
+    def at_receiver_carriers(self, carriers_hz: FloatArray) -> Record:
+        """The record with the carrier in Hz of each receiver, [n_rx]."""
+        distinct = np.unique(carriers_hz)
+        record = self.at_carrier(distinct[len(distinct) // 2])
+        if len(distinct) == 1:
+            return record
+        pairs = zip(self.receivers, carriers_hz, strict=True)
+        return replace(record, receivers=tuple(replace(rx, frequency_hz=float(carrier)) for rx, carrier in pairs))
+
+    @property
+    def receiver_carriers_hz(self) -> FloatArray | None:
+        """Carrier in Hz of each receiver, [n_rx], where receivers state their carriers; else None."""
+        carriers = [receiver.frequency_hz for receiver in self.receivers]
+        stated = np.array([np.nan if carrier is None else carrier for carrier in carriers])
+        return None if np.isnan(stated).all() else stated
 
     def precision(self, rows: IntArray) -> FloatArray | None:
         """Inverse variance of the noise of some rows' observations, relative to a typical reading's.

@@ -9,7 +9,6 @@ identity.
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,22 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Antenna, DataFault, InputError, Receiver, Record
+from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
-from ..core.antenna import ANTENNA, UPRIGHT
+from ..core.antenna import UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line, write_csv
-from ..core.types import IntArray
 from .faults import attempt, refuse, stop_at_faults
 from .folder_files import (
-    ANTENNA_WORDS,
     RUN,
-    TX_ANTENNA_WORDS,
     CsvTable,
     carriers_of,
     data_folder,
     folder_record,
-    read_antenna,
     read_csv,
     refuse_runs,
     refuse_unstated,
@@ -40,25 +35,36 @@ from .folder_files import (
     shown,
     write_extra,
 )
+from .receivers_file import (
+    WHOLE,
+    plain_id,
+    read_antennas,
+    read_ids,
+    read_orientations,
+    read_positions,
+    read_transmitter,
+    receiver_columns,
+    receiver_name,
+    wrong_id,
+)
 from .unknown import Table, long_columns, table_text
 
 logger = logging.getLogger(__name__)
 
-ANCHORS, TRAINING, TEST = "anchors.csv", "calibration_df.csv", "test_robot_df.csv"
+RECEIVERS, TRAINING = ("receivers.csv", "anchors.csv"), ("train.csv", "calibration_df.csv")
+TEST, MEASUREMENTS = ("test.csv", "test_robot_df.csv"), ("measurements.csv",)
+FILES = (RECEIVERS, TRAINING, TEST, MEASUREMENTS)
+"""Names of the files: that which is written, then that of the BLE data."""
 TAG_HEIGHT_M = 1.3
 """Height of the transmitter above the floor where the files have no column ``z`` (the data set's description)."""
 CARRIER_HZ = 2.44e9
 """Carrier of files without a column ``frequency_hz``. The data are means over BLE's three advertising channels, 2402,
 2426 and 2480 MHz (Bluetooth Core Specification, volume 6, part A): the middle of that band."""
-RSSI, COUNT, STD, TX = "rssi_", "count_", "std_", "tx_"
+RSSI, COUNT, STD, SPLIT = "rssi_", "count_", "std_", "split"
+PARTS = ("train", "test")
+"""Words of the column ``split``, which otherwise has numbers of spatial folds."""
 MOST_READINGS = 10**6
 """Largest number of readings of a row's mean."""
-COLUMNS = ("id", "x", "y", "z", *TX_ANTENNA_WORDS, *(TX + word for word in TX_ANTENNA_WORDS))
-"""Columns of ``anchors.csv``."""
-WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
-"""A whole number, also as pandas writes it in a column of floats: ``3``, ``3.0``."""
-NO_NAME = re.compile(r"[+-]?\d*\.\d*|nan", re.ASCII | re.IGNORECASE)
-"""A number with decimals, or pandas' mark of a missing value."""
 
 
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
@@ -67,48 +73,90 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     The record has the folder's name unless another is given.
 
     Returns:
-        A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received; the rows of
-        ``calibration_df.csv``, then those of ``test_robot_df.csv``, which is the official split.
+        A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received. The rows of
+        ``train.csv``, then those of ``test.csv``, are the official split; in ``measurements.csv`` the column ``split``
+        states that split or spatial folds.
 
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
-    folder = data_folder(path, f"{ANCHORS}, {TRAINING} and {TEST}")
-    anchors, *tables = (attempt(read_csv, folder / file) for file in (ANCHORS, TRAINING, TEST))
-    ids = attempt(_read_ids, anchors, complete=True)
-    anchors_m = attempt(_positions, anchors, "xyz", True)
-    rx_antennas, tx_antenna = attempt(_antennas, anchors, ""), attempt(_tx_antenna, anchors)
-    plane = [attempt(_positions, table, "xy") for table in tables]
+    folder = data_folder(path, f"{RECEIVERS[0]}, {TRAINING[0]} and {TEST[0]}, or {RECEIVERS[0]} and {MEASUREMENTS[0]}")
+    anchors, *tables = (attempt(read_csv, file) for file in _files(folder))
+    ids = attempt(read_ids, anchors, complete=True)
+    anchors_m = attempt(read_positions, anchors, "xyz", True)
+    orientations, receivers_hz = attempt(read_orientations, anchors), attempt(_receiver_carriers, anchors, tables)
+    rx_antennas = attempt(read_antennas, anchors, "", orientations)
+    tx_antenna = attempt(read_transmitter, anchors)
+    plane = [attempt(read_positions, table, "xy") for table in tables]
     stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, RUN)}
-    strengths = [attempt(_signal_strength, table, ids) for table in tables]
+    split = attempt(_read_split, tables)
+    strengths = [attempt(_signal_strength, table, ids, anchors) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
     stop_at_faults()
-    n_train, n_test = (len(table.value.rows) for table in tables)
-    height = stated["z"].value
+    height, counts = stated["z"].value, noise[COUNT].value
+    plane_m = np.concatenate([part.value for part in plane])
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
-        height = np.full(n_train + n_test, TAG_HEIGHT_M)
-    counts = noise[COUNT].value
+        height = np.full(len(plane_m), TAG_HEIGHT_M)
+    upright = np.array(UPRIGHT)
+    columns = ids.value, anchors_m.value, orientations.value, rx_antennas.value
     record = folder_record(
         folder,
         name,
         "rssi",
-        tx_pos_m=np.column_stack([np.concatenate([part.value for part in plane]), height]),
+        tx_pos_m=np.column_stack([plane_m, height]),
         receivers=tuple(
-            Receiver(_name(anchor), position, np.array(UPRIGHT), antenna)
-            for anchor, position, antenna in zip(ids.value, anchors_m.value, rx_antennas.value, strict=True)
+            Receiver(receiver_name(anchor), position, upright if orientation is None else orientation, antenna)
+            for anchor, position, orientation, antenna in zip(*columns, strict=True)
         ),
         observation=np.concatenate([part.value for part in strengths], axis=1),
-        official=(np.arange(n_train), n_train + np.arange(n_test)),
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=stated["heading"],
         tx_antenna=tx_antenna,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=noise[STD],
         runs=stated[RUN],
+        **split.value,
     )
+    if receivers_hz.value is not None:
+        return record.at_receiver_carriers(receivers_hz.value)
     carriers_hz = stated[FREQUENCY].value
     return record if carriers_hz is None else record.at_carriers(carriers_hz)
+
+
+def _files(folder: Path) -> list[Path]:
+    """File of the receivers and those of the rows: one, or those of training and test rows."""
+    present = {names: [name for name in names if (folder / name).exists()] for names in FILES}
+    both = [name for names in (TRAINING, TEST) for name in present[names]]
+    for same in (*present.values(), [*present[MEASUREMENTS], *both] if present[MEASUREMENTS] else []):
+        if len(same) > 1:
+            raise DataFault(folder, f"{same[0]} and {same[1]} state the same; remove one of them")
+    # A missing file is reported by the name that goes with those of the others.
+    historic = any(names.index(name) for names, named in present.items() for name in named)
+    rows = (MEASUREMENTS,) if present[MEASUREMENTS] else (TRAINING, TEST)
+    return [folder / (present[names] or [names[historic]])[0] for names in (RECEIVERS, *rows)]
+
+
+def _read_split(tables: list[CsvTable]) -> dict[str, Any]:
+    """The attributes ``official`` or ``folds`` of the record."""
+    if len(tables) > 1:
+        n_train, n_test = (len(table.rows) for table in tables)
+        return {"official": (np.arange(n_train), n_train + np.arange(n_test))}
+    table = tables[0]
+    if SPLIT not in table.header:
+        return {}
+    texts = table.texts(SPLIT)
+    # Rows that are damaged have been refused already; any word serves there.
+    words = np.array([PARTS[0] if row in table.damaged else text.strip().lower() for row, text in enumerate(texts)])
+    if all(map(WHOLE.fullmatch, words)):
+        return {"folds": np.unique(words.astype(float), return_inverse=True)[1].reshape(-1).astype(np.int64)}
+    for row in np.flatnonzero(~np.isin(words, PARTS)):
+        text = f"{SPLIT} is {shown(texts[row])}; give train or test, or in all rows a fold's number"
+        refuse(DataFault(table.path, text, row=int(row) + 1))
+    official = np.flatnonzero(words == PARTS[0]), np.flatnonzero(words == PARTS[1])
+    if not (len(official[0]) and len(official[1])):
+        raise DataFault(table.path, f"all rows have {words[0]} in the column {SPLIT}; mark others, or omit the column")
+    return {"official": official}
 
 
 def write_ble_folder(
@@ -120,38 +168,33 @@ def write_ble_folder(
 ) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
-    The official split assigns rows to the files, so they are read in the order of that split. ``extra`` is the content
-    of further files by their paths in the folder, ``further`` columns [n] of the rows that are not read.
+    Rows go into ``train.csv`` and ``test.csv`` by the official split, and are read in its order; without one into
+    ``measurements.csv``. ``extra`` is the content of further files by their paths in the folder, ``further`` columns
+    [n] of the rows that are not read.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
     """
-    official, ids = _writable(path, record)
-    carriers, hz = record.carriers_hz, record.frequencies_hz
-    if hz is not None and hz[0] != CARRIER_HZ:
-        carriers = np.full(len(record), hz[0])
+    ids = _writable(path, record)
     with atomic_folder(Path(path), replace) as part:
-        antennas = {TX: [record.tx_antenna] * len(ids), "": [receiver.antenna for receiver in record.receivers]}
-        stated = {
-            prefix + word: [getattr(antenna, word) for antenna in group]
-            for prefix, group in antennas.items()
-            for word in TX_ANTENNA_WORDS
-            if any(antenna != ANTENNA for antenna in group)
-        }
-        positions = np.stack([receiver.position_m for receiver in record.receivers])
-        columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True)), **stated}
-        write_csv(part / ANCHORS, columns, zip(*columns.values(), strict=True))
-        of_rows = {**_columns(record, ids, carriers), **(further or {})}
-        for file, rows in zip((TRAINING, TEST), official, strict=True):
-            write_csv(part / file, of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
+        columns = receiver_columns(record, ids)
+        write_csv(part / RECEIVERS[0], columns, zip(*columns.values(), strict=True))
+        of_rows = {**_columns(record, ids), **(further or {})}
+        files = (MEASUREMENTS,) if record.official is None else (TRAINING, TEST)
+        parts = (np.arange(len(record)),) if record.official is None else record.official
+        for names, rows in zip(files, parts, strict=True):
+            write_csv(part / names[0], of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
         write_extra(part, extra)
     return Path(path)
 
 
-def _columns(record: Record, ids: list[str], carriers_hz: FloatArray | None) -> dict[str, NDArray[Any]]:
+def _columns(record: Record, ids: list[str]) -> dict[str, NDArray[Any]]:
     """Columns of the tables of rows."""
+    carriers_hz, hz = record.carriers_hz, record.frequencies_hz
+    if hz is not None and hz[0] != CARRIER_HZ and record.receiver_carriers_hz is None:
+        carriers_hz = np.full(len(record), hz[0])
     columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
-    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, RUN: record.runs}
+    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, RUN: record.runs, SPLIT: record.folds}
     counts = None if record.n_readings is None else record.n_readings.astype(object)
     if counts is not None:
         counts[counts == 0] = None  # an empty field where nothing was received, as of strength and noise
@@ -161,106 +204,45 @@ def _columns(record: Record, ids: list[str], carriers_hz: FloatArray | None) -> 
     return {name: values for name, values in columns.items() if values is not None}
 
 
-def _writable(path: str | Path, record: Record) -> tuple[tuple[IntArray, IntArray], list[str]]:
-    """The official split and the receivers' ids of a record, checked to fit the layout."""
-    text, rows = f"{path}: {record.name} cannot be written in the layout of {ANCHORS}", np.arange(len(record))
-    if record.task != "rssi" or record.official is None:
-        raise InputError(f"{text}: it needs signal strengths with an official split; set Record.official")
-    if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
-        raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
+def _writable(path: str | Path, record: Record) -> list[str]:
+    """The receivers' ids of a record, checked to fit the layout."""
+    text, rows = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}", np.arange(len(record))
+    if record.task != "rssi":
+        raise InputError(f"{text}: it needs signal strengths")
+    refuse_unstated(path, record, "truth", "uplink")
+    if record.official is not None:
+        refuse_unstated(path, record, "folds")
+        if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
+            raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
     if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
-    refuse_unstated(path, record, "folds", "truth", "uplink")
     refuse_runs(path, record)
     numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
     if not all(np.isfinite(values).all() for values in numbers) or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
     ids: list[str] = []
     for rx in record.receivers:
-        if rx.array_m is not None or rx.orientation_xyzw.tolist() != list(UPRIGHT) or rx.antenna.frame != "world":
-            what = "it states no array, orientation or frame of an antenna"
-            raise InputError(f"{text}: receiver {rx.name}: {what}; set those of the world")
-        anchor = number if _name(number := rx.name.removeprefix("anchor")) == rx.name else rx.name
-        wrong = _wrong_id(anchor, ids) or ("" if _name(_id(anchor)) == rx.name else "would be read as another")
+        if rx.array_m is not None:
+            raise InputError(f"{text}: receiver {rx.name}: it states no array; set Receiver.array_m to None")
+        anchor = number if receiver_name(number := rx.name.removeprefix("anchor")) == rx.name else rx.name
+        wrong = wrong_id(anchor, ids)
+        if not wrong and receiver_name(plain_id(anchor)) != rx.name:
+            wrong = "would be read as another"
         if wrong:
             raise InputError(f"{text}: the name of receiver {shown(rx.name)} {wrong}; rename it")
         ids.append(anchor)
-    return record.official, ids
-
-
-def _read_ids(table: CsvTable) -> list[str]:
-    """Ids of the anchors in normal form."""
-    if unused := [column for column in table.header if column not in COLUMNS]:
-        known = ", ".join(COLUMNS)
-        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
-    ids: list[str] = []
-    for row, text in enumerate(table.texts("id"), start=1):
-        anchor = _id(text)
-        wrong = None if row - 1 in table.damaged else _wrong_id(anchor, ids)
-        if wrong:
-            remedy = "give each anchor a number or name that no other has"
-            refuse(DataFault(table.path, f"id {shown(text)} {wrong}; {remedy}", row=row))
-        ids.append(anchor)
-    if table.damaged:
-        stop_at_faults()  # an anchor without id
     return ids
 
 
-def _positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
-    """Coordinates [rows, axes] in metres; NaN where they are empty and may be so."""
-    columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
-    return np.stack([column.value for column in columns], axis=-1)
-
-
-def _tx_antenna(anchors: CsvTable) -> Antenna:
-    """The transmitter's antenna, which every row of the anchors states."""
-    first, *others = _antennas(anchors, TX)
-    for row, antenna in enumerate(others, start=2):
-        if antenna != first:
-            text = f"{TX}pattern or {TX}polarization differs from row 1"
-            remedy = "there is one transmitter: state the same in every row"
-            refuse(DataFault(anchors.path, f"{text}; {remedy}", row=row))
-    return first
-
-
-def _antennas(table: CsvTable, prefix: str) -> list[Antenna]:
-    """The antenna of each row; an empty field or a missing column is the default."""
-    stated = {key: table.texts(prefix + key) for key in TX_ANTENNA_WORDS if prefix + key in table.header}
-    entries = [
-        {key: text for key, texts in stated.items() if (text := texts[row].strip())} for row in range(len(table.rows))
-    ]
-    antennas = [
-        attempt(read_antenna, table.path, f"{prefix}antenna", entry, ANTENNA_WORDS, row)
-        for row, entry in enumerate(entries, start=1)
-    ]
-    return [antenna.value for antenna in antennas]
-
-
-def _id(text: str) -> str:
-    """Normal form of an id: a whole number without leading zeros and decimals, any other text unchanged."""
-    number = WHOLE.fullmatch(text.strip())
-    return text.strip() if number is None else number[1].replace("+", "") + number[2]
-
-
-def _name(anchor: str) -> str:
-    """Name of the receiver of an id."""
-    return f"anchor{anchor}" if WHOLE.fullmatch(anchor) else anchor
-
-
-def _wrong_id(anchor: str, before: list[str]) -> str | None:
-    """Reason why an id cannot follow others, or None."""
-    if not anchor:
-        return "is empty"
-    if not anchor.isprintable():
-        return "does not go into one line"
-    if "/" in anchor or "\\" in anchor or anchor in (".", ".."):
-        return "cannot name a file"
-    if NO_NAME.fullmatch(anchor):
-        return "is neither a whole number nor a name"
-    names = [_name(other) for other in before]
-    if _name(anchor) in names:
-        return f"gives the name {_name(anchor)}, as row {names.index(_name(anchor)) + 1} does"
-    return None
+def _receiver_carriers(anchors: CsvTable, tables: list[CsvTable]) -> FloatArray | None:
+    """Carrier of each receiver [n_rx], Hz; None without the column."""
+    if FREQUENCY not in anchors.header:
+        return None
+    for table in tables:
+        if FREQUENCY in table.header:
+            text = f"{FREQUENCY} is a column of {anchors.path.name}, too; remove one of them"
+            raise DataFault(table.path, text, line=1)
+    return carriers_of(anchors.path, anchors.numbers(FREQUENCY))
 
 
 def _in_both(column: str, tables: list[CsvTable]) -> Any:
@@ -282,7 +264,7 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
     columns: dict[str, str] = {}
     for column in table.header:
         if column.startswith(prefix):
-            first = columns.setdefault(_id(column.removeprefix(prefix)), column)
+            first = columns.setdefault(plain_id(column.removeprefix(prefix)), column)
             if first != column:
                 text = f"{first} and {column} name one anchor; remove one of them"
                 refuse(DataFault(table.path, text, line=1))
@@ -329,12 +311,12 @@ def _noise(
     return values
 
 
-def _signal_strength(table: CsvTable, ids: list[str]) -> NDArray[np.float32]:
+def _signal_strength(table: CsvTable, ids: list[str], anchors: CsvTable) -> NDArray[np.float32]:
     columns = _by_anchor(RSSI, table)
     unknown = sorted(column for anchor, column in columns.items() if anchor not in ids)
     lacking = [anchor for anchor in ids if anchor not in columns]
     if unknown or lacking:
-        text = f"{len(columns)} columns {RSSI}*, but {ANCHORS} has {len(ids)} anchors"
+        text = f"{len(columns)} columns {RSSI}*, but {anchors.path.name} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
         remedy = "give one column per anchor, named by its id"
         if not columns and long_columns(table.header):

@@ -14,7 +14,7 @@ from ..core import Record
 from ..core.array_files import stored_names
 from ..core.registry import Registry
 from .argos import SUFFIXES, read_argos
-from .ble_folder import ANCHORS, TEST, TRAINING, read_ble_folder
+from .ble_folder import MEASUREMENTS, RECEIVERS, TEST, TRAINING, read_ble_folder
 from .deepmimo import OLD_PARAMS, PARAMS, read_deepmimo
 from .folder_files import POSITIONS
 from .nerf2_ble import GATEWAYS as BLE_GATEWAYS
@@ -67,7 +67,7 @@ BUILT_IN = (
     Layout("spectra", "spectrum", read_spectrum_folder, (GATEWAYS,), parts=(IMAGES, POSITIONS, FOLDS)),
     Layout("nerf2-ble", "rssi", read_nerf2_ble, (POWERS, BLE_GATEWAYS)),
     Layout("nerf2-csi", "csi", read_nerf2_csi, (CHANNELS, STATION)),
-    Layout("ble", "rssi", read_ble_folder, (ANCHORS,), parts=(TRAINING, TEST)),
+    Layout("ble", "rssi", read_ble_folder, RECEIVERS, parts=(*TRAINING, *TEST, *MEASUREMENTS)),
     Layout("deepmimo", "csi", read_deepmimo, (PARAMS, OLD_PARAMS)),
     Layout("npz", "", read_record_file, suffixes=(".npz",), array=VERSION),
     Layout("newrf", "csi", read_newrf, suffixes=(".npz",)),

@@ -12,13 +12,13 @@ from ..core import DataFault, InputError
 from ..core.files import one_line, text_lines
 
 WANTED = (
-    "a data set is a folder with anchors.csv, calibration_df.csv and test_robot_df.csv (signal strengths), with "
+    "a data set is a folder with receivers.csv, train.csv and test.csv (signal strengths), with "
     "gateway_info.yml, tx_pos.csv and spectrum/ (spectra), with csidata.npy and base-station.yml (channels), or of "
     "another layout of docs/data.md"
 )
 TABLE = (
     "signal strengths are a row for each position with the columns x,y and rssi_<id> of each receiver, in "
-    "calibration_df.csv (training) and test_robot_df.csv (test), beside anchors.csv with id,x,y,z of each receiver "
+    "train.csv and test.csv, or in measurements.csv, beside receivers.csv with id,x,y,z of each receiver "
     "(docs/howto/own-data.md)"
 )
 TABLES = (".csv", ".tsv", ".txt")

@@ -35,7 +35,8 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
     rx_pos_m = np.stack([receiver.position_m for receiver in traced.receivers])
     columns: dict[str, Any] = {"tx": paths.tx.tolist(), "rx": paths.rx.tolist()}
     columns["receiver"] = [traced.receivers[index].name for index in paths.rx]
-    columns["frequency_hz"] = hz[paths.tx].tolist()
+    of_receivers = np.array([np.nan if rx.frequency_hz is None else rx.frequency_hz for rx in traced.receivers])
+    columns["frequency_hz"] = np.where(np.isnan(of_receivers)[paths.rx], hz[paths.tx], of_receivers[paths.rx]).tolist()
     for name, values in (("tx", traced.tx_pos_m[paths.tx]), ("rx", rx_pos_m[paths.rx])):
         columns |= {f"{name}_{axis}": column.tolist() for axis, column in zip("xyz", values.T, strict=True)}
     columns |= {"gain_re": paths.gain.real.tolist(), "gain_im": paths.gain.imag.tolist()}

@@ -77,6 +77,12 @@ def check_parts(record: Record) -> None:
     if record.runs is not None and record.runs.shape != (len(record),):
         raise InputError(f"{place_of(record)}: runs {list(record.runs.shape)}; give one for each of {len(record)} rows")
     carriers, place = record.carriers_hz, place_of(record)
+    if (of_receivers := record.receiver_carriers_hz) is not None:
+        if carriers is not None or not task_of(record).in_decibel:
+            text = "receivers' frequency_hz belongs to signal strengths without carriers_hz"
+            raise InputError(f"{place}: {text}; state the carriers of receivers or of rows")
+        if not (of_receivers > 0).all():
+            raise InputError(f"{place}: some receivers have no positive frequency_hz; give the carrier of each in Hz")
     if carriers is None:
         return
     if record.frequencies_hz is not None or task_of(record).is_complex:

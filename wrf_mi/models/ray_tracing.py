@@ -343,6 +343,9 @@ def check(problem: Problem, splits: Sequence[Split]) -> None:
             raise InputError(f"{place_of(problem.record)}: {carriers_text(carriers)}; {text}")
         for carrier_hz in np.unique(carriers):
             problem.open_scene(float(carrier_hz))
+    for receiver in problem.record.receivers:
+        if receiver.frequency_hz is not None:
+            problem.open_scene(receiver.frequency_hz)
     if problem.settings.calibration is not None:
         check_field(_graph_problem(problem), splits)
         if _changes_scene(problem):

@@ -71,7 +71,8 @@ def write_deepmimo(path: str | Path, traced: TraceResult, replace: bool = False,
         InputError: no path, several carriers, or a folder as `check_deepmimo_folder` refuses it.
     """
     folder = check_deepmimo_folder(path, replace)
-    if traced.carriers_hz is not None and len(np.unique(traced.carriers_hz)) > 1:
+    several = traced.carriers_hz is not None and len(np.unique(traced.carriers_hz)) > 1
+    if several or any(receiver.frequency_hz is not None for receiver in traced.receivers):
         raise InputError(
             f"{folder}: paths of several carriers; DeepMIMO has one, so trace the rows of each by themselves"
         )

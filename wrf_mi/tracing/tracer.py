@@ -77,7 +77,8 @@ class RayTracer:
                 searched for once. None: the instrument's carrier for all.
 
         Raises:
-            InputError: a position inside a solid object, or a material that is not known at one of the carriers.
+            InputError: a position inside a solid object, or a material that is not known at one of the carriers, among
+                them those that receivers state.
         """
         instrument = self.instrument
         traced = trace_paths(

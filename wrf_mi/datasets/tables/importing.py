@@ -18,7 +18,7 @@ from ...core.antenna import UPRIGHT
 from ...core.files import one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
-from ..splits import make_splits
+from ..receivers_file import receiver_name
 from .columns import HERTZ, Columns, described, find_columns, parsed_columns
 from .files import Table, joined, read_table
 from .further import further_columns
@@ -43,7 +43,6 @@ from .readings import (
     mean_strengths,
     merged,
     read_readings,
-    receiver_name,
     virtual_networks,
     without_not_heard,
 )
@@ -113,6 +112,7 @@ class _Import:
         self.notes += self.table.notes
         self.columns = find_columns(self.table, self.stated, options.receivers)
         self.units: dict[str, str] = {}
+        self.carrier_of: dict[str, float] = {}
         self.facts: dict[str, Any] = {"files": [path.name for path, _ in self.table.files]}
 
     def run(self, replace: bool) -> ImportReport:
@@ -133,7 +133,8 @@ class _Import:
         anchors_m, notes = self._anchors(readings, frame)
         self.notes += notes
         record = self._record(means, readings.ids, position_m, anchors_m)
-        record = self._with_conditions(record, {name: values[first] for name, values in conditions.items()})
+        conditions = {name: values[first] for name, values in conditions.items()}
+        record = self._with_conditions(record, conditions, readings.ids)
         record = self._with_split(record, self.is_test[first])
         further, notes = further_columns(self.table, self.columns, readings, place)
         self.notes += [*notes, *_reciprocity(self.columns)]
@@ -213,15 +214,11 @@ class _Import:
         return conditions
 
     def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
-        """Carriers of rows; where each receiver has its own, as of a Wi-Fi scan, their median for all rows."""
+        """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
         pairs = np.unique(np.column_stack([readings.receiver, carriers_hz[readings.row]]), axis=0)
-        carriers = np.unique(pairs[:, 1])
-        if len(carriers) > 1 and len(pairs) == len(np.unique(pairs[:, 0])):
-            hz = {readings.ids[int(number)]: float(carrier) for number, carrier in pairs}
-            self.facts["receiver_frequency_hz"] = hz
-            middle = float(carriers[len(carriers) // 2])
-            self.notes.append(f"receivers have carriers of their own ({FACTS}): {middle:.10g} Hz stands for all")
-            return {"frequency_hz": np.full(len(self.table), middle)}
+        if len(np.unique(pairs[:, 1])) > 1 and len(pairs) == len(np.unique(pairs[:, 0])):
+            self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in pairs}
+            return {}
         return {"frequency_hz": carriers_hz}
 
     def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[Readings, Means]:
@@ -286,21 +283,21 @@ class _Import:
             std=means.std.round(STRENGTH_DIGITS) if averaged else None,
         )
 
-    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]]) -> Record:
+    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]], ids: Sequence[str]) -> Record:
         carriers_hz = conditions.get("frequency_hz")
         record = dataclasses.replace(record, tx_heading_rad=conditions.get("heading"), runs=conditions.get("run"))
+        if self.carrier_of:
+            return record.at_receiver_carriers(np.array([self.carrier_of[name] for name in ids]))
         return record if carriers_hz is None else record.at_carriers(carriers_hz)
 
     def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
-        """The record with its official split: the stated one, or a block of the plan."""
-        if is_test.any() and not is_test.all():
-            official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
-            self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")
-            return dataclasses.replace(record, official=official)
-        test = make_splits(record, "blocked")[0].test
-        text = f"no test rows are stated: the official split holds out {len(test)} of {len(record)} rows"
-        self.notes.append(f"{text}, a block of the plan; train --split blocked or random makes others")
-        return dataclasses.replace(record, official=(np.setdiff1d(np.arange(len(record)), test), test))
+        """The record with its official split, if test rows are stated."""
+        if not is_test.any() or is_test.all():
+            self.notes.append("no test rows are stated: train --split blocked or random holds rows out")
+            return record
+        official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
+        self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")
+        return dataclasses.replace(record, official=official)
 
 
 def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from ...core.angles import FloatArray
 from ...core.files import one_line
 from ...core.types import IntArray
-from ..ble_folder import WHOLE
+from ..receivers_file import plain_id
 from ..sentinels import CUSTOMARY_DBM, suspicious_values
 from .columns import MAC, Columns
 from .files import Table, package
@@ -47,16 +47,8 @@ class Readings:
 
 
 def normal_id(text: str) -> str:
-    """An id as the layout reads it: whole numbers without leading zeros and decimals, names without slashes."""
-    number = WHOLE.fullmatch(text.strip())
-    if number is not None:
-        return number[1].replace("+", "") + number[2]
-    return re.sub(r"[/\\]", "-", one_line(text))
-
-
-def receiver_name(anchor: str) -> str:
-    """Name of the receiver of an id, as the layout reads it."""
-    return f"anchor{anchor}" if WHOLE.fullmatch(anchor) else anchor
+    """An id as the layout reads it, without slashes, which it refuses."""
+    return re.sub(r"[/\\]", "-", plain_id(one_line(text)))
 
 
 def read_readings(table: Table, columns: Columns) -> Readings:

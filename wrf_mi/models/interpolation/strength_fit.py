@@ -132,12 +132,13 @@ class PooledProcess:
 class PriorMean:
     """Expected signal strength before anything is measured: traced power, or free space where ``traced`` is None.
 
-    ``transmit_dbm`` includes the gains of both antennas; ``sd`` and ``rx_sd_db`` are those of `basis`.
+    ``transmit_dbm`` includes the gains of both antennas; ``sd`` and ``rx_sd_db`` are those of `basis`;
+    ``frequency_hz`` is the carrier [1], or that of each receiver [n_rx].
     """
 
     receivers_m: FloatArray
     transmit_dbm: float
-    frequency_hz: float
+    frequency_hz: FloatArray
     traced: Traced | None
     sd: FloatArray
     rx_sd_db: float
@@ -149,7 +150,8 @@ class PriorMean:
             level = power - float(np.median(self.traced.power_dbm))  # centred, so that factor and offset are apart
         else:
             distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
-            at_1m = 20 * np.log10(speed_of_light / self.frequency_hz / (4 * np.pi))
+            frequency_hz = np.broadcast_to(self.frequency_hz, len(self.receivers_m))[receiver]
+            at_1m = 20 * np.log10(speed_of_light / frequency_hz / (4 * np.pi))
             power, level = at_1m - 10 * FREE_SPACE * np.log10(np.maximum(distance, NEAREST_M)), None
         return self.transmit_dbm + power, *basis(poses, receiver, self.receivers_m, level, self.sd, self.rx_sd_db)
 

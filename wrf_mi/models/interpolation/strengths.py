@@ -129,7 +129,7 @@ class Strengths(Fitted):
             **field_arrays(stops.poses, "stop."),
             **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
             "receivers_m": prior.receivers_m,
-            "base": np.array([prior.transmit_dbm, prior.frequency_hz]),
+            "base": np.append(prior.transmit_dbm, prior.frequency_hz),
             "prior.shared": prior.sd,
             "prior.rx": prior.rx_sd_db,
             "ratio": field.ratio,
@@ -160,7 +160,7 @@ class Strengths(Fitted):
                 power_dbm = arrays["exact.traced_dbm"].T
                 known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
                 traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
-        transmit_dbm, frequency_hz = map(float, arrays["base"])
+        transmit_dbm, frequency_hz = float(arrays["base"][0]), arrays["base"][1:]
         sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
         prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
         poses = from_field_arrays(Poses, arrays, "stop.")
@@ -256,7 +256,8 @@ def _prior(record: Record, measured: Measured, power_map: Traced | None, setting
     receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     traced_sd = np.multiply(TRACED_SD, power_map is not None)
     sd = np.array([(OFFSET_SD_DB, RECEIVER_SD_DB), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
-    carrier_hz = float(np.mean(record.frequencies_hz))
+    of_receivers = record.receiver_carriers_hz
+    carrier_hz = np.mean(record.frequencies_hz, keepdims=True) if of_receivers is None else of_receivers
     at_0_dbm = PriorMean(receivers_m, 0.0, carrier_hz, power_map, sd, RECEIVER_PATTERN_DB)
     transmit_dbm = settings.transmit_dbm
     if transmit_dbm is None:

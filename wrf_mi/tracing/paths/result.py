@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
+from ...core.carriers import by_carrier
 from ...core.paths import read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import IntArray
 from ..options import TraceOptions
 from ..search.legs import Legs
 from ..search.surfaces import Surfaces, scene_surfaces
-from ..sionna.materials import absorbs
+from ..sionna.materials import absorbs, at_frequency
 from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
 
 
@@ -125,6 +126,31 @@ def device_ends(tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], tx_antenn
     return Devices(tx_pos_m, (tx_antenna.mounted(),)), Devices(rx, antennas)
 
 
+def gains_of_receivers(
+    scene: Any,
+    surfaces: Surfaces,
+    legs: Legs,
+    ends: Ends,
+    rays: int,
+    receivers: Sequence[Receiver],
+    receiver: IntArray,
+) -> NDArray[np.complex128]:
+    """Gains [p] of paths (`path_gains`) at the carrier of each path's receiver, whose number is ``receiver`` [p].
+
+    Receivers without a carrier have that of the scene.
+    """
+    scene_hz = float(scene.frequency[0])
+    carriers_hz = np.array([scene_hz if rx.frequency_hz is None else rx.frequency_hz for rx in receivers])
+
+    def at_carrier(carrier_hz: float, which: IntArray) -> NDArray[np.complex128]:
+        with at_frequency(scene, carrier_hz):
+            return path_gains(scene, surfaces, legs.select(which), ends, rays)
+
+    if len(receiver) == 0 or (carriers_hz == scene_hz).all():
+        return path_gains(scene, surfaces, legs, ends, rays)
+    return by_carrier(carriers_hz[receiver], at_carrier)
+
+
 def recompute(traced: TraceResult, scene: Any) -> TraceResult:
     """Recompute the gains of paths with the scene's present materials and frequency, without tracing again.
 
@@ -140,7 +166,9 @@ def recompute(traced: TraceResult, scene: Any) -> TraceResult:
     """
     surfaces = scene_surfaces(scene)
     with scattering_materials(scene, traced.options):
-        gain = path_gains(scene, surfaces, traced.legs(surfaces), traced.ends(), traced.rays)
+        legs = traced.legs(surfaces)
+        receiver = legs.source if traced.from_receivers else legs.target
+        gain = gains_of_receivers(scene, surfaces, legs, traced.ends(), traced.rays, traced.receivers, receiver)
     paths, hz = replace(traced.paths, gain=gain), float(scene.frequency[0])
     return replace(traced, paths=paths, frequency_hz=hz, carriers_hz=None)
 

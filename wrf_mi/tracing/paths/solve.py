@@ -22,8 +22,8 @@ from ..search.devices import before_surfaces, check_devices, from_behind
 from ..search.images import image_sources, specular_paths
 from ..search.legs import Legs, join
 from ..search.surfaces import Surfaces, scene_surfaces
-from ..sionna.path_solver import AT_ANTENNA_M, path_gains, sampled_paths, scattering_materials
-from .result import TraceResult, device_ends
+from ..sionna.path_solver import AT_ANTENNA_M, sampled_paths, scattering_materials
+from .result import TraceResult, device_ends, gains_of_receivers
 
 if TYPE_CHECKING:
     from .scene_parameters import MaterialGrouping, SceneTables
@@ -183,8 +183,10 @@ def trace_paths(
     # Paths, then their gains by Sionna RT's field calculator, which knows diffraction and scattering.
     with scattering_materials(scene, options):
         legs = _search(scene, shared, sources, targets, options, rays, progress)
-        unknown = np.full(len(legs), np.nan, np.complex128)
-        gain = path_gains(scene, shared.surfaces, legs, ends, rays) if gains else unknown
+        gain = np.full(len(legs), np.nan, np.complex128)
+        if gains:
+            receiver = legs.source if swap else legs.target
+            gain = gains_of_receivers(scene, shared.surfaces, legs, ends, rays, devices, receiver)
     # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
     paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
     primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)

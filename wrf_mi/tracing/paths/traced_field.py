@@ -99,7 +99,8 @@ class TracedField:
         traced: known paths from these transmitters to this receiver; None: paths are searched.
         prepared: shared state of the scene for several fields in it: rays of a receiver are then shot once, and the
             caller checks the antennas (`wrf_mi.tracing.paths.solve.Prepared.check`).
-        frequency_hz: carrier of the paths; None: that of the scene, at which parameters of materials hold.
+        frequency_hz: carrier of the paths; None: that of the receiver, or else of the scene, at which parameters of
+            materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
         present: parameter values used to prune weak paths, Dr.Jit tensors by name; None: as stated.
 
@@ -141,7 +142,7 @@ class TracedField:
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
         self._stated_hz = float(scene.frequency[0])
-        self.frequency_hz = self._stated_hz if frequency_hz is None else float(frequency_hz)
+        self.frequency_hz = float(frequency_hz or receiver.frequency_hz or self._stated_hz)
         self.searches = 0
         self.surfaces: Surfaces = self._shared.surfaces
         position_m = receiver.position_m if searched_at_m is None else searched_at_m
@@ -390,7 +391,8 @@ def traced_fields(
     traces, fields = dict[bool, TraceResult](), list[TracedField]()
     for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
         # The stated position serves the carriers for which the receiver has not moved by a quarter of a wavelength.
-        moved = _needs_search(moved_to_m, stated_m, carrier_hz or float(prepared.scene.frequency[0]))
+        at_hz = carrier_hz or receiver.frequency_hz or float(prepared.scene.frequency[0])
+        moved = _needs_search(moved_to_m, stated_m, at_hz)
         position_m = moved_to_m if moved else stated_m
         if moved not in traces:
             at = replace(receiver, position_m=position_m)

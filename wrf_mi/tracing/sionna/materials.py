@@ -8,7 +8,8 @@ material, outside of which Sionna RT raises an error. Most building materials be
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
@@ -63,6 +64,8 @@ def absorbs(material: Any) -> bool:
 
 CONSTANTS = ("relative_permittivity", "conductivity", "thickness")
 """Constants of a radio material that differ between materials."""
+CALLBACK, ITU_LAW = "_frequency_update_callback", "itu_law"
+"""Attributes of a radio material: its constants by frequency, and those of ITU-R P.2040 where others replace them."""
 
 
 def set_frequency(
@@ -93,6 +96,8 @@ def set_frequency(
         elif not in_itu_range(itu_type, frequency_hz):
             _extend(material, name, frequency_hz)
             below_range.append(itu_type)
+        elif hasattr(material, ITU_LAW):  # of a scene that was below the range before
+            material._frequency_update_callback = getattr(material, ITU_LAW)
     if below_range:
         text = "%g MHz is below the range of ITU-R P.2040 for %s: constant values of 1 GHz used"
         logger.info(text, frequency_hz / 1e6, ", ".join(sorted(below_range)))
@@ -102,6 +107,31 @@ def set_frequency(
             material.frequency_update = lambda: None
     scene.frequency = frequency_hz
     _share_kernels(scene, frequency_hz)
+
+
+@contextmanager
+def at_frequency(scene: Any, frequency_hz: float) -> Iterator[None]:
+    """A Sionna RT scene of `set_frequency` at another carrier frequency, for the duration of a block.
+
+    Raises:
+        InputError: as `set_frequency`.
+    """
+    stated_hz, names = scene._frequency, (*CONSTANTS, CALLBACK)
+    if float(stated_hz[0]) == np.float32(frequency_hz):
+        yield
+        return
+    stated = [
+        (material, {name: getattr(material, name) for name in names if hasattr(material, name)})
+        for material in scene.radio_materials.values()
+    ]
+    try:
+        set_frequency(scene, frequency_hz)
+        yield
+    finally:
+        scene._frequency = stated_hz  # the setter would compute the constants anew
+        for material, values in stated:
+            for name, value in values.items():
+                setattr(material, name, value)
 
 
 def _extend(material: Any, name: str, frequency_hz: float) -> None:
@@ -118,6 +148,8 @@ def _extend(material: Any, name: str, frequency_hz: float) -> None:
         way = f"in a Mitsuba XML give its shapes a BSDF with explicit constants (S/m): {bsdf}"
         raise InputError(f"{text}; choose another material, or {way}")
     constants = BELOW_1_GHZ[itu_type]
+    if not hasattr(material, ITU_LAW):
+        setattr(material, ITU_LAW, material.frequency_update_callback)
     material.frequency_update_callback = lambda _: tuple(map(mi.Float, constants))
 
 
