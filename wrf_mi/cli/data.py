@@ -53,6 +53,8 @@ def _add_import(data: Any) -> None:
     text = "tables with the positions of the rows: one for each table, those of --test last, or one for all"
     add("--positions", nargs="+", metavar="FILE", help=text)
     add("--anchors", metavar="FILE", help="table with the receivers' positions: id,x,y[,z] (default: unknown)")
+    text = "use the rows alone that have this text or number in a column, such as device=Samsung; repeatable"
+    add("--where", action="append", metavar="COLUMN=TEXT", help=text)
     text = "number for what was not heard, repeatable, or none (default: found and named)"
     add("--not-heard", action="append", metavar="DBM", help=text)
     add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
@@ -113,6 +115,8 @@ def import_command(a: Arguments) -> int:
     options = {name: value for name, value in given.items() if value is not None}
     if "not_heard" in options:
         options["not_heard"] = _not_heard(options["not_heard"])
+    if "where" in options:
+        options["where"] = dict(_where(text) for text in options["where"])
     report = import_measurements(a.files, a.out, a.replace, **options)
     check = check_data(a.out)
     facts = summary(report.record)
@@ -123,6 +127,14 @@ def import_command(a: Arguments) -> int:
     lines = [*report.columns, "", *report.notes, "", rows, *check.lines(), f"next: {next_command}"]
     show(a.json, values, "\n".join(lines))
     return 0 if check.ok else 2
+
+
+def _where(text: str) -> tuple[str, str]:
+    """Column and text of ``--where``."""
+    column, equals, wanted = text.partition("=")
+    if not equals:
+        raise InputError(f"--where {one_line(text)}: give COLUMN=TEXT")
+    return column.strip(), wanted.strip()
 
 
 def _not_heard(texts: list[str]) -> list[float]:

@@ -138,6 +138,18 @@ def test_further_columns_are_kept(tmp_path: Path) -> None:
     assert set(kept.source_count_x) == {3}
 
 
+def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
+    frame = pandas.concat([wide().assign(device=1.0), (wide() - 20).assign(device=2.0)])
+    np.testing.assert_allclose(in_order(imported(tmp_path, frame, where={"device": "1"}))[1], STRENGTHS, atol=ROUNDING)
+    frame.iloc[40, 0] = np.nan
+    frame.iloc[50, frame.columns.get_loc("x")] = np.nan
+    frame.to_csv(tmp_path / "table.csv", index=False)
+    with pytest.raises(InputError, match="row 51: x is empty"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "2"})
+    with pytest.raises(InputError, match="no row has device 3; correct --where"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "3"})
+
+
 def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     mhz = {"kitchen": 2412, "hall": 5180, "7": 2412}
     record = imported(tmp_path, long().assign(frequency=long().bssid.map(mhz)))

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line, readable
+from ..receivers_file import plain_id
 
 Frame = Any  # pandas.DataFrame, which is imported where it is used
 
@@ -62,6 +64,7 @@ class Table:
 
     def fault(self, text: str, row: int) -> DataFault:
         """The fault of a row, from 0, with its file and its number there."""
+        row = int(self.frame.index[row])  # its number before rows were left out
         for path, rows in self.files:
             if row < rows:
                 return DataFault(path, text, row=row + 1)
@@ -79,6 +82,15 @@ class Table:
             text = f"{one_line(column)} is {str(values.iloc[wrong[0]])[:40]!r}"
             raise self.fault(f"{text}; give a number, or name another column by --columns", int(wrong[0]))
         return np.asarray(numbers)
+
+    def where(self, column: str, text: str) -> NDArray[np.bool_]:
+        """Rows [rows] whose field of a column is a text or whole number; an `InputError` without such rows."""
+        if column not in self.frame:
+            raise DataFault(self.files[0][0], f"no column {one_line(column)}; correct --where", line=1)
+        rows = self.frame[column].astype(str).map(plain_id).to_numpy() == plain_id(text)
+        if not rows.any():
+            raise DataFault(self.files[0][0], f"no row has {one_line(column)} {one_line(text)}; correct --where")
+        return np.asarray(rows)
 
     def is_numeric(self, column: str) -> bool:
         """Whether a column holds numbers, or nothing."""

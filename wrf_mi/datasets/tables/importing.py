@@ -91,6 +91,17 @@ def import_measurements(
 
     Raises:
         InputError: an unknown option, a table or a field that cannot be understood, or a folder that exists.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> rows = ["x,y,bssid,rssi", "0,0,hall,-50", "0,0,hall,-52", "2,0,hall,-60", "2,0,attic,-71"]
+    >>> _ = (folder / "scans.csv").write_text("\\n".join(rows))
+    >>> report = import_measurements(folder / "scans.csv", folder / "office")
+    >>> [receiver.name for receiver in report.record.receivers]
+    ['hall', 'attic']
+    >>> report.record.observation
+    array([[-51., -60.],
+           [ nan, -71.]], dtype=float32)
     """
     if unknown := set(options) - {attribute.name for attribute in dataclasses.fields(ImportOptions)}:
         raise InputError(f"import_measurements: no option {min(unknown)}; see ImportOptions")
@@ -162,7 +173,12 @@ class _Import:
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
         rows = [len(table) for table in tables]
         is_test = np.repeat([number >= len(files) for number in range(len(paths))], rows)
-        return joined(tables), is_test
+        table = joined(tables)
+        for name, text in options.where.items():
+            rows = table.where(name, text)
+            self.notes.append(f"{np.count_nonzero(~rows)} rows are left out: their {one_line(name)} is not {text}")
+            table, is_test = dataclasses.replace(table, frame=table.frame[rows]), is_test[rows]
+        return table, is_test
 
     def _positions(self) -> tuple[LocalFrame, FloatArray]:
         """The local frame and the positions [rows, 3] in it."""

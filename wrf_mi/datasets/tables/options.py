@@ -26,6 +26,7 @@ class ImportOptions:
         test: files with the test rows.
         positions: files with the positions of the rows, one for each file (test files last) or one for all.
         anchors: file with the positions of the receivers, or None.
+        where: texts of columns; rows with other ones are left out.
         not_heard: numbers for what was not heard; None: found.
         average: mean of the readings of a place, ``db`` or ``mw``.
         place_m: side of the squares whose readings are averaged; 0: those of one exact position.
@@ -46,6 +47,7 @@ class ImportOptions:
     test: Sequence[str | Path] = ()
     positions: Sequence[str | Path] = ()
     anchors: str | Path | None = None
+    where: Mapping[str, str] = field(default_factory=dict)
     not_heard: Sequence[float] | None = None
     average: str = "db"
     place_m: float = 0.0
