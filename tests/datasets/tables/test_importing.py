@@ -144,7 +144,7 @@ def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
     frame.iloc[40, 0] = np.nan
     frame.iloc[50, frame.columns.get_loc("x")] = np.nan
     frame.to_csv(tmp_path / "table.csv", index=False)
-    with pytest.raises(InputError, match="row 51: x is empty"):
+    with pytest.raises(InputError, match="row 51: x is empty or infinite"):
         import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "2"})
     with pytest.raises(InputError, match="no row has device 3; correct --where"):
         import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "3"})
@@ -182,9 +182,10 @@ REFUSED = {
     "empty position": (
         lambda f: f.assign(x=[np.nan, *f.x[1:]]),
         {},
-        r"table\.csv: row 1: x is empty; give the position",
+        r"table\.csv: row 1: x is empty or infinite; give a number",
     ),
     "no position": (lambda f: f.drop(columns="x"), {}, "no columns of positions among .*--positions FILE"),
+    "carrier": (lambda f: f.assign(frequency=0), {}, "row 1: frequency is 0; give the carrier, or --columns"),
     "split": (lambda f: f.assign(split="maybe"), {}, "row 1: split is 'maybe'; give train or test"),
     "nothing heard": (lambda f: f, {"not_heard": STRENGTHS.ravel().tolist()}, "no reading was heard"),
     "rarely heard": (lambda f: f, {"min_heard": 99}, "no receiver was heard in 99 training rows"),

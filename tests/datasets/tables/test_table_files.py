@@ -103,6 +103,9 @@ def test_text_in_a_column_of_numbers_is_refused_with_its_file_and_row(tmp_path: 
     assert len(table) == 4
     with pytest.raises(InputError, match=r"b\.csv: row 2: rssi is 'weak'; give a number"):
         table.numbers("rssi")
+    (tmp_path / "c.csv").write_text("x,rssi\n1,-60\n1e300,-61\n")
+    with pytest.raises(InputError, match=r"c\.csv: row 2: x is '1e\+300'; give a number of single precision"):
+        read_table(tmp_path / "c.csv").numbers("x")
 
 
 def test_tables_beyond_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

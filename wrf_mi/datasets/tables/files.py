@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line, readable
+from ..folder_files import SINGLE_MAX
 from ..receivers_file import plain_id
 
 Frame = Any  # pandas.DataFrame, which is imported where it is used
@@ -74,13 +75,13 @@ class Table:
     def numbers(self, column: str) -> FloatArray:
         """Numbers of a column [rows], NaN where empty; an `InputError` for the first field that is no number."""
         values = self.frame[column]
-        if values.dtype.kind in "biuf":
-            return np.asarray(values.to_numpy(float, na_value=np.nan))
-        numbers = package("pandas").to_numeric(values.astype(str).str.strip(), errors="coerce").to_numpy(float)
-        wrong = np.flatnonzero(np.isnan(numbers) & values.notna().to_numpy())
-        if len(wrong):
-            text = f"{one_line(column)} is {str(values.iloc[wrong[0]])[:40]!r}"
-            raise self.fault(f"{text}; give a number, or name another column by --columns", int(wrong[0]))
+        texts = values if values.dtype.kind in "biuf" else values.astype(str).str.strip()
+        numbers = package("pandas").to_numeric(texts, errors="coerce").to_numpy(float, na_value=np.nan)
+        wrong = np.isnan(numbers) & values.notna().to_numpy() | (np.abs(numbers) > SINGLE_MAX) & np.isfinite(numbers)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            text = f"{one_line(column)} is {str(values.iloc[row])[:40]!r}; give a number of single precision"
+            raise self.fault(f"{text}, or name another column by --columns", row)
         return np.asarray(numbers)
 
     def where(self, column: str, text: str) -> NDArray[np.bool_]:

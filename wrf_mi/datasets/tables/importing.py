@@ -19,7 +19,7 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
 from ..receivers_file import receiver_name
-from .columns import HERTZ, Columns, described, find_columns, parsed_columns
+from .columns import HERTZ, Columns, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
 from .further import further_columns
 from .options import ImportOptions
@@ -78,7 +78,7 @@ class ImportReport:
 def import_measurements(
     files: str | Path | Sequence[str | Path], out: str | Path, replace: bool = False, **options: Any
 ) -> ImportReport:
-    """Make a data set of signal strengths from tables as people have them.
+    r"""Make a data set of signal strengths from tables as people have them.
 
     A table has a column for each receiver, or a row for each reading with an id and a strength. Readings of a receiver
     at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
@@ -95,7 +95,7 @@ def import_measurements(
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
     >>> rows = ["x,y,bssid,rssi", "0,0,hall,-50", "0,0,hall,-52", "2,0,hall,-60", "2,0,attic,-71"]
-    >>> _ = (folder / "scans.csv").write_text("\\n".join(rows))
+    >>> _ = (folder / "scans.csv").write_text("\n".join(rows))
     >>> report = import_measurements(folder / "scans.csv", folder / "office")
     >>> [receiver.name for receiver in report.record.receivers]
     ['hall', 'attic']
@@ -175,9 +175,10 @@ class _Import:
         is_test = np.repeat([number >= len(files) for number in range(len(paths))], rows)
         table = joined(tables)
         for name, text in options.where.items():
-            rows = table.where(name, text)
-            self.notes.append(f"{np.count_nonzero(~rows)} rows are left out: their {one_line(name)} is not {text}")
-            table, is_test = dataclasses.replace(table, frame=table.frame[rows]), is_test[rows]
+            chosen_rows = table.where(name, text)
+            left_out = len(table) - np.count_nonzero(chosen_rows)
+            self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
+            table, is_test = dataclasses.replace(table, frame=table.frame[chosen_rows]), is_test[chosen_rows]
         return table, is_test
 
     def _positions(self) -> tuple[LocalFrame, FloatArray]:
@@ -224,9 +225,8 @@ class _Import:
             if not table.frame[of["run"]].isna().any() and (runs != "").all():
                 conditions["run"] = runs
         if "frequency" in of and not self.options.frequency_hz:
-            carriers_hz = _hertz(finite_columns(table, [of["frequency"]])[:, 0], self.columns.unit("frequency"))
             self.units["frequency"] = "-> Hz"
-            conditions |= self._carriers(carriers_hz, readings)
+            conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
         return conditions
 
     def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
@@ -325,12 +325,14 @@ def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
     return np.isin(words, TEST_WORDS)
 
 
-def _hertz(values: FloatArray, unit: str) -> FloatArray:
+def _hertz(table: Table, column: str) -> FloatArray:
     """Carriers in Hz, from the unit of their column or else by their size."""
-    if unit in HERTZ:
-        return values * HERTZ[unit]
+    values = finite_columns(table, [column])[:, 0]
+    if (wrong := values <= 0).any():
+        row = int(np.argmax(wrong))
+        raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
     largest = values.max()
-    return values * (1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
+    return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
 
 
 def _reciprocity(columns: Columns) -> list[str]:

@@ -155,7 +155,7 @@ def finite_columns(table: Table, names: Sequence[str]) -> FloatArray:
     values = np.column_stack([table.numbers(name) for name in names])
     if len(empty := np.argwhere(~np.isfinite(values))):
         row, column = (int(index) for index in empty[0])
-        raise table.fault(f"{one_line(names[column])} is empty; give the position, or remove the row", row)
+        raise table.fault(f"{one_line(names[column])} is empty or infinite; give a number, or remove the row", row)
     return values
 
 

@@ -142,11 +142,15 @@ def _stated_positions(table: Table, frame: LocalFrame, units: str, height_m: flo
 def _position_notes(
     table: Table, ids: Sequence[str], positions: FloatArray, stated: Sequence[str], height_m: float | None
 ) -> list[str]:
-    notes = [] if height_m is None else [f"no column z: receivers are {height_m:g} m above the floor"]
-    if unknown := [name for name, place in zip(ids, positions, strict=True) if np.isnan(place).any()]:
-        notes.append(f"{len(unknown)} of {len(ids)} receivers have no position: {listed(unknown)}")
-    if other := [name for name in stated if name not in ids]:
-        notes.append(f"{len(other)} receivers are not in the measurements: {listed(other)}")
+    used = {*named_columns(list(table.frame.columns), {}).values(), "id"}
+    is_unknown = np.isnan(positions).any(axis=1)
+    groups = {
+        "columns that are not used": [name for name in table.frame.columns if name not in used],
+        "receivers without position": [name for name, unknown in zip(ids, is_unknown, strict=True) if unknown],
+        "receivers that are not in the measurements": sorted(set(stated) - set(ids)),
+    }
+    notes = [f"{len(names)} {what}: {listed(names)}" for what, names in groups.items() if names]
+    notes += [] if height_m is None else [f"no column z: receivers are {height_m:g} m above the floor"]
     return [f"{table.files[0][0].name}: {note}" for note in notes]
 
 
