@@ -115,7 +115,7 @@ def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
     if match == "point":
         values, positions = values.assign(point=range(30)), positions.assign(point=range(30))[::-1]
     if match == "time":
-        values = values.assign(time=np.arange(30) + 0.5)[:-1]
+        values = values.assign(time=np.arange(30) + 0.5)  # the last row is after all positions
         positions = positions.assign(time=np.arange(30))
     positions.to_csv(tmp_path / "positions.csv", index=False, header=header)
     values.to_csv(tmp_path / "values.csv", index=False, header=header)
@@ -124,6 +124,28 @@ def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
     expected = (PLACES_M[1:] + PLACES_M[:-1]) / 2 if match == "time" else PLACES_M
     assert len(record) == len(expected)
     assert max(np.linalg.norm(record.tx_pos_m[:, :2] - place, axis=1).min() for place in expected) < 1e-5
+
+
+def test_positions_in_the_names_of_cells(tmp_path: Path) -> None:
+    cells = [f"L{floor}-{x}-{y}" for floor, x, y in zip([4, 5] * 15, range(30), range(30, 60), strict=True)]
+    frame = wide().drop(columns=["x", "y"]).assign(Cid=cells)
+    record = imported(tmp_path, frame, columns="cell=Cid", pitch_m=2.0, storey_m=4.0)
+    order = np.argsort(record.tx_pos_m[:, 0])
+    expected = np.column_stack(
+        [2.0 * np.arange(30), 2.0 * np.arange(30, 60), TAG_HEIGHT_M + 4.0 * np.array([4, 5] * 15)]
+    )
+    np.testing.assert_allclose(record.tx_pos_m[order], expected)
+    frame.assign(Cid="L4").to_csv(tmp_path / "table.csv", index=False)
+    with pytest.raises(InputError, match="row 1: Cid is 'L4'; give a text with the numbers x and y"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", columns="cell=Cid")
+
+
+def test_times_of_another_unit_are_refused(tmp_path: Path) -> None:
+    wide().drop(columns=["x", "y"]).assign(time=1000 * np.arange(30)).to_csv(tmp_path / "table.csv", index=False)
+    positions = pandas.DataFrame(PLACES_M, columns=["x", "y"]).assign(time=np.arange(30))
+    positions.to_csv(tmp_path / "positions.csv", index=False)
+    with pytest.raises(InputError, match="row 2: its time is outside those of positions.csv, as those of 29 rows are"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "data", positions=[tmp_path / "positions.csv"])
 
 
 def test_further_columns_are_kept(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ NAMES = {
     "frequency": "frequency|freq|carrier|carrierfrequency|centerfreq|centrefrequency",
 }
 """Names of columns, in small letters without units, blanks and marks."""
-MEANINGS = (*NAMES, "id", "rssi")
+MEANINGS = (*NAMES, "id", "rssi", "cell")
 QUANTITIES = ("rtt", "range", "distance", "dist", "tof", "rsrq", "snr", "sinr", "std", "count", "variance", "noise")
 """Words of columns that hold another quantity of a receiver; the first five are a length or a time."""
 RANGES = QUANTITIES[:4]

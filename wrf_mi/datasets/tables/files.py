@@ -129,8 +129,10 @@ def joined(tables: list[Table]) -> Table:
     first = tables[0]
     if len(tables) == 1:
         return first
-    frame = package("pandas").concat([table.frame for table in tables], ignore_index=True)
     files = tuple(file for table in tables for file in table.files)
+    starts = np.cumsum([0, *(rows for _, rows in files)])  # numbers of rows count those that were left out
+    frames = [table.frame.set_axis(table.frame.index + start) for table, start in zip(tables, starts, strict=False)]
+    frame = package("pandas").concat(frames)
     _check_size(files[-1][0], len(frame), frame.shape[1])
     return Table(frame, files, tuple(note for table in tables for note in table.notes), first.has_header)
 

@@ -34,7 +34,7 @@ from .places import (
     plane_columns,
     unit_scale,
 )
-from .positions_file import receiver_positions, with_positions
+from .positions_file import receiver_positions, with_cells, with_positions
 from .readings import (
     Means,
     Readings,
@@ -120,6 +120,8 @@ class _Import:
         stated = options.columns
         self.stated = parsed_columns(stated) if isinstance(stated, str) else dict(stated)
         self.table, self.is_test = self._read(files)
+        if "cell" in self.stated:
+            self.table = with_cells(self.table, self.stated["cell"])
         self.notes += self.table.notes
         self.columns = find_columns(self.table, self.stated, options.receivers)
         self.units: dict[str, str] = {}

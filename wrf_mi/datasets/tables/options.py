@@ -20,8 +20,9 @@ class ImportOptions:
     """Options of `import_measurements`, by default guessed from the tables.
 
     Attributes:
-        columns: columns by meaning (x, y, z, lat, lon, floor, heading, time, run, split, frequency, id, rssi), a
-            mapping or text such as ``"x=X,y=Y"``; ``-`` for a column: there is none.
+        columns: columns by meaning (x, y, z, lat, lon, floor, heading, time, run, split, frequency, id, rssi, or cell,
+            whose texts end with the numbers floor, x and y, as L4-31-2), a mapping or text such as ``"x=X,y=Y"``; the
+            name ``-``: there is none.
         receivers: patterns of the columns of strengths of a wide table, such as ``"AP* RSS(dBm)"``.
         test: files with the test rows.
         positions: files with the positions of the rows, one for each file (test files last) or one for all.

@@ -17,6 +17,7 @@ from .files import Table, package
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
 from .readings import listed, normal_id
 
+MOST_OUTSIDE = 0.5  # share of rows outside the time of the positions above which the times are not in one unit
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
 
 
@@ -38,7 +39,7 @@ def with_positions(values: Table, positions: Table, stated: Mapping[str, str]) -
     if shared and values.has_header and positions.has_header:
         return _looked_up(values, positions, shared[0], new), f"by the column {one_line(shared[0])}"
     if time and other_time:
-        return _interpolated(values, time, positions, other_time, new), "by time, linear between positions"
+        return _interpolated(values, time, positions, other_time, new)
     return _row_by_row(values, positions, new), "row by row"
 
 
@@ -73,15 +74,34 @@ def _looked_up(values: Table, positions: Table, key: str, new: Sequence[str]) ->
     return replace(values, frame=frame)
 
 
-def _interpolated(values: Table, time: str, positions: Table, other: str, new: Sequence[str]) -> Table:
+def _interpolated(values: Table, time: str, positions: Table, other: str, new: Sequence[str]) -> tuple[Table, str]:
     at, known = seconds(values, time), seconds(positions, other)
-    outside = np.flatnonzero(~((at >= np.nanmin(known)) & (at <= np.nanmax(known))))
-    if len(outside):
-        what = f"its time is outside those of {positions.files[0][0].name}, as those of {len(outside)} rows are"
-        raise values.fault(f"{what}; remove such rows, or give their positions", int(outside[0]))
+    within = (at >= np.nanmin(known)) & (at <= np.nanmax(known))
+    outside = len(at) - np.count_nonzero(within)
+    if outside > MOST_OUTSIDE * len(at):
+        what = f"its time is outside those of {positions.files[0][0].name}, as those of {outside} rows are"
+        raise values.fault(f"{what}; give both in one unit and time zone", int(np.argmin(within)))
     order = np.argsort(known, kind="stable")
     columns = {name: np.interp(at, known[order], positions.numbers(name)[order]) for name in new}
-    return replace(values, frame=values.frame.assign(**columns))
+    text = "by time, linear between positions" + (
+        f"; {outside} rows before or after them are left out" if outside else ""
+    )
+    return replace(values, frame=values.frame.assign(**columns)[within]), text
+
+
+def with_cells(table: Table, column: str) -> Table:
+    """A table with the columns x, y, and floor if it is stated, from the last numbers in the texts of a column."""
+    if column not in table.frame:
+        raise DataFault(table.files[0][0], f"no column {one_line(column)}; correct --columns", line=1)
+    numbers = table.frame[column].astype(str).str.findall(r"\d+")
+    count = int(numbers.str.len().min())
+    if count < 2:
+        row = int(np.argmin(numbers.str.len()))
+        text = f"{one_line(column)} is {str(table.frame[column].iloc[row])[:40]!r}"
+        raise table.fault(f"{text}; give a text with the numbers x and y, such as L4-31-2", row)
+    names = ["floor", "x", "y"][-count:]
+    columns = {name: numbers.str[place - len(names)].astype(float) for place, name in enumerate(names)}
+    return replace(table, frame=table.frame.assign(**columns))
 
 
 def seconds(table: Table, column: str) -> FloatArray:
@@ -143,7 +163,7 @@ def _position_notes(
     table: Table, ids: Sequence[str], positions: FloatArray, stated: Sequence[str], height_m: float | None
 ) -> list[str]:
     used = {*named_columns(list(table.frame.columns), {}).values(), "id"}
-    is_unknown = np.isnan(positions).any(axis=1)
+    is_unknown = np.isnan(positions[:, 0])
     groups = {
         "columns that are not used": [name for name in table.frame.columns if name not in used],
         "receivers without position": [name for name, unknown in zip(ids, is_unknown, strict=True) if unknown],
