@@ -168,8 +168,9 @@ def summary(record: Record) -> dict[str, Any]:
     """Summary of a record in plain values; None: not stated.
 
     ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
-    training and test rows, ``frequencies_hz`` the carrier or the subcarriers, ``carriers_hz`` rows by carrier,
-    ``runs`` rows by run, ``n_readings`` and ``std_db`` minimum, median and maximum.
+    training and test rows, ``folds`` rows by spatial fold, ``frequencies_hz`` the carrier or the subcarriers,
+    ``carriers_hz`` rows by carrier, ``receiver_carriers_hz`` carriers by receiver, ``antennas`` patterns and
+    polarisations of receivers, ``runs`` rows by run, ``n_readings`` and ``std_db`` minimum, median and maximum.
 
     Raises:
         InputError: parts of the record that do not fit together.
@@ -182,7 +183,7 @@ def summary(record: Record) -> dict[str, Any]:
     if record.carriers_hz is not None:
         hz, rows = np.unique(record.carriers_hz, return_counts=True)
         carriers = dict(zip(hz.tolist(), rows.tolist(), strict=True))
-    runs = None
+    runs, hz_of = None, record.receiver_carriers_hz
     if record.runs is not None:
         names, first, rows = np.unique(record.runs, return_index=True, return_counts=True)
         runs = {str(names[k]): int(rows[k]) for k in np.argsort(first)}
@@ -196,6 +197,9 @@ def summary(record: Record) -> dict[str, Any]:
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
         "carriers_hz": carriers,
+        "receiver_carriers_hz": None if hz_of is None else {r.name: r.frequency_hz for r in record.receivers},
+        "folds": None if record.folds is None else np.bincount(record.folds).tolist(),
+        "antennas": sorted({f"{r.antenna.pattern} {r.antenna.polarization}" for r in record.receivers}),
         "runs": runs,
         "n_readings": _range(record.n_readings, received),
         "std_db": _range(record.std, received),
@@ -211,8 +215,12 @@ def render(facts: dict[str, Any]) -> str:
     shape = " x ".join(map(str, facts["observation"])) or "one number"
     received = ", ".join(f"{name} {count}" for name, count in facts["receivers"].items())
     official = "{} training rows, {} test rows".format(*facts["official"]) if facts["official"] else "not stated"
+    if facts["folds"]:
+        official += f"; {len(facts['folds'])} spatial folds of {', '.join(map(str, facts['folds']))} rows"
     carriers, frequencies = facts["carriers_hz"], facts["frequencies_hz"]
-    if carriers is not None:
+    if facts["receiver_carriers_hz"]:
+        carrier = ", ".join(f"{name} {hz:.10g} Hz" for name, hz in facts["receiver_carriers_hz"].items())
+    elif carriers is not None:
         carrier = carriers_text(np.array(list(carriers)))
         if len(carriers) <= SHOWN_CARRIERS:
             carrier = ", ".join(f"{hz:.10g} Hz in {rows} rows" for hz, rows in carriers.items())
@@ -228,6 +236,7 @@ def render(facts: dict[str, Any]) -> str:
         "received": received,
         "official split": official,
         "carrier": carrier,
+        "antennas": ", ".join(facts["antennas"]),
         "runs": "not stated" if facts["runs"] is None else ", ".join(f"{k} {n}" for k, n in facts["runs"].items()),
         "readings per row": _shown(facts["n_readings"], ""),
         "noise": _shown(facts["std_db"], " dB"),

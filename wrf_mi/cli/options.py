@@ -56,8 +56,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add("--evaluation", choices=get_args(EvaluationName), help=f"evaluation {text}")
     add_tracing(parser)
     folded = "blocked, frequency, frequency-known, receiver, other-run"
-    text = f"official (default), random, trajectory, or with folds in turn {folded}; one fold: blocked:K, frequency:K"
-    add("--split", help=text)
+    text = f"official, random, trajectory, or with folds in turn {folded}; one fold: blocked:K, frequency:K"
+    default = "none: folds in space for the scores, then all rows for the model (default: official, or else none)"
+    add("--split", help=f"{text}; {default}")
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")

@@ -58,6 +58,11 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
         f"{metrics['ms_per_sample']:.3g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
     )
+    if folds := metrics.get("cross_validated"):
+        print(
+            f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
+            f"{folds['folds']} folds; the model is fitted to all rows"
+        )
     if line := unbeaten(metrics):
         print(line)
     if folder is not None:

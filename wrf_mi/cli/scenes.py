@@ -90,7 +90,7 @@ def _add_correct(commands: Any) -> None:
     add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
-    add("--split", default="official", help="as for train (default: official); test rows are not used")
+    add("--split", help="as for train; test rows are not used")
     add_n_train(parser)
     add("--seed", type=int, default=0, metavar="N", help="seed of split and held-out rows (default: 0)")
     add("--replace", action="store_true", help="replace an existing scene folder")
@@ -103,6 +103,7 @@ def correct_command(a: Arguments) -> int:
     from ..correction import correct_scene, default_options, write_page
     from ..correction.options import FRAME, PLANES
     from ..datasets import make_splits
+    from ..datasets.splits import NONE, default_split
     from ..synthetic import load_record
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
@@ -116,7 +117,10 @@ def correct_command(a: Arguments) -> int:
     options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
     if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
         raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
-    splits = make_splits(record, a.split, a.seed, a.n_train)
+    name = default_split(record) if a.split is None else a.split
+    splits = make_splits(record, name, a.seed, a.n_train)
+    if name == NONE:
+        splits = splits[-1:]
     if len(splits) > 1:
         raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
     warn_of_suspicions(record)

@@ -113,7 +113,7 @@ def training_request(a: Arguments) -> RunRequest:
         model,
         settings=settings,
         antennas=AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)}),
-        split="official" if a.split is None else a.split,
+        split=a.split,
         seed=a.seed or 0,
         **{name: getattr(a, name) for name in names},
     )
@@ -193,7 +193,7 @@ def _add_trace(commands: Any) -> None:
     add("--target-error", type=float, metavar="DB", help=target)
     text = "write the traced paths as a scenario of DeepMIMO, which deepmimo.load opens (docs/data.md)"
     add("--deepmimo", metavar="FOLDER", help=text)
-    add("--split", help="as for train (default: official)")
+    add("--split", help="as for train")
     add_n_train(parser)
     add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
     add_scheduler(parser)

@@ -70,7 +70,10 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     info = attempt(read_yaml, station)
     receiver = attempt(_read_station, station, info)
     with recoverable():
-        _check_antennas(station, receiver.value, channel.value)
+        count, antennas = len(np.asarray(receiver.value.array_m)), channel.value.shape[1]
+        if count != antennas:
+            text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
+            raise DataFault(station, f"{text}; give one for each")
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
     stated = attempt(read_columns, folder / POSITIONS, AXES) if (folder / POSITIONS).exists() else None
     with recoverable():
@@ -205,12 +208,3 @@ def _read_station(path: Path, info: dict[Any, Any]) -> Receiver:
         raise DataFault(path, f"base_station is {shown(places)}; give x, y, z in metres of each antenna")
     receiver = Receiver("base-station", elements.mean(axis=0), orientation.value, antenna.value)
     return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)
-
-
-def _check_antennas(path: Path, receiver: Receiver, channel: NDArray[np.complex64]) -> None:
-    """Refuse another number of antennas than the channels have."""
-    assert receiver.array_m is not None
-    count, antennas = len(receiver.array_m), channel.shape[1]
-    if count != antennas:
-        text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
-        raise DataFault(path, f"{text}; give one for each")

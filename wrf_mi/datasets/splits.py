@@ -17,7 +17,9 @@ from ..core.types import IntArray
 
 FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")
 """Splits of several folds."""
-SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory")
+NONE = "none"
+"""Split whose last part trains on all rows and tests none; its scores are those of the folds before."""
+SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory", NONE)
 TRAIN_FRACTION = 0.8
 """Training share of ``random`` and ``trajectory``, as in the authors' split of rfid-lab (160 of 200)."""
 FOLDS = 5
@@ -39,7 +41,7 @@ def make_splits(
     n_train: int | float | None = None,
     validation_fraction: float = 0.1,
 ) -> list[Split]:
-    """Split a record's rows by one of eight rules.
+    """Split a record's rows by one of nine rules.
 
     - ``official``: the split of the data.
     - ``random``: seeded, 80 % train and 20 % test.
@@ -55,6 +57,8 @@ def make_splits(
     - ``other-run``: a split per run of the measurement, in the order of first appearance, whose test set are its rows;
       the rows of all other runs train.
     - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
+    - ``none``: the spatial folds of ``blocked``, and last all rows, which train, with none to test. Where positions are
+      not known or fewer than five are distinct, folds are a seeded draw.
 
     One fold alone is ``blocked:2``, ``frequency:0`` (the lowest carrier), ``frequency-known:0``, ``receiver:1`` or
     ``other-run:0``.
@@ -99,7 +103,7 @@ def make_splits(
 def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, validation_fraction: float) -> Split:
     what = f"{record.name}, split {rows.name}"
     for verb, part in (("trains", rows.train), ("scores", rows.test)):
-        if len(part) == 0:
+        if len(part) == 0 and (rows.name != NONE or part is rows.train):
             raise InputError(f"{what}: no row that was received {verb}; use another split")
     # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it is
     # nested in a longer one, validation rows included.
@@ -122,6 +126,11 @@ def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, 
             who = f"{record.name}: {record.receivers[receiver].name} received {count_left} of the training rows"
             raise InputError(f"{who}, and split {rows.name} leaves it {rows.left}; leave fewer")
     return Split(rows.name, seed, *parts, rows.held_receivers, left)
+
+
+def default_split(record: Record) -> str:
+    """Name of the split where none is asked for: that of the data, or else ``none``."""
+    return NONE if record.official is None else "official"
 
 
 def splits_below(record: Record, name: str) -> tuple[str, ...]:
@@ -238,6 +247,12 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
         train, test = (part[received[part]] for part in record.official)
         return [_Rows(name, train, test)]
+    if kind == NONE:
+        able = record.folds is not None or (len(np.unique(record.tx_pos_m, axis=0)) >= FOLDS and record.has_positions)
+        drawn = np.random.default_rng([seed, 8]).permutation(len(record)) % FOLDS
+        fold = (position_folds(record) if able else drawn)[rows]
+        folds = [_Rows(f"{NONE}:{k}", rows[fold != k], rows[fold == k]) for k in np.unique(fold)]
+        return [*folds, _Rows(NONE, rows, rows[:0])]
     if kind == "receiver":
         return _receivers_held_out(record, name, seed, int(left or 0))
     if kind in FOLDED:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
-from ..core import DataFault, Receiver
+from ..core import DataFault, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.files import one_line, write_csv
 from ..core.receivers import SHOWN as SHOWN_NAMES
@@ -88,6 +88,8 @@ def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
     """Signal strengths of the test rows of a run that were received, and true positions, as `read_observations`."""
     record = run.problem.record
     rows = load_rows(run.folder, record).test
+    if not len(rows):
+        raise InputError(f"{run.folder}: its split holds no rows out, which could be located; give a file of strengths")
     rows = rows[np.isfinite(record.observation[:, rows]).any(axis=0)]
     return np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float)
 

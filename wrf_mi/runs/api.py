@@ -53,7 +53,7 @@ from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
 from ..datasets import make_splits
 from ..datasets.observations import check_observations, fitted_receivers, place_of, warn_of_left_out
-from ..datasets.splits import splits_below
+from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.calibrated import WithIntervals
 from ..models.checks import check_held_receivers, check_record
@@ -101,7 +101,11 @@ def plan_run(
     settings, seed, deterministic = _settings_of(model, request), request.seed, request.deterministic
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
-    record, splits, left_out = _split_rows(record, request.split, seed, request.n_train)
+    split = default_split(record) if request.split is None else request.split
+    if request.split is None and split == NONE:
+        text = "%s: no official split, so --split none: scores are of folds held out in space, the model of all rows"
+        logger.warning(text, place_of(record))
+    record, splits, left_out = _split_rows(record, split, seed, request.n_train)
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, complete=model.complete)
@@ -109,7 +113,7 @@ def plan_run(
     checked = WithIntervals(model) if request.intervals else model
     checked.check(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
-    name = request.split.name if isinstance(request.split, Split) else request.split
+    name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
     return problem, RunConfig(request.model, source, record.task, name, request.n_train, *options), splits
 
@@ -176,7 +180,7 @@ def train(
     antennas: AntennaOptions = AS_STATED,
     receiver: str | None = None,
     evaluation: str | None = None,
-    split: str | Split = "official",
+    split: str | Split | None = None,
     n_train: int | float | None = None,
     seed: int = 0,
     settings: Settings = (),
@@ -198,7 +202,8 @@ def train(
         antennas: patterns and polarisations that override the data set; with a scene.
         receiver: ``"pixel"``, ``"array"`` or ``"auto"``, for models that have a choice.
         evaluation: evaluation of Gaussians, ``"splatted"`` or ``"traced"`` (`wrf_mi.graph.evaluations`).
-        split: name of a split (``blocked`` fits every fold in turn and pools the scores), or the rows themselves.
+        split: name of a split (``blocked`` fits every fold in turn and pools the scores; ``none`` then fits all rows),
+            or the rows themselves; None: ``official``, or ``none`` where the data have no split.
         n_train: number or fraction of the training rows to use; None: all.
         seed: seed of split and fit.
         settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
@@ -302,7 +307,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(Part(part, rows, *load_fitted(config, problem, part)))
-        scores.append(score_part(folder, config, problem, parts[-1]))
+        if len(rows.test):
+            scores.append(score_part(folder, config, problem, parts[-1]))
     score_run(folder, config, parts, scores)
 
 
@@ -328,7 +334,8 @@ def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = 
     parts = [Part(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
     if split is not None:
         return score_other(config, problem, parts[0], split)
-    return score_run(run.folder, config, parts, [score_part(run.folder, config, problem, part) for part in parts])
+    scores = [score_part(run.folder, config, problem, part) for part in parts if len(part.split.test)]
+    return score_run(run.folder, config, parts, scores)
 
 
 __all__ = ["Interrupted", "Run", "evaluate_run", "open_run", "plan_run", "predict_to_file", "resume", "train"]

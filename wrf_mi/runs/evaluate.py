@@ -41,6 +41,8 @@ NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
+CROSS_VALIDATED = "cross_validated"
+"""Key of the folds that the scores are of, where the model of the run was fitted to all rows."""
 SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")  # arrays of ``predictions.npz`` without an axis of receivers
 REPEATS = 20  # largest number of single predictions that are timed
 MOST_OF_STAGES = 400  # test rows by which the stages of a fit are scored
@@ -175,8 +177,18 @@ def score_part(run: Path, config: RunConfig, problem: Problem, part: Part) -> Sc
 
 
 def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Sequence[Scores]) -> dict[str, Any]:
-    """Write ``metrics.json`` and ``predictions.npz`` of a run from its parts' scores; return the metrics."""
+    """Write ``metrics.json`` and ``predictions.npz`` of a run from the scores of its parts that have test rows.
+
+    Returns:
+        The metrics. With a part that trains on all rows ``n_train`` is their number, and ``cross_validated`` states the
+        folds of the scores: ``folds`` and their mean ``n_train``.
+    """
     metrics, arrays = scores[0] if len(scores) == 1 else pool(scores)
+    final = parts[-1]
+    if not len(final.split.test):
+        parts = [final, *parts[:-1]]  # the model of the run, whose facts come first
+        metrics[CROSS_VALIDATED] = {"folds": len(scores), "n_train": metrics["n_train"]}
+        metrics["n_train"] = len(final.split.all_train)
     merged = _header(run, config, parts) | metrics
     write_results(run, merged, arrays)
     return merged

@@ -6,9 +6,9 @@
     metrics.json     scores
     predictions.npz  predictions of the test rows, with their truth
 
-With several splits ``fold0``, ... are each such a folder, and their parent pools the scores. A model may write
-further files: ``checkpoint.npz`` until its training has ended, ``log.jsonl``, ``paths.npz`` of the ray tracer,
-``operator0.npz``. Files are written atomically.
+With several splits ``fold0``, ... are each such a folder, and their parent pools the scores; with the split ``none``
+the parent holds the model of all rows, too. A model may write further files: ``checkpoint.npz`` until its training has
+ended, ``log.jsonl``, ``paths.npz`` of the ray tracer, ``operator0.npz``. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class RunRequest:
     antennas: AntennaOptions = AS_STATED
     receiver: str | None = None
     evaluation: str | None = None
-    split: str | Split = "official"
+    split: str | Split | None = None
     n_train: int | float | None = None
     seed: int = 0
     settings: Settings = ()
@@ -220,15 +220,15 @@ def write_configs(folder: Path, config: RunConfig, splits: Sequence[Split]) -> N
 
 
 def _folders(folder: Path, splits: Sequence[Split]) -> list[tuple[Path, Split]]:
-    """Folder of each split: a single one in the run folder, several in ``fold0``, ..."""
-    if len(splits) == 1:
-        return [(folder, splits[0])]
-    return [(folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
+    """Folder of each split: one alone, or without test rows, in the run folder, others in ``fold0``, ..."""
+    alone = len(splits) == 1
+    return [(folder if alone or not len(rows.test) else folder / f"fold{k}", rows) for k, rows in enumerate(splits)]
 
 
 def run_parts(folder: Path) -> list[Path]:
-    """Folders of a run that hold a split: the run folder, or those of its folds."""
-    return [folder] if (folder / SPLIT).exists() else sorted(folder.glob("fold*"), key=lambda p: (len(p.name), p.name))
+    """Folders of a run that hold a split: those of its folds, and the run folder unless it only pools their scores."""
+    folds = sorted(folder.glob(f"fold*/{SPLIT}"), key=lambda path: (len(path.parent.name), path.parent.name))
+    return [path.parent for path in folds] + ([folder] if (folder / SPLIT).exists() else [])
 
 
 def is_finished(folder: Path) -> bool:

@@ -134,7 +134,7 @@ def hold_out(record: Record, split: Split) -> Split | None:
     if len(rows) < 3 or len(np.unique(positions, axis=0)) < 2:
         return None
     carriers = record.carriers_hz
-    if carriers is not None and not np.isin(carriers[split.test], carriers[rows]).any():
+    if carriers is not None and len(split.test) and not np.isin(carriers[split.test], carriers[rows]).any():
         return _without_carrier(record.tx_pos_m, carriers, split)
     groups = hold_out_groups(split, record.tx_pos_m)
     out = groups.validation

@@ -1,0 +1,170 @@
+"""The split ``none``: scores of folds, a model of all rows, and what commands do with such a run."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import call, refused, stored
+from made_channels import channels
+
+from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import load, make_splits, write_ble_folder
+from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
+
+
+@pytest.fixture(scope="module")
+def strengths(flat_folder: Path) -> Record:
+    """Signal strengths without an official split."""
+    return replace(load(flat_folder), official=None)
+
+
+@pytest.fixture(scope="module")
+def table(strengths: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_ble_folder(tmp_path_factory.mktemp("data") / "office", strengths)
+
+
+@pytest.fixture(scope="module")
+def run(table: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(table, tmp_path_factory.mktemp("runs") / "run", "kriging", split="none").folder
+
+
+def test_all_rows_train_and_each_is_tested_once(strengths: Record):
+    *folds, final = make_splits(strengths, "none")
+    rows = np.arange(len(strengths))
+    np.testing.assert_array_equal(np.sort(np.concatenate([fold.test for fold in folds])), rows)
+    np.testing.assert_array_equal(final.all_train, rows)
+    assert (final.name, len(final.test)) == ("none", 0)
+    for fold, blocked in zip(folds, make_splits(strengths, "blocked"), strict=True):
+        np.testing.assert_array_equal(fold.test, blocked.test)
+        np.testing.assert_array_equal(fold.validation, blocked.validation)
+
+
+def test_folds_are_drawn_where_space_has_none():
+    for record in (channels(positions=False), replace(channels(), tx_pos_m=np.ones((30, 3)))):
+        *folds, final = make_splits(record, "none")
+        assert [len(fold.test) for fold in folds] == [6] * 5
+        assert len(final.all_train) == 30
+    few = replace(channels(), tx_pos_m=np.ones((1, 3)), observation=channels().observation[:, :1], official=None)
+    with pytest.raises(InputError, match=r"split none:\d: no row that was received trains"):
+        make_splits(few, "none")
+
+
+def test_scores_are_those_of_blocks_and_the_model_that_of_all_rows(table: Path, run: Path, tmp_path: Path):
+    record, metrics = load(table), open_run(run).metrics
+    blocked = train(table, tmp_path / "blocked", "kriging", split="blocked").metrics
+    assert metrics["abs_error_db"] == blocked["abs_error_db"]
+    assert metrics["reference"] == blocked["reference"]
+    assert metrics["cross_validated"] == {"folds": 5, "n_train": blocked["n_train"]}
+    assert (metrics["n_train"], metrics["n_test"], metrics["split"]) == (len(record), len(record), "none")
+    # The same training rows, with a further row to score.
+    twice, final = np.append(np.arange(len(record)), 0), make_splits(record, "none")[-1]
+    longer = replace(record, tx_pos_m=record.tx_pos_m[twice], tx_heading_rad=np.asarray(record.tx_heading_rad)[twice])
+    longer = replace(longer, observation=record.observation[:, twice])
+    split = replace(final, test=np.array([len(record)]))
+    everything = train(longer, tmp_path / "all", "kriging", split=split)
+    place = [[1.0, 2.0, 1.3]], 1, [0.5]
+    np.testing.assert_array_equal(open_run(run).predict(*place).mean, everything.predict(*place).mean)
+
+
+def test_it_is_the_default_of_data_without_a_split(table: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.WARNING, "wrf_mi"):
+        metrics = train(table, tmp_path / "run", "idw").metrics
+    assert metrics["split"] == "none"
+    assert f"{table}: no official split, so --split none: scores are of folds held out in space" in caplog.text
+    with pytest.raises(InputError, match="has no official split"):
+        train(table, tmp_path / "official", "idw", split="official")
+
+
+@pytest.mark.parametrize("model", ["trees", "mri", "wrf-gs+", "hybrid"])
+def test_models_of_strengths(model: str, strengths: Record, tmp_path: Path):
+    few = {"wrf-gs+": ("steps=20", "initial.gaussians=50", "patience=0"), "trees": ("trees=10",)}.get(model, ())
+    if model == "hybrid":
+        few = ("stages=residual",)
+    made = train(strengths, tmp_path / "run", model, split="none", settings=few)
+    headings = [0.1, 0.2] if made.takes_heading else None
+    assert np.isfinite(made.predict([[1, 2, 1.3], [2, 2, 1.3]], 0, headings).mean).all()
+    assert made.metrics["n_test"] == len(strengths)
+
+
+@pytest.mark.parametrize("model", ["wrf-gs+", "idw"])
+def test_models_of_spectra(model: str, one_gateway: Record, tmp_path: Path):
+    few = ("steps=10", "initial.gaussians=40", "patience=0") if model == "wrf-gs+" else ()
+    made = train(one_gateway, tmp_path / "run", model, split="none", settings=few)
+    assert made.predict(one_gateway.tx_pos_m[:2]).mean.shape == (2, *one_gateway.observation.shape[2:])
+    assert made.metrics["cross_validated"]["folds"] >= 2
+
+
+@pytest.mark.parametrize("model", ["linear", "kriging"])
+def test_models_of_channels(model: str, tmp_path: Path):
+    record = channels()
+    made = train(record, tmp_path / "run", model, split="none")
+    assert made.predict(uplink=record.uplink[:2], tx_pos_m=record.tx_pos_m[:2]).mean.shape == (2, 3, 4)
+
+
+def test_ray_tracing_keeps_the_paths_of_each_part(room: Path, strengths: Record, tmp_path: Path):
+    made = train(strengths, tmp_path / "run", "ray-tracing", scene=room, split="none", settings=["depth=1"])
+    assert np.isfinite(made.predict([[1, 2, 1.3]]).mean).all()
+    scores = evaluate_run(made.folder)
+    assert scores["abs_error_db"] == made.metrics["abs_error_db"]
+
+
+def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    tx, heard = tmp_path / "tx.csv", tmp_path / "heard.csv"
+    tx.write_text("x,y,z,heading_rad\n1,2,1.3,0\n")
+    heard.write_text("rssi_1,rssi_2\n-60,-70\n")
+    commands: list[list[Any]] = [
+        ["evaluate", run],
+        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
+        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
+        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
+        ["compare", run, "--out", tmp_path / "page"],
+        ["view", run, "--out", tmp_path / "view.html"],
+    ]
+    for command in commands:
+        status, out, err = call(command, capsys)
+        assert status == 0, (command, err)
+        assert ("scores are cross-validated: each row" in out) == (command[0] == "evaluate")
+    refused(["evaluate", run, "--split", "random"], "every row is held out in one of its folds; omit --split", capsys)
+    refused(
+        ["locate", run, "--step", "1", "--out", tmp_path / "test.csv"],
+        "its split holds no rows out, which could be located",
+        capsys,
+    )
+
+
+def test_scored_again_as_before(run: Path):
+    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
+    metrics = evaluate_run(run)
+    timed = {"ms_per_sample"}
+    assert {k: v for k, v in metrics.items() if k not in timed} == {k: v for k, v in before.items() if k not in timed}
+    for name, values in stored(run).items():
+        np.testing.assert_array_equal(values, arrays[name], name)
+
+
+def test_a_stopped_run_goes_on(strengths: Record, tmp_path: Path):
+    fractions = list[float]()
+
+    def stop() -> bool:
+        return len(fractions) > 4
+
+    settings = ("stages=residual",)
+    with pytest.raises(Interrupted):
+        train(
+            strengths,
+            tmp_path / "run",
+            "hybrid",
+            split="none",
+            settings=settings,
+            stop=stop,
+            on_progress=lambda stage, share, progress=None: fractions.append(share),
+        )
+    assert not (tmp_path / "run" / "metrics.json").exists()
+    resumed = resume(tmp_path / "run", record=strengths)
+    plain = train(strengths, tmp_path / "plain", "hybrid", split="none", settings=settings)
+    assert resumed.metrics["abs_error_db"] == plain.metrics["abs_error_db"]
