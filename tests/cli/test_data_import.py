@@ -35,7 +35,7 @@ def test_import_states_columns_assumptions_and_the_next_command(
         assert line in out
     assert "projected to metres east and north" in out
     assert "by reciprocity" in out
-    assert f"{folder}: no fault, no suspicion\nnext: wrf-mi train {folder} --split blocked\n" in out
+    assert f"{folder}: no fault, no suspicion\nnext: wrf-mi train {folder}\n" in out
     assert {"import.yml", "plan.png"} < contents(folder)
     refused(["data", "import", tmp_path / "drive.csv", "--out", folder], "campus: exists; remove it", capsys)
     status, out, _ = call(["data", "import", tmp_path / "drive.csv", "--out", folder, "--replace", "--json"], capsys)

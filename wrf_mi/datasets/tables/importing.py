@@ -311,7 +311,9 @@ class _Import:
     def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
         """The record with its official split, if test rows are stated."""
         if not is_test.any() or is_test.all():
-            self.notes.append("no test rows are stated: train --split blocked or random holds rows out")
+            self.notes.append(
+                "no test rows are stated: train scores folds in space, then fits all rows (--split none, the default)"
+            )
             return record
         official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
         self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")

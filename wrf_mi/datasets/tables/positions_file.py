@@ -83,10 +83,8 @@ def _interpolated(values: Table, time: str, positions: Table, other: str, new: S
         raise values.fault(f"{what}; give both in one unit and time zone", int(np.argmin(within)))
     order = np.argsort(known, kind="stable")
     columns = {name: np.interp(at, known[order], positions.numbers(name)[order]) for name in new}
-    text = "by time, linear between positions" + (
-        f"; {outside} rows before or after them are left out" if outside else ""
-    )
-    return replace(values, frame=values.frame.assign(**columns)[within]), text
+    text = f"; {outside} rows before or after them are left out" if outside else ""
+    return replace(values, frame=values.frame.assign(**columns)[within]), f"by time, linear between positions{text}"
 
 
 def with_cells(table: Table, column: str) -> Table:
