@@ -66,9 +66,14 @@ def table_text(table: Table) -> str:
     return f"{table.name} has the columns {_listed(table.header)}{kind}; {TABLE}: {remedy}"
 
 
+def name_words(name: str) -> set[str]:
+    """Words of a column's name in small letters, also those of ``anchorId``."""
+    return {*re.findall("[a-z]+", name.lower()), *map(str.lower, re.findall("[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name))}
+
+
 def long_columns(header: Sequence[str]) -> tuple[str, str] | None:
     """Columns of receivers and of strengths in a table with a row for each reading, or None."""
-    words = {column: set(re.findall("[a-z]+", column.lower())) for column in header}
+    words = {column: name_words(column) for column in header}
     strengths = [column for column, parts in words.items() if parts & STRENGTH]
     receivers = [column for word in RECEIVER for column, parts in words.items() if word in parts]
     receivers = [column for column in receivers if column not in strengths]

@@ -191,7 +191,7 @@ def test_receivers_heard_too_rarely_are_left_out_by_name(tmp_path: Path) -> None
 
 
 def test_pitch_heading_carrier_run_and_storeys(tmp_path: Path) -> None:
-    frame = wide().assign(x=range(30), y=0, floor=[0, 2] * 15, heading=90, frequency_mhz=920, run="monday")
+    frame = wide().assign(x=range(30), y=0, floor=["L0", "L2"] * 15, heading=90, frequency_mhz=920, run="monday")
     record = imported(tmp_path, frame, pitch_m=0.6)
     np.testing.assert_allclose(np.sort(record.tx_pos_m[:, 0]), 0.6 * np.arange(30))
     assert set(record.tx_pos_m[:, 2].tolist()) == {TAG_HEIGHT_M, TAG_HEIGHT_M + 6.0}
@@ -208,6 +208,7 @@ REFUSED = {
     ),
     "no position": (lambda f: f.drop(columns="x"), {}, "no columns of positions among .*--positions FILE"),
     "carrier": (lambda f: f.assign(frequency=0), {}, "row 1: frequency is 0; give the carrier, or --columns"),
+    "floor": (lambda f: f.assign(floor="ground"), {}, "row 1: floor is 'ground'; give its number, or leave"),
     "split": (lambda f: f.assign(split="maybe"), {}, "row 1: split is 'maybe'; give train or test"),
     "nothing heard": (lambda f: f, {"not_heard": STRENGTHS.ravel().tolist()}, "no reading was heard"),
     "rarely heard": (lambda f: f, {"min_heard": 99}, "no receiver was heard in 99 training rows"),

@@ -23,6 +23,7 @@ LONG = {
     "PCI,latitude,longitude,device,rsrp": ("C,36.004,-78.93,Samsung,-124", "PCI", "rsrp"),
     "timestamp,lat,lon,pci,rsrp,rsrq": ("0,51.1,4.4,17,-110,-12", "pci", "rsrp"),
     "bssid,ssid,level,frequency,x,y": ("aa:bb:cc:00:00:01,net,-60,2412,1,2", "bssid", "level"),
+    "t,anchorId,RSSI_dBm,posX,posY": ("1,7,-70,1,2", "anchorId", "RSSI_dBm"),
     "time,mac,rssi,x,y": ("1,aa:bb:cc:00:00:01,-70,1,2", "mac", "rssi"),
 }
 

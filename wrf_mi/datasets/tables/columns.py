@@ -11,13 +11,14 @@ import numpy as np
 
 from ...core import DataFault, InputError
 from ...core.files import one_line
-from ..unknown import STRENGTH, long_columns
+from ..unknown import STRENGTH, long_columns, name_words
 from .files import Table
 
+AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
+"""Words before or after x, y and z in names of coordinates."""
+AXES = {"x": "|easting|east|ecoord", "y": "|northing|north|ncoord", "z": "|height"}
 NAMES = {
-    "x": "x|xm|xcoord|xcoordinate|coordx|coordinatex|posx|positionx|locx|locationx|px|gtx|truex|easting|east|ecoord",
-    "y": "y|ym|ycoord|ycoordinate|coordy|coordinatey|posy|positiony|locy|locationy|py|gty|truey|northing|north|ncoord",
-    "z": "z|zm|zcoord|zcoordinate|coordz|coordinatez|posz|positionz|locz|locationz|pz|gtz|truez|height",
+    **{axis: "|".join(f"{affix}{axis}|{axis}{affix}" for affix in AFFIXES) + other for axis, other in AXES.items()},
     "lat": "lat|latitude|gpslat|gpslatitude",
     "lon": "lon|lng|long|longitude|gpslon|gpslongitude",
     "floor": "floor|floorid|floornumber|storey|level",
@@ -135,7 +136,7 @@ def _long_columns(names: Sequence[str], of: Mapping[str, str]) -> dict[str, str]
 
 def _is_free(name: str, of: Mapping[str, str]) -> bool:
     """Whether a column may name the receivers of a long table or hold its strengths."""
-    if "rssi" in of and _words(name) & STRENGTH:
+    if "rssi" in of and name_words(name) & STRENGTH:
         return False
     # "level" is a strength in tables of Android and a storey elsewhere.
     return name not in of.values() or _plain(name) == "level"
@@ -144,7 +145,7 @@ def _is_free(name: str, of: Mapping[str, str]) -> bool:
 def _wide_columns(table: Table, names: Sequence[str], patterns: Sequence[str]) -> list[str]:
     """Columns of strengths: those of patterns, with words such as RSSI, or with values in dBm."""
     matching = [name for name in table.frame.columns if _in_pattern(name, patterns)]
-    named = [name for name in names if _words(name) & STRENGTH and not _words(name) & set(QUANTITIES)]
+    named = [name for name in names if name_words(name) & STRENGTH and not name_words(name) & set(QUANTITIES)]
     chosen = matching if patterns else named or _by_values(table, names)
     if not chosen:
         text = f"no column of signal strengths among {shown_names(list(table.frame.columns))}"
@@ -158,7 +159,7 @@ def _sort_others(table: Table, columns: Columns) -> None:
     ids = {*columns.strengths.values()} if columns.strengths else {""}
     used = {*columns.of.values(), *columns.strengths}
     for name in table.frame.columns.drop(list(used)):
-        quantity = next((word for word in QUANTITIES if word in _words(name)), None)
+        quantity = next((word for word in QUANTITIES if word in name_words(name)), None)
         receiver = _receiver_id(name) if columns.strengths else ""
         if quantity and receiver in ids and table.is_numeric(name):
             columns.others[name] = quantity, receiver
@@ -172,7 +173,7 @@ def _by_values(table: Table, names: Sequence[str]) -> list[str]:
     for name in names:
         by_stem.setdefault(_stem(name), []).append(_is_dbm(table, name))
     stems = {stem for stem, verdicts in by_stem.items() if any(verdicts) and False not in verdicts}
-    return [name for name in names if _stem(name) in stems and not _words(name) & set(QUANTITIES)]
+    return [name for name in names if _stem(name) in stems and not name_words(name) & set(QUANTITIES)]
 
 
 def _is_dbm(table: Table, name: str) -> bool | None:
@@ -191,10 +192,6 @@ def _stem(name: str) -> str:
 
 def _in_pattern(name: str, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
-
-
-def _words(name: str) -> set[str]:
-    return set(re.findall("[a-z]+", name.lower()))
 
 
 def _plain(name: str) -> str:

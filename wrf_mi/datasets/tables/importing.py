@@ -29,6 +29,7 @@ from .places import (
     LocalFrame,
     find_frame,
     finite_columns,
+    floor_numbers,
     headings_rad,
     place_numbers,
     plane_columns,
@@ -206,7 +207,7 @@ class _Import:
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
         if "floor" in of:
             self.notes.append(f"z is {options.height_m:g} m above the floor, storeys are {options.storey_m:g} m high")
-            return options.height_m + options.storey_m * finite_columns(table, [of["floor"]])[:, 0]
+            return options.height_m + options.storey_m * floor_numbers(table, of["floor"])
         self.notes.append(f"no column z: all rows are {options.height_m:g} m above the floor (--height-m)")
         return np.full(len(table), options.height_m)
 

@@ -159,6 +159,18 @@ def finite_columns(table: Table, names: Sequence[str]) -> FloatArray:
     return values
 
 
+def floor_numbers(table: Table, column: str) -> FloatArray:
+    """Numbers of floors [rows], also of those that are called L2; an `InputError` for a name without a number."""
+    if table.is_numeric(column):
+        return finite_columns(table, [column])[:, 0]
+    numbers = table.frame[column].astype(str).str.extract(r"(-?\d+)")[0].astype(float).to_numpy()
+    if (wrong := np.isnan(numbers)).any():
+        row = int(np.argmax(wrong))
+        text = f"{one_line(column)} is {str(table.frame[column].iloc[row])[:40]!r}; give its number"
+        raise table.fault(f"{text}, or leave the column out by --columns floor=-", row)
+    return np.asarray(numbers)
+
+
 def headings_rad(values: FloatArray, name: str, unit: str) -> tuple[FloatArray, str]:
     """Headings from +x towards +y in radians, and what they are taken for.
 

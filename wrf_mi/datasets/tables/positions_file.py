@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -11,7 +10,7 @@ import numpy as np
 from ...core import DataFault
 from ...core.angles import FloatArray
 from ...core.files import one_line
-from ..unknown import RECEIVER
+from ..unknown import RECEIVER, name_words
 from .columns import MOST_FLOORS, named_columns, shown_names, unit_of
 from .files import Table, package
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
@@ -187,7 +186,7 @@ def _with_ids(table: Table) -> Table:
     if not table.has_header and len(names) in (3, 4):
         names = ["id", "x", "y", "z"][: len(names)]
     elif "id" not in names:
-        matches = (name for word in RECEIVER for name in names if word in re.findall("[a-z]+", name.lower()))
+        matches = (name for word in RECEIVER for name in names if word in name_words(name))
         if (first := next(matches, None)) is None:
             text = f"no column of receivers among {shown_names(names)}"
             raise DataFault(table.files[0][0], f"{text}; give the columns id,x,y,z", line=1)
