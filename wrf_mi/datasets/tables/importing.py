@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError, Receiver, Record
 from ...core.angles import FloatArray
-from ...core.antenna import UPRIGHT
 from ...core.files import one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
-from ..receivers_file import receiver_name
 from .columns import HERTZ, Columns, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
 from .further import further_columns
@@ -35,7 +33,7 @@ from .places import (
     plane_columns,
     unit_scale,
 )
-from .positions_file import receiver_positions, with_cells, with_positions
+from .positions_file import with_cells, with_positions
 from .readings import (
     Means,
     Readings,
@@ -47,6 +45,7 @@ from .readings import (
     virtual_networks,
     without_not_heard,
 )
+from .receivers_table import read_receivers
 
 FACTS, PICTURE = "import.yml", "plan.png"
 """Files beside the tables: what the import assumed, and a plan of the rows."""
@@ -144,11 +143,11 @@ class _Import:
         first = np.unique(place, return_index=True)[1]
         readings, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
-        anchors_m, notes = self._anchors(readings, frame)
+        receivers, notes = self._receivers(readings, frame)
         self.notes += notes
-        record = self._record(means, readings.ids, position_m, anchors_m)
+        record = self._record(means, position_m, receivers)
         conditions = {name: values[first] for name, values in conditions.items()}
-        record = self._with_conditions(record, conditions, readings.ids)
+        record = self._with_conditions(record, conditions)
         record = self._with_split(record, self.is_test[first])
         further, notes = further_columns(self.table, self.columns, readings, place)
         self.notes += [*notes, *_reciprocity(self.columns)]
@@ -271,12 +270,20 @@ class _Import:
         readings = chosen(readings, remaining)
         return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
 
-    def _anchors(self, readings: Readings, frame: LocalFrame) -> tuple[FloatArray, list[str]]:
+    def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
+        """Receivers with the carriers of their readings, if these state any."""
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors)
-        return receiver_positions(table, readings.ids, frame, options.units, options.anchor_height_m)
+        receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
+        carriers = [
+            self.carrier_of.get(name, rx.frequency_hz) for name, rx in zip(readings.ids, receivers, strict=True)
+        ]
+        if None in carriers or options.frequency_hz:
+            carriers = [None] * len(carriers)
+        pairs = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in pairs), notes
 
-    def _record(self, means: Means, ids: Sequence[str], position_m: FloatArray, anchors_m: FloatArray) -> Record:
+    def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
         averaged = bool((means.count > 1).any())
         if averaged:
             most, what = int(means.count.max()), {"db": "dB", "mw": "mW"}[self.options.average]
@@ -285,28 +292,25 @@ class _Import:
             )
             self.notes.append(f"{readings}; count_ and std_ are their number and the noise of the mean")
         carrier_hz = self.options.frequency_hz or CARRIER_HZ
-        if not self.options.frequency_hz and "frequency" not in self.columns.of:
+        stated = "frequency" in self.columns.of or receivers[0].frequency_hz
+        if not self.options.frequency_hz and not stated:
             self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency-hz)")
-        receivers = [
-            Receiver(receiver_name(anchor), place, np.array(UPRIGHT))
-            for anchor, place in zip(ids, anchors_m, strict=True)
-        ]
         return Record(
             name=self.out.name,
             task="rssi",
             tx_pos_m=position_m,
-            receivers=tuple(receivers),
+            receivers=receivers,
             observation=means.dbm.round(STRENGTH_DIGITS).astype(np.float32),
             frequencies_hz=np.array([carrier_hz]),
             n_readings=means.count if averaged else None,
             std=means.std.round(STRENGTH_DIGITS) if averaged else None,
         )
 
-    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]], ids: Sequence[str]) -> Record:
+    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]]) -> Record:
         carriers_hz = conditions.get("frequency_hz")
         record = dataclasses.replace(record, tx_heading_rad=conditions.get("heading"), runs=conditions.get("run"))
-        if self.carrier_of:
-            return record.at_receiver_carriers(np.array([self.carrier_of[name] for name in ids]))
+        if (of_receivers := record.receiver_carriers_hz) is not None:
+            return record.at_receiver_carriers(of_receivers)
         return record if carriers_hz is None else record.at_carriers(carriers_hz)
 
     def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:

@@ -1,4 +1,4 @@
-"""Positions in tables of their own: those of a table's rows, and those of the receivers."""
+"""Positions of a table's rows in a table of their own, or in the names of cells."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ import numpy as np
 from ...core import DataFault
 from ...core.angles import FloatArray
 from ...core.files import one_line
-from ..unknown import RECEIVER, name_words
-from .columns import MOST_FLOORS, named_columns, shown_names, unit_of
+from .columns import MOST_FLOORS, named_columns
 from .files import Table, package
-from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
-from .readings import listed, normal_id
 
 MOST_OUTSIDE = 0.5  # share of rows outside the time of the positions above which the times are not in one unit
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
@@ -111,84 +108,3 @@ def seconds(table: Table, column: str) -> FloatArray:
         text = f"{one_line(column)} is {str(table.frame[column].iloc[wrong[0]])[:40]!r}"
         raise table.fault(f"{text}; give a time as a number or an ISO date", int(wrong[0]))
     return np.asarray((times - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float))
-
-
-def receiver_positions(
-    table: Table | None, ids: Sequence[str], frame: LocalFrame, units: str, height_m: float
-) -> tuple[FloatArray, list[str]]:
-    """Positions [n_rx, 3] in the local frame, NaN of receivers that the table lacks, and what was assumed.
-
-    Args:
-        table: columns id, x, y, z or id, lat, lon, z; None: all positions are unknown.
-        ids: ids of the receivers.
-        frame: frame of the rows' positions, in which coordinates without a unit are, too.
-        units: unit that was stated for all coordinates, or "".
-        height_m: height of receivers without z.
-
-    Raises:
-        InputError: no column of ids or positions, or a receiver that is in it twice.
-    """
-    positions = np.full((len(ids), 3), np.nan)
-    if table is None:
-        return positions, ["positions of the receivers are unknown, their fields empty; --anchors FILE states them"]
-    table = _with_ids(table)
-    row_of = _rows_by_id(table)
-    stated_m, has_z = _stated_positions(table, frame, units, height_m)
-    known = [number for number, name in enumerate(ids) if name in row_of]
-    positions[known] = stated_m[[row_of[ids[number]] for number in known]].round(POSITION_DIGITS)
-    positions[np.isnan(positions).any(axis=1)] = np.nan
-    return positions, _position_notes(table, ids, positions, list(row_of), None if has_z else height_m)
-
-
-def _stated_positions(table: Table, frame: LocalFrame, units: str, height_m: float) -> tuple[FloatArray, bool]:
-    """Positions [rows, 3] of a table of receivers, and whether it states heights."""
-    of = named_columns(list(table.frame.columns), {})
-    first, second, geographic = plane_columns(of, table)
-    if geographic and not frame.crs:
-        text = "longitude and latitude, but the positions of the measurements are in metres"
-        raise DataFault(table.files[0][0], f"{text}; give both in one reference system", line=1)
-    if not frame.crs and (unit := unit_of(first) or units):
-        frame = replace(frame, scale_m=unit_scale(unit, "--units"))
-    plane_m = frame.local_m(np.column_stack([table.numbers(name) for name in (first, second)]))
-    heights_m = np.full(len(table), height_m)
-    if "z" in of:
-        heights_m = table.numbers(of["z"]) * unit_scale(unit_of(of["z"]) or "m", "--units")
-    return np.column_stack([plane_m, heights_m]), "z" in of
-
-
-def _position_notes(
-    table: Table, ids: Sequence[str], positions: FloatArray, stated: Sequence[str], height_m: float | None
-) -> list[str]:
-    used = {*named_columns(list(table.frame.columns), {}).values(), "id"}
-    is_unknown = np.isnan(positions[:, 0])
-    groups = {
-        "columns that are not used": [name for name in table.frame.columns if name not in used],
-        "receivers without position": [name for name, unknown in zip(ids, is_unknown, strict=True) if unknown],
-        "receivers that are not in the measurements": sorted(set(stated) - set(ids)),
-    }
-    notes = [f"{len(names)} {what}: {listed(names)}" for what, names in groups.items() if names]
-    notes += [] if height_m is None else [f"no column z: receivers are {height_m:g} m above the floor"]
-    return [f"{table.files[0][0].name}: {note}" for note in notes]
-
-
-def _rows_by_id(table: Table) -> dict[str, int]:
-    row_of: dict[str, int] = {}
-    for row, text in enumerate(table.frame["id"].astype(str)):
-        if (name := normal_id(text)) in row_of:
-            raise table.fault(f"receiver {name} stands in row {row_of[name] + 1}, too; remove one of them", row)
-        row_of[name] = row
-    return row_of
-
-
-def _with_ids(table: Table) -> Table:
-    """A table of receivers whose column of ids is called so; without header its columns are id, x, y and z."""
-    names: list[str] = list(table.frame.columns)
-    if not table.has_header and len(names) in (3, 4):
-        names = ["id", "x", "y", "z"][: len(names)]
-    elif "id" not in names:
-        matches = (name for word in RECEIVER for name in names if word in name_words(name))
-        if (first := next(matches, None)) is None:
-            text = f"no column of receivers among {shown_names(names)}"
-            raise DataFault(table.files[0][0], f"{text}; give the columns id,x,y,z", line=1)
-        names[names.index(first)] = "id"
-    return replace(table, frame=table.frame.set_axis(names, axis=1))
