@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .checking import check_data
     from .core import BackendError, InputError, Receiver, Record, Split
     from .core.settings import with_settings
-    from .datasets import fetch, make_splits
+    from .datasets import fetch, import_measurements, make_splits
     from .maps.api import radio_map
     from .maps.coverage import run_reliability
     from .maps.dataset import write_map
@@ -47,6 +47,7 @@ _HOME = {
     "edit_scene": "scene.edit",
     "evaluate_run": "runs.api",
     "fetch": "datasets",
+    "import_measurements": "datasets",
     "load": "synthetic:load_record",
     "locate": "maps.locate:locate",
     "make_scene": "scene.make",

@@ -16,9 +16,10 @@ from made_building import TRAINED, building, silent_in
 from scipy.stats import truncnorm
 
 from wrf_mi.checking import check_data
-from wrf_mi.checking.rows import few_rows, not_heard, suspicious_values
+from wrf_mi.checking.rows import few_rows, not_heard
 from wrf_mi.core import Record
 from wrf_mi.datasets import write_ble_folder
+from wrf_mi.datasets.sentinels import suspicious_values
 from wrf_mi.runs.api import train
 
 DRAWS = np.random.default_rng(0)

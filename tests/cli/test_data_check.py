@@ -57,7 +57,7 @@ def test_faults_end_with_status_2(flat: Path, capsys: pytest.CaptureFixture[str]
         assert len(found) == 3, out
     status, out, _ = call(["data", "check", flat], capsys)
     assert sorted(out.splitlines()[:-1]) == [
-        "fault: anchors.csv, row 2: z is 'high'; give a finite number",
+        "fault: anchors.csv, row 2: z is 'high'; give a finite number, or leave it empty",
         "fault: calibration_df.csv, row 4: 2 fields, but the header has 6; correct or remove the row",
         "fault: test_robot_df.csv: missing; give a file that exists, or complete its folder",
     ]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import refused
+from calling import call, refused
 from made_flat import write_flat
 
 from wrf_mi.core import InputError
@@ -22,17 +22,16 @@ SCANS = """time,x,y,BSSID,RSSI
 3,3.5,3.5,aa:01,-64
 """
 WANTED = r"columns x,y and rssi_<id> of each receiver, in train\.csv and test\.csv, or in measurements\.csv, beside"
-PIVOT = "pivot it by "
 
 
 @pytest.mark.parametrize(
     ("asked", "separator"),
     [("file", ","), ("file", ";"), ("folder", ","), ("folder", "\t"), ("folder in the layout", ",")],
 )
-def test_a_table_of_readings_is_told_how_to_pivot(
+def test_a_table_of_readings_is_told_how_it_is_imported(
     asked: str, separator: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pandas")
     folder = tmp_path / "office"
     folder.mkdir()
     name = "scans.csv"
@@ -43,17 +42,10 @@ def test_a_table_of_readings_is_told_how_to_pivot(
     (folder / name).write_text(SCANS.replace(",", separator))
     dataset = folder / name if asked == "file" else folder
     refused(["train", dataset, "--model", "idw", "--out", tmp_path / "run"], WANTED, capsys)
-    with pytest.raises(InputError, match=PIVOT) as error:
-        load(dataset)
-    code = str(error.value).partition(PIVOT)[2].replace(repr(name), repr(str(folder / name)))
-    wide = eval(code, {"pandas": pandas})
-    # The table so made is read.
-    (folder / "anchors.csv").write_text("id,x,y,z\naa:01,0,0,2\naa:02,4,0,2\n")
-    for part in ("calibration_df.csv", "test_robot_df.csv"):
-        wide.to_csv(folder / part, index=False)
-    record = load(folder)
+    refused(["data", "info", dataset], rf"wrf-mi data import {name} --out FOLDER$", capsys)
+    assert call(["data", "import", folder / name, "--out", tmp_path / "made"], capsys)[0] == 0
     expected = np.array([[-60, -62, np.nan, -64], [-70, np.nan, -75, np.nan]], np.float32)
-    np.testing.assert_array_equal(record.observation[:, :4], expected)
+    np.testing.assert_array_equal(load(tmp_path / "made").observation, expected)
 
 
 @pytest.mark.parametrize(
@@ -61,11 +53,11 @@ def test_a_table_of_readings_is_told_how_to_pivot(
     [
         (
             "timestamp,pos_x,pos_y,MAC address,RSSI (dBm)",
-            ("MAC address", "RSSI (dBm)", ["timestamp", "pos_x", "pos_y"]),
+            ("MAC address", "RSSI (dBm)"),
         ),
-        ("x,y,z,AP,level", ("AP", "level", ["x", "y", "z"])),
-        ("lat,lon,ssid,bssid,signal_dbm,channel", ("bssid", "signal_dbm", ["lat", "lon"])),
-        ("scan,gateway_id,rsrp", ("gateway_id", "rsrp", ["scan"])),
+        ("x,y,z,AP,level", ("AP", "level")),
+        ("lat,lon,ssid,bssid,signal_dbm,channel", ("bssid", "signal_dbm")),
+        ("scan,gateway_id,rsrp", ("gateway_id", "rsrp")),
         ("x,y,rssi_1,rssi_2", None),
         ("X,Y,AP1 RSS(dBm),AP2 RSS(dBm)", None),
         ("x,y,rssi", None),

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Record
+from ..core import InputError, Record
 from ..core.carriers import carriers_text
+from ..core.files import one_line
+from ..datasets.tables.options import AVERAGES
 from .options import DATASET, Arguments, add_command
 from .output import show
 
@@ -18,12 +20,13 @@ SHOWN_CARRIERS = 8
 
 def add_parser(commands: Any) -> None:
     """Add ``data`` and its subcommands to the commands."""
-    data = commands.add_parser("data", help="data sets: list, fetch, info, check").add_subparsers(
+    data = commands.add_parser("data", help="data sets: list, fetch, import, info, check").add_subparsers(
         required=True, metavar="COMMAND"
     )
     add_command(data, "list", list_command, "list known data sets and their folders")
     parser = add_command(data, "fetch", fetch_command, "download a data set, checked by SHA-256", json_output=False)
     parser.add_argument("name", metavar="NAME", help="name of a data set")
+    _add_import(data)
     parser = add_command(data, "info", info_command, "read and check a data set, and summarise its content")
     parser.add_argument("dataset", metavar="DATASET", help=DATASET)
     text = "find every fault of a data set, and data that are likely wrong (docs/data.md)"
@@ -32,6 +35,41 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--strict", action="store_true", help="exit status 1 if there is a suspicion")
     text = "suspicion that is not reported, see docs/data.md; repeatable"
     parser.add_argument("--ignore", action="append", default=[], metavar="NAME", help=text)
+
+
+def _add_import(data: Any) -> None:
+    """Add ``import``."""
+    text = "make a data set from tables of signal strengths: CSV, Parquet, Excel (docs/howto/own-data.md)"
+    parser = add_command(data, "import", import_command, text)
+    add = parser.add_argument
+    add("files", nargs="+", metavar="FILE", help="tables with a column per receiver, or a row per reading")
+    add("--out", required=True, metavar="FOLDER", help="data set to write")
+    add("--replace", action="store_true", help="replace the folder if it exists")
+    text = "columns by meaning, such as x=X,y=Y,rssi=level,id=bssid,time=ts (default: guessed); '-': there is none"
+    add("--columns", metavar="LIST", help=text)
+    text = "columns of strengths of a wide table, such as 'AP* RSS(dBm)'; repeatable"
+    add("--receivers", action="append", metavar="PATTERN", help=text)
+    add("--test", nargs="+", metavar="FILE", help="tables with the test rows")
+    text = "tables with the positions of the rows: one for each table, those of --test last, or one for all"
+    add("--positions", nargs="+", metavar="FILE", help=text)
+    add("--anchors", metavar="FILE", help="table with the receivers' positions: id,x,y[,z] (default: unknown)")
+    text = "use the rows alone that have this text or number in a column, such as device=Samsung; repeatable"
+    add("--where", action="append", metavar="COLUMN=TEXT", help=text)
+    text = "number for what was not heard, repeatable, or none (default: found and named)"
+    add("--not-heard", action="append", metavar="DBM", help=text)
+    add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
+    add("--place-m", type=float, metavar="M", help="average in squares of this side (default: at equal positions)")
+    add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg (default: by names, or m)")
+    add("--pitch-m", type=float, metavar="M", help="positions are indices of a grid of this pitch")
+    add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
+    text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"
+    add("--heading", metavar="UNIT", help=text)
+    add("--height-m", type=float, metavar="M", help="height of the moving end without z (default: 1.3)")
+    add("--storey-m", type=float, metavar="M", help="height of a storey, for a column floor without z (default: 3)")
+    add("--anchor-height-m", type=float, metavar="M", help="height of receivers without z (default: 2.5)")
+    add("--frequency-hz", type=float, metavar="HZ", help="carrier of all rows (default: of the table, or 2.44e9)")
+    add("--merge-radios", action="store_true", default=None, help="make networks of one radio (BSSIDs) one receiver")
+    add("--min-heard", type=int, metavar="N", help="leave out receivers heard in fewer training rows (default: 1)")
 
 
 def list_command(a: Arguments) -> int:
@@ -64,6 +102,47 @@ def fetch_command(a: Arguments) -> int:
     if synthetic and dataset.note:
         print(f"{a.name}: {dataset.note}", file=sys.stderr)
     return 0
+
+
+def import_command(a: Arguments) -> int:
+    """Import tables, check the data set, and name the next command."""
+    from dataclasses import fields
+
+    from ..checking import check_data
+    from ..datasets import ImportOptions, import_measurements
+
+    given = {attribute.name: getattr(a, attribute.name) for attribute in fields(ImportOptions)}
+    options = {name: value for name, value in given.items() if value is not None}
+    if "not_heard" in options:
+        options["not_heard"] = _not_heard(options["not_heard"])
+    if "where" in options:
+        options["where"] = dict(_where(text) for text in options["where"])
+    report = import_measurements(a.files, a.out, a.replace, **options)
+    check = check_data(a.out)
+    facts = summary(report.record)
+    next_command = f"wrf-mi train {a.out}"
+    values: dict[str, Any] = {"folder": str(report.folder), "columns": report.columns, "notes": report.notes}
+    values |= {"summary": facts, "check": check.as_dict(), "next": next_command}
+    rows = f"{a.out}: {facts['rows']} rows, {len(facts['receivers'])} receivers; plan.png shows them"
+    lines = [*report.columns, "", *report.notes, "", rows, *check.lines(), f"next: {next_command}"]
+    show(a.json, values, "\n".join(lines))
+    return 0 if check.ok else 2
+
+
+def _where(text: str) -> tuple[str, str]:
+    """Column and text of ``--where``."""
+    column, equals, wanted = text.partition("=")
+    if not equals:
+        raise InputError(f"--where {one_line(text)}: give COLUMN=TEXT")
+    return column.strip(), wanted.strip()
+
+
+def _not_heard(texts: list[str]) -> list[float]:
+    """Numbers of ``--not-heard``; none for ``none``."""
+    try:
+        return [float(text) for text in texts if text != "none"]
+    except ValueError:
+        raise InputError(f"--not-heard {one_line(' '.join(texts))}: give numbers in dBm, or none") from None
 
 
 def info_command(a: Arguments) -> int:

@@ -11,14 +11,18 @@ from .record_file import read_record_file, write_record_file
 from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
 from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
 from .splits import SPLIT_NAMES, load_split, make_splits, save_split
+from .tables import ImportOptions, ImportReport, import_measurements
 
 __all__ = [
     "SPLIT_NAMES",
     "DataSet",
     "DataSetStatus",
+    "ImportOptions",
+    "ImportReport",
     "data_home",
     "datasets",
     "fetch",
+    "import_measurements",
     "load",
     "load_split",
     "make_splits",

@@ -74,10 +74,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     anchors, *tables = (attempt(files.read_csv, file) for file in _files(folder))
     ids = attempt(read_ids, anchors, complete=True)
     anchors_m = attempt(read_positions, anchors, "xyz", True)
-    orientations, receivers_hz = (
-        attempt(read_orientations, anchors),
-        attempt(_receiver_carriers, anchors, tables),
-    )
+    orientations, receivers_hz = attempt(read_orientations, anchors), attempt(_receiver_carriers, anchors, tables)
     rx_antennas = attempt(read_antennas, anchors, "", orientations)
     tx_antenna = attempt(read_transmitter, anchors)
     plane = [attempt(read_positions, table, "xy") for table in tables]
@@ -153,12 +150,17 @@ def _read_split(tables: list[files.CsvTable]) -> dict[str, Any]:
 
 
 def write_ble_folder(
-    path: str | Path, record: Record, replace: bool = False, extra: Mapping[str, str | bytes] | None = None
+    path: str | Path,
+    record: Record,
+    replace: bool = False,
+    extra: Mapping[str, str | bytes] | None = None,
+    further: Mapping[str, NDArray[Any]] | None = None,
 ) -> Path:
     """Write signal strengths atomically in the layout of the BLE data.
 
     Rows go into ``train.csv`` and ``test.csv`` by the official split, and are read in its order; without one into
-    ``measurements.csv``. ``extra`` is the content of further files by their paths in the folder.
+    ``measurements.csv``. ``extra`` is the content of further files by their paths in the folder, ``further`` columns
+    [n] of the rows that are not read.
 
     Raises:
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
@@ -167,7 +169,7 @@ def write_ble_folder(
     with atomic_folder(Path(path), replace) as part:
         columns = receiver_columns(record, ids)
         write_csv(part / RECEIVERS[0], columns, zip(*columns.values(), strict=True))
-        of_rows = _columns(record, ids)
+        of_rows = {**_columns(record, ids), **(further or {})}
         file_names = (MEASUREMENTS,) if record.official is None else (TRAINING, TEST)
         parts = (np.arange(len(record)),) if record.official is None else record.official
         for names, rows in zip(file_names, parts, strict=True):

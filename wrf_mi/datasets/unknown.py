@@ -30,22 +30,16 @@ RECEIVER = (
     *("pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""
-PLACE = frozenset(
-    {"x", "y", "z", "lat", "lon", "lng", "latitude", "longitude", "easting", "northing", "heading", "floor"}
-    | {"time", "timestamp", "ts", "date", "run", "scan", "point", "position", "place", "location", "row", "frequency"}
-)
-"""Words in the names of columns that tell positions and scans apart."""
 SHOWN = 8
 """Columns or files that a message names."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Name, names of the columns and separator of a table."""
+    """Name of a table and names of its columns."""
 
     name: str
     header: tuple[str, ...]
-    separator: str = ","
 
 
 def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
@@ -66,27 +60,24 @@ def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
 
 
 def table_text(table: Table) -> str:
-    """What a table lacks as signal strengths, and how a table of single readings is pivoted."""
-    columns = f"{table.name} has the columns {_listed(table.header)}"
-    if (columns_of_readings := long_columns(table.header)) is None:
-        return f"{columns}; {TABLE}"
-    receiver, strength, index = columns_of_readings
-    separated = "" if table.separator == "," else f", sep={table.separator!r}"
-    pivot = f"pivot_table(index={index}, columns={receiver!r}, values={strength!r})"
-    code = f"pandas.read_csv({table.name!r}{separated}).{pivot}.add_prefix('rssi_').reset_index()"
-    return f"{columns}, a row for each reading; {TABLE}: pivot it by {one_line(code)}"
+    """What a table lacks as signal strengths, and the command that makes a data set of it."""
+    kind = "" if long_columns(table.header) is None else ", a row for each reading"
+    remedy = f"make a data set of it by wrf-mi data import {one_line(table.name)} --out FOLDER"
+    return f"{table.name} has the columns {_listed(table.header)}{kind}; {TABLE}: {remedy}"
 
 
-def long_columns(header: Sequence[str]) -> tuple[str, str, list[str]] | None:
-    """Columns of receivers and strengths and those of the positions in a table with a row for each reading, or None."""
-    words = {column: set(re.findall("[a-z]+", column.lower())) for column in header}
+def name_words(name: str) -> set[str]:
+    """Words of a column's name in small letters, also those of ``anchorId``."""
+    return {*re.findall("[a-z]+", name.lower()), *map(str.lower, re.findall("[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name))}
+
+
+def long_columns(header: Sequence[str]) -> tuple[str, str] | None:
+    """Columns of receivers and of strengths in a table with a row for each reading, or None."""
+    words = {column: name_words(column) for column in header}
     strengths = [column for column, parts in words.items() if parts & STRENGTH]
     receivers = [column for word in RECEIVER for column, parts in words.items() if word in parts]
     receivers = [column for column in receivers if column not in strengths]
-    if len(strengths) != 1 or not receivers:
-        return None
-    others = [column for column in header if column not in (receivers[0], strengths[0])]
-    return receivers[0], strengths[0], [column for column in others if words[column] & PLACE] or others
+    return (receivers[0], strengths[0]) if len(strengths) == 1 and receivers else None
 
 
 def _read_header(file: Path) -> Table | None:
@@ -99,7 +90,7 @@ def _read_header(file: Path) -> Table | None:
         header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
     except (InputError, csv.Error):
         return None
-    return Table(file.name, tuple(header), separator) if len(header) > 1 else None
+    return Table(file.name, tuple(header)) if len(header) > 1 else None
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -1,0 +1,254 @@
+"""Import of tables into a data set: the record that is read back, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from wrf_mi import import_measurements
+from wrf_mi.checking import check_data
+from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import read_ble_folder
+from wrf_mi.datasets.ble_folder import TAG_HEIGHT_M
+
+pandas = pytest.importorskip("pandas")
+pyproj = pytest.importorskip("pyproj")
+
+APS_M = {"kitchen": (1.0, 1.0), "hall": (11.0, 7.0), "7": (1.0, 7.0)}
+ROUNDING = 1e-5
+"""Of strengths near -60 dBm in single precision."""
+rng = np.random.default_rng(0)
+PLACES_M = np.round(rng.uniform(0, 12, (30, 2)), 3)
+STRENGTHS = np.stack([-40 - 25 * np.log10(np.linalg.norm(PLACES_M - ap, axis=1) + 1) for ap in APS_M.values()], axis=1)
+STRENGTHS = np.round(STRENGTHS, 2)
+
+
+def wide(name: str = "rssi_{}") -> Any:
+    frame = pandas.DataFrame(STRENGTHS, columns=[name.format(ap) for ap in APS_M])
+    return frame.assign(x=PLACES_M[:, 0], y=PLACES_M[:, 1])
+
+
+def long() -> Any:
+    frame = wide("{}").assign(time=np.arange(30.0)).melt(["time", "x", "y"], var_name="bssid", value_name="level")
+    return frame.sort_values(["time", "bssid"], ignore_index=True)
+
+
+def imported(tmp_path: Path, frame: Any, **options: Any) -> Record:
+    frame.to_csv(tmp_path / "table.csv", index=False)
+    import_measurements(tmp_path / "table.csv", tmp_path / "data", replace=True, **options)
+    assert check_data(tmp_path / "data").ok
+    return read_ble_folder(tmp_path / "data")
+
+
+def in_order(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and strengths by receiver, in the order of `PLACES_M`."""
+    ids = [receiver.name.removeprefix("anchor") for receiver in record.receivers]
+    rows = [int(np.argmin(np.linalg.norm(record.tx_pos_m[:, :2] - place, axis=1))) for place in PLACES_M]
+    return record.tx_pos_m[rows], record.observation[[ids.index(ap) for ap in APS_M]][:, rows].T
+
+
+@pytest.mark.parametrize("form", ["wide", "long"])
+def test_both_forms_give_the_same_rows(form: str, tmp_path: Path) -> None:
+    record = imported(tmp_path, wide() if form == "wide" else long())
+    positions_m, strengths = in_order(record)
+    np.testing.assert_allclose(positions_m, np.column_stack([PLACES_M, np.full(30, TAG_HEIGHT_M)]))
+    np.testing.assert_allclose(strengths, STRENGTHS, atol=ROUNDING)
+    assert record.official is None
+    assert np.isnan([receiver.position_m for receiver in record.receivers]).all()
+    assert (record.n_readings, record.std, record.tx_heading_rad) == (None, None, None)
+
+
+def test_receivers_and_rows_are_in_one_frame(tmp_path: Path) -> None:
+    """Latitude and longitude, of rows and receivers: distances are those of the plan."""
+    local = "+proj=aeqd +lon_0=-78.9385 +lat_0=36.001 +datum=WGS84"
+    to_degrees = pyproj.Transformer.from_crs(local, "EPSG:4326", always_xy=True)
+    plan_m = np.array(list(APS_M.values()))
+    lon, lat = to_degrees.transform(*plan_m.T)
+    anchors = pandas.DataFrame({"bssid": list(APS_M), "lat": lat, "lon": lon, "z": [2.0, 2.5, 3.0]})
+    anchors.to_csv(tmp_path / "anchors.csv", index=False)
+    lon, lat = to_degrees.transform(*PLACES_M.T)
+    frame = wide().drop(columns=["x", "y"]).assign(latitude=lat, longitude=lon)
+    record = imported(tmp_path, frame, anchors=tmp_path / "anchors.csv")
+    stated = {receiver.name.removeprefix("anchor"): receiver.position_m for receiver in record.receivers}
+    assert {ap: place[2] for ap, place in stated.items()} == {"kitchen": 2.0, "hall": 2.5, "7": 3.0}
+    shift_m = stated["kitchen"][:2] - APS_M["kitchen"]
+    for ap, place in APS_M.items():
+        np.testing.assert_allclose(stated[ap][:2] - shift_m, place, atol=1e-3)
+    shifted_m = record.tx_pos_m[:, :2] - shift_m
+    assert max(np.linalg.norm(shifted_m - place, axis=1).min() for place in PLACES_M) < 1e-3
+    facts = yaml.safe_load((tmp_path / "data" / "import.yml").read_text())
+    assert facts["frame"]["crs"] == "EPSG:4326"
+    assert len(facts["frame"]["origin"]) == 2
+
+
+def test_readings_of_a_place_are_averaged_with_their_number_and_noise(tmp_path: Path) -> None:
+    frame = pandas.concat([wide(), wide().assign(rssi_hall=wide().rssi_hall - 2)])
+    frame.loc[frame.index == 3, "rssi_7"] = np.nan
+    record = imported(tmp_path, frame)
+    assert (len(record), record.n_readings is not None, record.std is not None) == (30, True, True)
+    _, strengths = in_order(record)
+    expected = STRENGTHS - [0, 1, 0]
+    expected[3, 2] = np.nan
+    np.testing.assert_allclose(strengths, expected, atol=ROUNDING)
+    assert sorted(np.unique(record.n_readings)) == [0, 2]
+
+
+@pytest.mark.parametrize("how", ["file", "column"])
+def test_test_rows_are_the_stated_ones(how: str, tmp_path: Path) -> None:
+    if how == "file":
+        wide()[20:].to_csv(tmp_path / "test.csv", index=False)
+        record = imported(tmp_path, wide()[:20], test=[tmp_path / "test.csv"])
+    else:
+        record = imported(tmp_path, wide().assign(split=["Train"] * 20 + ["test"] * 10))
+    assert record.official is not None
+    np.testing.assert_allclose(record.tx_pos_m[record.official[1], :2], PLACES_M[20:])
+
+
+@pytest.mark.parametrize("match", ["rows", "point", "time"])
+def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
+    values, positions = wide().drop(columns=["x", "y"]), pandas.DataFrame(PLACES_M, columns=["x", "y"])
+    header = match != "rows"
+    if match == "point":
+        values, positions = values.assign(point=range(30)), positions.assign(point=range(30))[::-1]
+    if match == "time":
+        values = values.assign(time=np.arange(30) + 0.5)  # the last row is after all positions
+        positions = positions.assign(time=np.arange(30))
+    positions.to_csv(tmp_path / "positions.csv", index=False, header=header)
+    values.to_csv(tmp_path / "values.csv", index=False, header=header)
+    import_measurements(tmp_path / "values.csv", tmp_path / "data", positions=[tmp_path / "positions.csv"])
+    record = read_ble_folder(tmp_path / "data")
+    expected = (PLACES_M[1:] + PLACES_M[:-1]) / 2 if match == "time" else PLACES_M
+    assert len(record) == len(expected)
+    assert max(np.linalg.norm(record.tx_pos_m[:, :2] - place, axis=1).min() for place in expected) < 1e-5
+
+
+def test_positions_in_the_names_of_cells(tmp_path: Path) -> None:
+    cells = [f"L{floor}-{x}-{y}" for floor, x, y in zip([4, 5] * 15, range(30), range(30, 60), strict=True)]
+    frame = wide().drop(columns=["x", "y"]).assign(Cid=cells)
+    record = imported(tmp_path, frame, columns="cell=Cid", pitch_m=2.0, storey_m=4.0)
+    order = np.argsort(record.tx_pos_m[:, 0])
+    expected = np.column_stack(
+        [2.0 * np.arange(30), 2.0 * np.arange(30, 60), TAG_HEIGHT_M + 4.0 * np.array([4, 5] * 15)]
+    )
+    np.testing.assert_allclose(record.tx_pos_m[order], expected)
+    frame.assign(Cid="L4").to_csv(tmp_path / "table.csv", index=False)
+    with pytest.raises(InputError, match="row 1: Cid is 'L4'; give a text with the numbers x and y"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", columns="cell=Cid")
+
+
+def test_times_of_another_unit_are_refused(tmp_path: Path) -> None:
+    wide().drop(columns=["x", "y"]).assign(time=1000 * np.arange(30)).to_csv(tmp_path / "table.csv", index=False)
+    positions = pandas.DataFrame(PLACES_M, columns=["x", "y"]).assign(time=np.arange(30))
+    positions.to_csv(tmp_path / "positions.csv", index=False)
+    with pytest.raises(InputError, match=r"row 2: its time is outside those of positions\.csv, as those of 29"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "data", positions=[tmp_path / "positions.csv"])
+
+
+def test_further_columns_are_kept(tmp_path: Path) -> None:
+    ranges = np.where(np.arange(30) % 5 == 0, 100_000.0, np.linspace(1000, 9000, 30))
+    frame = wide().assign(**{"hall RTT(mm)": ranges, "device": "a", "count_x": 3})
+    imported(tmp_path, pandas.concat([frame, frame.assign(device="b")]))
+    tables = [pandas.read_csv(path) for path in (tmp_path / "data").glob("*.csv")]
+    kept = pandas.concat([table for table in tables if "rssi_hall" in table])
+    order = [int(np.argmin(np.linalg.norm(kept[["x", "y"]] - place, axis=1))) for place in PLACES_M]
+    np.testing.assert_allclose(kept.rtt_hall_m.iloc[order], np.where(ranges < 1e5, ranges / 1e3, np.nan))
+    assert set(kept.device) == {"a|b"}
+    assert set(kept.source_count_x) == {3}
+
+
+def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
+    frame = pandas.concat([wide().assign(device=1.0), (wide() - 20).assign(device=2.0)])
+    np.testing.assert_allclose(in_order(imported(tmp_path, frame, where={"device": "1"}))[1], STRENGTHS, atol=ROUNDING)
+    frame.iloc[40, 0] = np.nan
+    frame.iloc[50, frame.columns.get_loc("x")] = np.nan
+    frame.to_csv(tmp_path / "table.csv", index=False)
+    with pytest.raises(InputError, match="row 51: x is empty or infinite"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "2"})
+    with pytest.raises(InputError, match="no row has device 3; correct --where"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "3"})
+
+
+def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
+    mhz = {"kitchen": 2412, "hall": 5180, "7": 2412}
+    record = imported(tmp_path, long().assign(frequency=long().bssid.map(mhz)))
+    assert record.receiver_carriers_hz is not None
+    stated = {
+        rx.name.removeprefix("anchor"): hz for rx, hz in zip(record.receivers, record.receiver_carriers_hz, strict=True)
+    }
+    assert stated == {ap: 1e6 * carrier for ap, carrier in mhz.items()}
+    assert len(record) == len(PLACES_M)
+
+
+def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
+    anchors = pandas.DataFrame(
+        {"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "azimuth_deg": [90, 0, np.nan]}
+    )
+    anchors = anchors.assign(pattern=["tr38901", "", ""], frequency_hz=[3.56e9, 3.6e9, 3.69e9], mast="a")
+    anchors.to_csv(tmp_path / "anchors.csv", index=False)
+    record = imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")
+    by_name = {receiver.name: receiver for receiver in record.receivers}
+    np.testing.assert_allclose(by_name["hall"].to_world[:, 2], [0, 1, 0], atol=1e-9)
+    np.testing.assert_array_equal(by_name["anchor7"].to_world, np.eye(3))
+    assert (by_name["hall"].antenna.pattern, by_name["kitchen"].antenna.pattern) == ("tr38901", "iso")
+    assert [by_name[name].frequency_hz for name in ("hall", "kitchen", "anchor7")] == [3.56e9, 3.6e9, 3.69e9]
+    assert "1 columns that are not used: mast" in (tmp_path / "data" / "import.yml").read_text()
+    anchors.assign(id="hall").to_csv(tmp_path / "anchors.csv", index=False)
+    with pytest.raises(InputError, match=r"anchors\.csv: row 2: receiver hall is in an earlier row, too"):
+        imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")
+
+
+def test_receivers_heard_too_rarely_are_left_out_by_name(tmp_path: Path) -> None:
+    frame = wide().assign(rssi_far=[-95.0, -96] + [np.nan] * 28, split=["train"] * 20 + ["test"] * 10)
+    assert len(imported(tmp_path, frame).receivers) == 4
+    assert len(imported(tmp_path, frame, min_heard=3).receivers) == 3
+    assert "left out (--min-heard): far" in (tmp_path / "data" / "import.yml").read_text().replace("\n", " ")
+
+
+def test_pitch_heading_carrier_run_and_storeys(tmp_path: Path) -> None:
+    frame = wide().assign(x=range(30), y=0, floor=["L0", "L2"] * 15, heading=90, frequency_mhz=920, run="monday")
+    record = imported(tmp_path, frame, pitch_m=0.6)
+    np.testing.assert_allclose(np.sort(record.tx_pos_m[:, 0]), 0.6 * np.arange(30))
+    assert set(record.tx_pos_m[:, 2].tolist()) == {TAG_HEIGHT_M, TAG_HEIGHT_M + 6.0}
+    np.testing.assert_allclose(record.tx_heading_rad, np.pi / 2)
+    np.testing.assert_array_equal(record.frequencies_hz, [920e6])
+    assert set(record.runs) == {"monday"}
+
+
+REFUSED = {
+    "empty position": (
+        lambda f: f.assign(x=[np.nan, *f.x[1:]]),
+        {},
+        r"table\.csv: row 1: x is empty or infinite; give a number",
+    ),
+    "no position": (lambda f: f.drop(columns="x"), {}, "no columns of positions among .*--positions FILE"),
+    "carrier": (lambda f: f.assign(frequency=0), {}, "row 1: frequency is 0; give the carrier, or --columns"),
+    "floor": (lambda f: f.assign(floor="ground"), {}, "row 1: floor is 'ground'; give its number, or leave"),
+    "split": (lambda f: f.assign(split="maybe"), {}, "row 1: split is 'maybe'; give train or test"),
+    "nothing heard": (lambda f: f, {"not_heard": STRENGTHS.ravel().tolist()}, "no reading was heard"),
+    "rarely heard": (lambda f: f, {"min_heard": 99}, "no receiver was heard in 99 training rows"),
+    "average": (lambda f: f, {"average": "median"}, "--average 'median' is unknown; give one of db, mw"),
+    "pitch": (lambda f: f, {"pitch_m": -1}, "--pitch-m -1: give a number above 0"),
+    "option": (lambda f: f, {"sentinel": 1}, "no option sentinel; see ImportOptions"),
+    "positions": (lambda f: f, {"positions": ["a.csv", "b.csv"]}, r"a\.csv: missing"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_input_is_refused_and_nothing_written(case: str, tmp_path: Path) -> None:
+    change, options, message = REFUSED[case]
+    change(wide()).to_csv(tmp_path / "table.csv", index=False)
+    with pytest.raises(InputError, match=message):
+        import_measurements(tmp_path / "table.csv", tmp_path / "data", **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+
+
+def test_existing_folder_is_refused(tmp_path: Path) -> None:
+    wide().to_csv(tmp_path / "table.csv", index=False)
+    (tmp_path / "data").mkdir()
+    with pytest.raises(InputError, match="data: exists; remove it"):
+        import_measurements(tmp_path / "table.csv", tmp_path / "data")
+    assert not list((tmp_path / "data").iterdir())

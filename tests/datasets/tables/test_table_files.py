@@ -1,0 +1,125 @@
+"""Reading of tables: separators, decimal marks, comments, encodings, formats and damaged lines."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wrf_mi.core import InputError
+from wrf_mi.datasets.tables import files
+from wrf_mi.datasets.tables.files import joined, read_table
+
+pandas = pytest.importorskip("pandas")
+
+NAMES = ["x", "y", "ap", "rssi"]
+ROWS = [[1.5, 2.0, "AP a", -60.5], [1.5, 2.25, "AP b", np.nan], [3.0, -4.0, "AP a", -71.0]]
+LINES = ["x,y,ap,rssi", "1.5,2.0,AP a,-60.5", "1.5,2.25,AP b,", "3.0,-4.0,AP a,-71"]
+TEXT = "\n".join(LINES) + "\n"
+
+FORMS = {
+    "commas": TEXT.encode(),
+    "tabs": TEXT.replace(",", "\t").encode(),
+    "semicolons": TEXT.replace(",", ";").encode(),
+    "decimal comma": TEXT.replace(",", ";").replace(".", ",").encode(),
+    "mark of the byte order": b"\xef\xbb\xbf" + TEXT.encode(),
+    "UTF-16": TEXT.encode("utf-16"),
+    "comments": ("# made up\n\n" + "\n% again\n".join(LINES)).encode(),
+    "header in a comment": ("# " + TEXT).encode(),
+    "quotes": TEXT.replace("AP a", '"AP a"').encode(),
+    "blanks after commas": TEXT.replace(",", ", ").encode(),
+    "lines of Windows": TEXT.replace("\n", "\r\n").encode(),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_forms_of_text_hold_the_same_table(form: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_bytes(FORMS[form])
+    table = read_table(tmp_path / "t.csv")
+    expected = pandas.DataFrame(ROWS, columns=NAMES)
+    pandas.testing.assert_frame_equal(table.frame, expected, check_dtype=False)
+    assert table.numbers("rssi").dtype == np.float64
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "xlsx"])
+def test_binary_formats_hold_the_same_table(suffix: str, tmp_path: Path) -> None:
+    frame = pandas.DataFrame(ROWS, columns=NAMES)
+    path = tmp_path / f"t.{suffix}"
+    frame.to_parquet(path) if suffix == "parquet" else frame.to_excel(path, index=False)
+    pandas.testing.assert_frame_equal(read_table(path).frame, frame, check_dtype=False)
+
+
+def test_table_without_header_has_numbered_columns(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("100,-60,100\n-71,100,-80\n")
+    table = read_table(tmp_path / "t.csv")
+    assert not table.has_header
+    assert list(table.frame.columns) == ["1", "2", "3"]
+    np.testing.assert_array_equal(table.numbers("2"), [-60, 100])
+
+
+def test_whole_numbers_may_be_names(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("x,y,17,42\n0,1,-60,-70\n")
+    assert list(read_table(tmp_path / "t.csv").frame.columns) == ["x", "y", "17", "42"]
+
+
+def test_text_in_code_page_1252_is_read(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_bytes("x;y;Küche\n1;2;-60\n".encode("cp1252"))
+    table = read_table(tmp_path / "t.csv")
+    assert "Küche" in table.frame
+    assert "cp1252" in table.notes[0]
+
+
+REFUSED = {
+    "x,y,rssi\n1,2,-60\n1,2\n": "line 3: 2 fields, but the first line has 3; correct or remove",
+    "# c\nx,y,rssi\n1,2,-60,5\n": "line 3: 4 fields",
+    "x,y,x\n1,2,3\n": "line 1: the header has twice the column x",
+    "\n# nothing\n": "empty; give a row",
+    "x,y,rssi\n": "no rows; give one",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_damaged_text_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=REFUSED[text]):
+        read_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet", "t.xlsx"])
+def test_missing_and_damaged_files_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"{name}: missing"):
+        read_table(tmp_path / name)
+    (tmp_path / name).write_bytes(b"\x00\x81\x8d\xff" * 9)
+    with pytest.raises(InputError, match=name):
+        read_table(tmp_path / name)
+
+
+def test_text_in_a_column_of_numbers_is_refused_with_its_file_and_row(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x,rssi\n1,-60\n2,-61\n")
+    (tmp_path / "b.csv").write_text("x,rssi\n1,-60\n2,weak\n")
+    table = joined([read_table(tmp_path / name) for name in ("a.csv", "b.csv")])
+    assert len(table) == 4
+    with pytest.raises(InputError, match=r"b\.csv: row 2: rssi is 'weak'; give a number"):
+        table.numbers("rssi")
+    (tmp_path / "c.csv").write_text("x,rssi\n1,-60\n1e300,-61\n")
+    with pytest.raises(InputError, match=r"c\.csv: row 2: x is '1e\+300'; give a number of single precision"):
+        read_table(tmp_path / "c.csv").numbers("x")
+
+
+def test_tables_beyond_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "t.csv").write_text("x,y\n" + "1,2\n" * 6)
+    monkeypatch.setattr(files, "MOST_FIELDS", 11)
+    with pytest.raises(InputError, match="6 rows of 2 columns are more than the 11 fields"):
+        read_table(tmp_path / "t.csv")
+
+
+def test_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(files, "import_module", absent)
+    with pytest.raises(InputError, match=r"data import needs pandas: pip install 'wrf-mi\[tables\]'"):
+        read_table(tmp_path / "t.csv")
+    assert importlib.import_module("pandas") is pandas

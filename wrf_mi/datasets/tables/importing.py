@@ -1,0 +1,350 @@
+"""Import of tables of signal strengths into a folder that all commands read."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ...core import DataFault, InputError, Receiver, Record
+from ...core.angles import FloatArray
+from ...core.files import one_line
+from ...core.types import IntArray
+from ..ble_folder import CARRIER_HZ, write_ble_folder
+from .columns import HERTZ, Columns, described, find_columns, parsed_columns, unit_of
+from .files import Table, joined, read_table
+from .further import further_columns
+from .options import ImportOptions
+from .picture import plan_picture
+from .places import (
+    POSITION_DIGITS,
+    LocalFrame,
+    find_frame,
+    finite_columns,
+    floor_numbers,
+    headings_rad,
+    place_numbers,
+    plane_columns,
+    unit_scale,
+)
+from .positions_file import with_cells, with_positions
+from .readings import (
+    Means,
+    Readings,
+    chosen,
+    listed,
+    mean_strengths,
+    merged,
+    read_readings,
+    virtual_networks,
+    without_not_heard,
+)
+from .receivers_table import read_receivers
+
+FACTS, PICTURE = "import.yml", "plan.png"
+"""Files beside the tables: what the import assumed, and a plan of the rows."""
+MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
+MOST_CELLS = 50_000_000
+"""Largest number of receivers times places: 2 GB while means are computed."""
+TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
+
+
+STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What `import_measurements` wrote.
+
+    Attributes:
+        folder: the data set.
+        record: its content.
+        columns: lines of a table: column, meaning, unit and number of values.
+        notes: what was found and assumed.
+    """
+
+    folder: Path
+    record: Record
+    columns: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def import_measurements(
+    files: str | Path | Sequence[str | Path], out: str | Path, replace: bool = False, **options: Any
+) -> ImportReport:
+    r"""Make a data set of signal strengths from tables as people have them.
+
+    A table has a column for each receiver, or a row for each reading with an id and a strength. Readings of a receiver
+    at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
+
+    Args:
+        files: tables in CSV, Parquet or Excel; their rows train, unless there is a column ``split``.
+        out: folder to write.
+        replace: whether an existing folder is replaced.
+        options: attributes of `ImportOptions`.
+
+    Raises:
+        InputError: an unknown option, a table or a field that cannot be understood, or a folder that exists.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> rows = ["x,y,bssid,rssi", "0,0,hall,-50", "0,0,hall,-52", "2,0,hall,-60", "2,0,attic,-71"]
+    >>> _ = (folder / "scans.csv").write_text("\n".join(rows))
+    >>> report = import_measurements(folder / "scans.csv", folder / "office")
+    >>> [receiver.name for receiver in report.record.receivers]
+    ['hall', 'attic']
+    >>> report.record.observation
+    array([[-51., -60.],
+           [ nan, -71.]], dtype=float32)
+    """
+    if unknown := set(options) - {attribute.name for attribute in dataclasses.fields(ImportOptions)}:
+        raise InputError(f"import_measurements: no option {min(unknown)}; see ImportOptions")
+    if Path(out).exists() and not replace:
+        raise InputError(f"{out}: exists; remove it or choose another folder")
+    chosen_options = ImportOptions(**options)
+    files = [files] if isinstance(files, str | Path) else list(files)
+    return _Import(files, Path(out), chosen_options).run(replace)
+
+
+class _Import:
+    """One import: its table, columns and notes, which each step extends."""
+
+    def __init__(self, files: Sequence[str | Path], out: Path, options: ImportOptions) -> None:
+        self.out, self.options, self.notes = out, options, list[str]()
+        stated = options.columns
+        self.stated = parsed_columns(stated) if isinstance(stated, str) else dict(stated)
+        self.table, self.is_test = self._read(files)
+        if "cell" in self.stated:
+            self.table = with_cells(self.table, self.stated["cell"])
+        self.notes += self.table.notes
+        self.columns = find_columns(self.table, self.stated, options.receivers)
+        self.units: dict[str, str] = {}
+        self.carrier_of: dict[str, float] = {}
+        self.facts: dict[str, Any] = {"files": [path.name for path, _ in self.table.files]}
+
+    def run(self, replace: bool) -> ImportReport:
+        """Read, average and write."""
+        frame, xyz_m = self._positions()
+        readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
+        self.notes += notes
+        if not len(readings.dbm):
+            raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
+        conditions = self._conditions(readings)
+        place = place_numbers(
+            {"z": xyz_m[:, 2], **conditions, "part": self.is_test}, xyz_m[:, :2], self.options.place_m
+        )
+        count = np.bincount(place)
+        first = np.unique(place, return_index=True)[1]
+        readings, means = self._means(readings, place, len(count))
+        position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
+        receivers, notes = self._receivers(readings, frame)
+        self.notes += notes
+        record = self._record(means, position_m, receivers)
+        conditions = {name: values[first] for name, values in conditions.items()}
+        record = self._with_conditions(record, conditions)
+        record = self._with_split(record, self.is_test[first])
+        further, notes = further_columns(self.table, self.columns, readings, place)
+        self.notes += [*notes, *_reciprocity(self.columns)]
+        lines = described(self.table, self.columns, self.units)
+        self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
+        extra: dict[str, str | bytes] = {
+            FACTS: yaml.safe_dump(self.facts, sort_keys=False, allow_unicode=True, width=120),
+            PICTURE: plan_picture(record),
+        }
+        write_ble_folder(self.out, record, replace, extra, further)
+        return ImportReport(self.out, record, tuple(lines), tuple(self.notes))
+
+    def _read(self, files: Sequence[str | Path]) -> tuple[Table, NDArray[np.bool_]]:
+        """All rows with their positions, and which of them test."""
+        options = self.options
+        paths = [*files, *options.test]
+        tables, positions = [read_table(path) for path in paths], [read_table(path) for path in options.positions]
+        if len(positions) not in (0, 1, len(paths)):
+            text = f"{len(positions)} files of positions for {len(paths)} tables"
+            raise InputError(f"--positions: {text}; give one for each table, those of --test last, or one for all")
+        if positions:
+            positions *= len(paths) // len(positions)
+            pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
+            tables = [table for table, _ in pairs]
+            self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
+        rows = [len(table) for table in tables]
+        is_test = np.repeat([number >= len(files) for number in range(len(paths))], rows)
+        table = joined(tables)
+        for name, text in options.where.items():
+            chosen_rows = table.where(name, text)
+            left_out = len(table) - np.count_nonzero(chosen_rows)
+            self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
+            table, is_test = dataclasses.replace(table, frame=table.frame[chosen_rows]), is_test[chosen_rows]
+        return table, is_test
+
+    def _positions(self) -> tuple[LocalFrame, FloatArray]:
+        """The local frame and the positions [rows, 3] in it."""
+        options, table, of = self.options, self.table, self.columns.of
+        first, second, geographic = plane_columns(of, table)
+        xy = finite_columns(table, [first, second])
+        unit = options.units or self.columns.unit("lon" if geographic else "x")
+        scale_m = options.pitch_m or unit_scale(unit, "--units")
+        frame, notes = find_frame(xy, geographic, unit, scale_m, options.crs)
+        self.notes += notes
+        if not options.pitch_m and (xy == np.round(xy)).all() and np.ptp(xy, axis=0).max() < MOST_STEPS:
+            self.notes.append("x and y are whole numbers: if they are indices of a grid, state its pitch by --pitch-m")
+        shown = f"steps of {options.pitch_m:g} m" if options.pitch_m else frame.crs or unit or "m"
+        self.units |= dict.fromkeys(("x", "y", "lat", "lon"), shown)
+        return frame, np.column_stack([frame.local_m(xy), self._heights_m()])
+
+    def _heights_m(self) -> FloatArray:
+        """Heights of the rows, from z, the floor, or an assumption."""
+        options, table, of = self.options, self.table, self.columns.of
+        if "z" in of:
+            self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
+            return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
+        if "floor" in of:
+            self.notes.append(f"z is {options.height_m:g} m above the floor, storeys are {options.storey_m:g} m high")
+            return options.height_m + options.storey_m * floor_numbers(table, of["floor"])
+        self.notes.append(f"no column z: all rows are {options.height_m:g} m above the floor (--height-m)")
+        return np.full(len(table), options.height_m)
+
+    def _conditions(self, readings: Readings) -> dict[str, Any]:
+        """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
+        of, table, conditions = self.columns.of, self.table, {}
+        if "split" in of:
+            self.is_test = self.is_test | _test_rows(table, of["split"])
+        if "heading" in of:
+            values = table.numbers(of["heading"])
+            if np.isfinite(values).all():
+                heading_rad, self.units["heading"] = headings_rad(values, of["heading"], self.options.heading)
+                conditions["heading"] = heading_rad
+            else:
+                self.notes.append(f"{of['heading']} is empty in {np.isnan(values).sum()} rows: no headings are used")
+        if "run" in of:
+            runs = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
+            if not table.frame[of["run"]].isna().any() and (runs != "").all():
+                conditions["run"] = runs
+        if "frequency" in of and not self.options.frequency_hz:
+            self.units["frequency"] = "-> Hz"
+            conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
+        return conditions
+
+    def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
+        """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
+        pairs = np.unique(np.column_stack([readings.receiver, carriers_hz[readings.row]]), axis=0)
+        if len(np.unique(pairs[:, 1])) > 1 and len(pairs) == len(np.unique(pairs[:, 0])):
+            self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in pairs}
+            return {}
+        return {"frequency_hz": carriers_hz}
+
+    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[Readings, Means]:
+        """Readings of the receivers that remain, and their means at each place."""
+        options = self.options
+        if places * len(readings.ids) > MOST_CELLS:
+            text = (
+                f"{places} places of {len(readings.ids)} receivers are more than the {MOST_CELLS} that fit into memory"
+            )
+            raise InputError(f"{self.out}: {text}; average by --place-m, or leave receivers out by --receivers")
+        means = mean_strengths(readings, place, places, options.average)
+        groups = virtual_networks(readings.ids, means.dbm)
+        if groups:
+            names = "; ".join(listed([readings.ids[number] for number in group]) for group in groups[:3])
+            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios ({names})"
+            self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
+            if options.merge_radios:
+                readings = merged(readings, groups)
+                means = mean_strengths(readings, place, places, options.average)
+        trains = ~self.is_test[np.unique(place, return_index=True)[1]]
+        heard = (means.count[:, trains] > 0).sum(axis=1)
+        remaining = np.flatnonzero(heard >= max(1, options.min_heard))
+        if len(out := np.setdiff1d(np.arange(len(heard)), remaining)):
+            names = listed([readings.ids[number] for number in out])
+            text = f"{len(out)} of {len(heard)} receivers were heard in fewer than {max(1, options.min_heard)} training"
+            self.notes.append(f"{text} rows and are left out (--min-heard): {names}")
+        if not len(remaining):
+            raise InputError(
+                f"{self.out}: no receiver was heard in {options.min_heard} training rows; lower --min-heard"
+            )
+        readings = chosen(readings, remaining)
+        return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
+
+    def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
+        """Receivers with the carriers of their readings, if these state any."""
+        options = self.options
+        table = None if options.anchors is None else read_table(options.anchors)
+        receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
+        carriers = [
+            self.carrier_of.get(name, rx.frequency_hz) for name, rx in zip(readings.ids, receivers, strict=True)
+        ]
+        if None in carriers or options.frequency_hz:
+            carriers = [None] * len(carriers)
+        pairs = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in pairs), notes
+
+    def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
+        averaged = bool((means.count > 1).any())
+        if averaged:
+            most, what = int(means.count.max()), {"db": "dB", "mw": "mW"}[self.options.average]
+            readings = (
+                f"{means.count.sum()} readings at {len(position_m)} places are averaged in {what}, up to {most} each"
+            )
+            self.notes.append(f"{readings}; count_ and std_ are their number and the noise of the mean")
+        carrier_hz = self.options.frequency_hz or CARRIER_HZ
+        stated = "frequency" in self.columns.of or receivers[0].frequency_hz
+        if not self.options.frequency_hz and not stated:
+            self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency-hz)")
+        return Record(
+            name=self.out.name,
+            task="rssi",
+            tx_pos_m=position_m,
+            receivers=receivers,
+            observation=means.dbm.round(STRENGTH_DIGITS).astype(np.float32),
+            frequencies_hz=np.array([carrier_hz]),
+            n_readings=means.count if averaged else None,
+            std=means.std.round(STRENGTH_DIGITS) if averaged else None,
+        )
+
+    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]]) -> Record:
+        carriers_hz = conditions.get("frequency_hz")
+        record = dataclasses.replace(record, tx_heading_rad=conditions.get("heading"), runs=conditions.get("run"))
+        if (of_receivers := record.receiver_carriers_hz) is not None:
+            return record.at_receiver_carriers(of_receivers)
+        return record if carriers_hz is None else record.at_carriers(carriers_hz)
+
+    def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
+        """The record with its official split, if test rows are stated."""
+        if not is_test.any() or is_test.all():
+            self.notes.append(
+                "no test rows are stated: train scores folds in space, then fits all rows (--split none, the default)"
+            )
+            return record
+        official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
+        self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")
+        return dataclasses.replace(record, official=official)
+
+
+def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
+    words = table.frame[column].astype(str).str.strip().str.lower().to_numpy(str)
+    known = np.isin(words, (*TRAIN_WORDS, *TEST_WORDS))
+    if len(wrong := np.flatnonzero(~known)):
+        text = f"{one_line(column)} is {one_line(words[wrong[0]])!r}; give train or test, or --columns split=-"
+        raise table.fault(text, int(wrong[0]))
+    return np.isin(words, TEST_WORDS)
+
+
+def _hertz(table: Table, column: str) -> FloatArray:
+    """Carriers in Hz, from the unit of their column or else by their size."""
+    values = finite_columns(table, [column])[:, 0]
+    if (wrong := values <= 0).any():
+        row = int(np.argmax(wrong))
+        raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
+    largest = values.max()
+    return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
+
+
+def _reciprocity(columns: Columns) -> list[str]:
+    what = one_line(columns.of["id"]) if "id" in columns.of else "the columns of strengths"
+    text = f"the fixed ends, named by {what}, are the receivers, and the moving end is the transmitter"
+    return [f"{text}: by reciprocity it does not matter who sends"]

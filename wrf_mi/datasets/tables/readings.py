@@ -1,0 +1,206 @@
+"""Single readings of a table: numbers for "not heard", virtual networks of one radio, and means of places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ...core.angles import FloatArray
+from ...core.files import one_line
+from ...core.types import IntArray
+from ..receivers_file import plain_id
+from ..sentinels import CUSTOMARY_DBM, suspicious_values
+from .columns import MAC, Columns
+from .files import Table, package
+
+MOST_SHOWN = 6
+POOLED_READINGS = 4.0
+"""Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""
+LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
+FEWEST_SHARED, LEAST_CORRELATION, MOST_DIFFERENCE_DB = 5, 0.8, 3.0
+"""Places at which two networks were heard, correlation and median difference from which they are one radio's: the bands
+of one access point differ by more, and so do neighbouring access points."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Single signal strengths.
+
+    Attributes:
+        ids: id of each receiver, a whole number in normal form or a name.
+        row: row of the table of each reading [k].
+        receiver: number of its receiver [k].
+        dbm: its strength [k].
+    """
+
+    ids: tuple[str, ...]
+    row: IntArray
+    receiver: IntArray
+    dbm: FloatArray
+
+
+def normal_id(text: str) -> str:
+    """An id as the layout reads it, without slashes, which it refuses."""
+    return re.sub(r"[/\\]", "-", plain_id(one_line(text)))
+
+
+def read_readings(table: Table, columns: Columns) -> Readings:
+    """All readings of a table that are not empty, in the order of its rows."""
+    if "rssi" in columns.of and not columns.strengths:
+        dbm, texts = table.numbers(columns.of["rssi"]), table.frame[columns.of["id"]]
+        codes, values = package("pandas").factorize(texts)
+        ids = [normal_id(str(value)) for value in values]
+        wrong = np.flatnonzero((codes < 0) & ~np.isnan(dbm))
+        if len(wrong):
+            raise table.fault(f"{one_line(columns.of['id'])} is empty; name the receiver of the reading", int(wrong[0]))
+        rows = np.flatnonzero(~np.isnan(dbm))
+        return _distinct(Readings(tuple(ids), rows, codes[rows].astype(np.int64), dbm[rows]))
+    parts = []
+    for number, name in enumerate(columns.strengths):
+        dbm = table.numbers(name)
+        rows = np.flatnonzero(~np.isnan(dbm))
+        parts.append((rows, np.full(len(rows), number), dbm[rows]))
+    rows, receivers, dbm = (np.concatenate(values) for values in zip(*parts, strict=True))
+    names = tuple(normal_id(name) for name in columns.strengths.values())
+    return _distinct(Readings(names, rows, receivers, dbm))
+
+
+def _distinct(readings: Readings) -> Readings:
+    """Readings in which receivers with one id (7 and 7.0) are one."""
+    number_of = {name: number for number, name in enumerate(dict.fromkeys(readings.ids))}
+    number = np.array([number_of[name] for name in readings.ids], np.int64)
+    return replace(readings, ids=tuple(number_of), receiver=number[readings.receiver])
+
+
+def without_not_heard(readings: Readings, stated: Sequence[float] | None) -> tuple[Readings, list[str], list[float]]:
+    """Readings without numbers for "not heard", what was found in words, and these numbers.
+
+    Numbers are the ``stated`` ones; for None those apart from all strengths of a receiver or of all together, and
+    customary ones (-100, -101, ...) at the lower end of all that adjoin the strengths but are far more frequent.
+    """
+    notes = []
+    if stated is None:
+        stated, unclear = _marks(readings)
+        for dbm in unclear:
+            text = f"{dbm:g} dBm is far more frequent ({np.mean(readings.dbm == dbm):.1%} of all readings)"
+            notes.append(f"{text} than the strengths next to it: kept; --not-heard {dbm:g} leaves it out")
+    for dbm in stated:
+        notes.append(f"{dbm:g} is not heard: {np.count_nonzero(readings.dbm == dbm)} readings are empty fields")
+    heard = ~np.isin(readings.dbm, list(stated))
+    part = replace(readings, row=readings.row[heard], receiver=readings.receiver[heard], dbm=readings.dbm[heard])
+    return part, notes, [float(dbm) for dbm in stated]
+
+
+def _marks(readings: Readings) -> tuple[list[float], list[float]]:
+    """Numbers for "not heard", and numbers that may be strengths clipped at the sensitivity."""
+    order = np.argsort(readings.receiver, kind="stable")
+    ends = np.searchsorted(readings.receiver[order], np.arange(1, len(readings.ids)))
+    apart: set[float] = set()
+    unclear: set[float] = set()
+    lowest = readings.dbm.min(initial=np.inf)
+    for part in [readings.dbm, *np.split(readings.dbm[order], ends)]:
+        for value in suspicious_values(part):
+            # One receiver's strengths may pile up at -100 dBm by chance, those of all receivers do not.
+            customary = value.dbm in CUSTOMARY_DBM and value.dbm == lowest and len(part) == len(readings.dbm)
+            (unclear if value.adjoins and not customary else apart).add(value.dbm)
+    return sorted(apart), sorted(unclear - apart)
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of the readings of each receiver at each place.
+
+    Attributes:
+        dbm: mean strength [n_rx, n], NaN where nothing was received.
+        count: number of readings [n_rx, n].
+        std: standard deviation of the noise of the mean in dB [n_rx, n], NaN where nothing was received.
+    """
+
+    dbm: FloatArray
+    count: IntArray
+    std: FloatArray
+
+
+def mean_strengths(readings: Readings, place: IntArray, places: int, average: str) -> Means:
+    """Means over the readings of each place, in dB or of the powers in mW.
+
+    The variance of a reading at a place is that of its readings, pooled with the mean variance of all places with the
+    weight of four readings (Smyth, Stat. Appl. Genet. Mol. Biol. 3, 2004, with fixed degrees of freedom of the prior).
+    """
+    shape = (len(readings.ids), places)
+    cell = readings.receiver * places + place[readings.row]
+
+    def total(values: FloatArray | None = None) -> NDArray[np.float64]:
+        return np.bincount(cell, values, minlength=shape[0] * shape[1]).astype(float)
+
+    count = total()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean_db = total(readings.dbm) / count
+        squares = np.nan_to_num(total((readings.dbm - mean_db[cell]) ** 2))
+        dbm = mean_db if average == "db" else 10 * np.log10(total(10 ** (readings.dbm / 10)) / count)
+        freedom = np.maximum(count - 1, 0)
+        pooled = squares.sum() / max(freedom.sum(), 1)
+        variance = (squares + POOLED_READINGS * pooled) / (freedom + POOLED_READINGS)
+        std = np.where(count > 0, np.maximum(np.sqrt(variance / count), LEAST_STD_DB), np.nan)
+    return Means(dbm.reshape(shape), count.reshape(shape).astype(np.int64), std.reshape(shape))
+
+
+def virtual_networks(ids: Sequence[str], dbm: FloatArray) -> list[list[int]]:
+    """Groups of receivers that are networks of one radio, by their hardware addresses and strengths [n_rx, n].
+
+    Addresses of a radio's networks differ in the last digit or in the first byte, which marks local administration.
+    """
+    by_address: dict[str, list[int]] = {}
+    for number, name in enumerate(ids):
+        if MAC.fullmatch(name):
+            by_address.setdefault(re.sub("[^0-9a-f]", "", name.lower())[2:-1], []).append(number)
+    candidates = [pair for numbers in by_address.values() for pair in combinations(numbers, 2)]
+    pairs = [pair for pair in candidates if _is_one_radio(dbm[pair[0]], dbm[pair[1]])]
+    if not pairs:
+        return []
+    graph = coo_array((np.ones(len(pairs)), np.array(pairs).T), shape=(len(ids), len(ids)))
+    radio = connected_components(graph, directed=False)[1]
+    return [np.flatnonzero(radio == number).tolist() for number in np.flatnonzero(np.bincount(radio) > 1)]
+
+
+def _is_one_radio(first_dbm: FloatArray, second_dbm: FloatArray) -> bool:
+    both = ~np.isnan(first_dbm) & ~np.isnan(second_dbm)
+    first, second = first_dbm[both], second_dbm[both]
+    if len(first) < FEWEST_SHARED or np.abs(np.median(first - second)) > MOST_DIFFERENCE_DB:
+        return False
+    if not np.ptp(first) or not np.ptp(second):
+        return bool(not np.ptp(first) and not np.ptp(second))
+    return bool(np.corrcoef(first, second)[0, 1] >= LEAST_CORRELATION)
+
+
+def merged(readings: Readings, groups: Sequence[Sequence[int]]) -> Readings:
+    """Readings in which each group of receivers is its first one."""
+    number = np.arange(len(readings.ids))
+    for first, *others in groups:
+        number[others] = first
+    remaining = np.unique(number)
+    ids = tuple(readings.ids[k] for k in remaining)
+    return replace(readings, ids=ids, receiver=np.searchsorted(remaining, number)[readings.receiver])
+
+
+def chosen(readings: Readings, receivers: IntArray) -> Readings:
+    """Readings of some receivers."""
+    number = np.full(len(readings.ids), -1)
+    number[receivers] = np.arange(len(receivers))
+    renumbered = number[readings.receiver]
+    part = renumbered >= 0
+    ids = tuple(readings.ids[k] for k in receivers)
+    return Readings(ids, readings.row[part], renumbered[part], readings.dbm[part])
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and the number of the others."""
+    more = f" and {len(names) - MOST_SHOWN} more" if len(names) > MOST_SHOWN else ""
+    return ", ".join(names[:MOST_SHOWN]) + more
