@@ -85,10 +85,8 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
                 raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
             if plugin in MESHES:
                 content = _mesh_content(shape)
-            elif (mesh := _unit_shape(plugin)) is not None:
-                content = _placed_content(mesh, shape, root.get("version", ""), f"{path}: {name}")
             else:
-                continue
+                content = _placed_content(shape, root.get("version", ""), f"{path}: {name}")
         except InputError as error:
             raise InputError(f"{path}: {name}: {one_line(error)}") from None
         if content is None:
@@ -124,13 +122,13 @@ def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) 
     corners = np.asarray(mesh.vertices, np.float32)[mesh.faces]
     if not np.isfinite(corners).all():
         raise InputError(f"{file}: an invalid vertex position, not a finite number; correct it")
-    if _same_triangles(corners, _triangles_by_mitsuba(file, plugin)):
+    if same_triangles(corners, triangles_by_mitsuba(file, plugin)):
         return None
     logger.info("%s: read as %d triangles, which Mitsuba reads otherwise or not at all", file, len(corners))
     return plain_ply(mesh)
 
 
-def _triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
+def triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
     """Corners [f, 3, 3] of a mesh file as Mitsuba reads it; none where it refuses the file."""
     import mitsuba as mi
 
@@ -157,7 +155,7 @@ def _quiet_mitsuba() -> Iterator[None]:
         mi.set_log_level(level)
 
 
-def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
+def same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
     """Whether triangles [f, 3, 3] are the same, in any order and with any order of their corners."""
     if first.shape != second.shape or np.array_equal(first, second):
         return first.shape == second.shape
@@ -166,30 +164,61 @@ def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> 
     return all(np.array_equal(*(part[np.lexsort(part.T)][:, k] for part in rows)) for k in range(3))
 
 
-def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: str) -> bytes:
-    """PLY of a unit shape's mesh in the scene's frame; the shape loses its parameters."""
+def placed_mesh(shape: Element, version: str) -> trimesh.Trimesh | None:
+    """Mesh of a shape without a file in the scene's frame; None for another shape.
+
+    Args:
+        shape: a cube, rectangle, disk, cylinder or sphere.
+        version: version of its scene file; older ones have other names of parameters.
+
+    Returns:
+        The mesh, with the matrix that places it as ``to_world`` in its metadata.
+
+    Raises:
+        InputError: a parameter that Mitsuba does not know, or no area.
+    """
     import mitsuba as mi
 
+    plugin = shape.get("type", "")
+    mesh = trimesh.creation.box((2, 2, 2)) if plugin == "cube" else _unit_shape(plugin)
+    if mesh is None:
+        return None
     # Mitsuba reads the parameters: its to_world then holds centre, radius and ends, too, and it names unknown ones.
-    alone = Element("scene", version=version)  # older versions have other names of parameters
-    stated = SubElement(alone, "shape", type=shape.get("type", ""))
+    alone = Element("scene", version=version)
+    stated = SubElement(alone, "shape", type=plugin)
     stated.extend([child for child in shape if child.tag in VALUES])
-    for child in stated:
-        shape.remove(child)
     try:
         with _quiet_mitsuba():
             loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
-        to_world = mi.traverse(loaded.shapes()[0])["to_world"].matrix.numpy().reshape(4, 4).astype(float)
+        parameters = mi.traverse(loaded.shapes()[0])
+        if "to_world" in parameters:
+            to_world = parameters["to_world"].matrix.numpy().reshape(4, 4).astype(float)
+        else:  # a cube is a mesh, whose vertices are placed
+            corners = np.asarray(parameters["vertex_positions"].numpy().reshape(-1, 3), float)
+            faces = parameters["faces"].numpy().reshape(-1, 3)
+            mesh, to_world = trimesh.Trimesh(corners, faces, process=False), np.eye(4)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"cannot be opened ({reason(error)}); correct the shape") from None
-    placed = mesh.copy()
     if np.isfinite(to_world).all():
-        placed.apply_transform(to_world)
-    if not np.isfinite(to_world).all() or not placed.area_faces.min() > 0:
+        mesh.apply_transform(to_world)
+    if not np.isfinite(mesh.vertices).all() or not np.isfinite(to_world).all() or not mesh.area_faces.min() > 0:
         raise InputError("has no area; give a radius and a transform that leave one")
-    if (plugin := shape.get("type", "")) != "rectangle":
+    mesh.metadata["to_world"] = to_world
+    return mesh
+
+
+def _placed_content(shape: Element, version: str, where: str) -> bytes | None:
+    """PLY of `placed_mesh` where Mitsuba has no triangles; the shape then loses its parameters."""
+    plugin = shape.get("type", "")
+    placed = None if plugin == "cube" else placed_mesh(shape, version)
+    if placed is None:
+        return None
+    for child in [child for child in shape if child.tag in VALUES]:
+        shape.remove(child)
+    if plugin != "rectangle":
         # Facets of a sphere lie off it by both the angle between meridians and that between parallels.
         round_axes, angles = (3, 2) if plugin == "sphere" else (2, 1)
+        to_world = placed.metadata["to_world"]
         off_m = (1 - np.cos(np.pi / SEGMENTS) ** angles) * np.linalg.norm(to_world[:3, :round_axes], 2)
         logger.info("%s: a %s as %d triangles, up to %.2g m off it", where, plugin, len(placed.faces), off_m)
     return plain_ply(placed)
