@@ -33,7 +33,10 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "shape-type": ("fault", "sphere, cylinder or disk, which has no triangles"),
     "unsupported-shape": ("fault", "shape that Sionna RT does not open, such as an instance"),
     "no-shapes": ("fault", "scene without a shape"),
-    "transform": ("fault", "to_world that is not finite or leaves no volume"),
+    "transform": (
+        "fault",
+        "to_world that is not finite, leaves no volume, or turns about an axis that is no unit vector",
+    ),
     "moved": ("note", "to_world, which is applied when the scene is opened: the mesh file has other coordinates"),
     "pictures": ("note", "emitters, sensors or integrators, which are for pictures"),
     "folder": ("fault", "scene folder whose scene.yml or materials.yml is damaged"),

@@ -25,6 +25,7 @@ from .triangle_faults import copies, double_sheets, is_flat, open_solids, withou
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
 MEMORY_BINARY = 12
 SINGULAR = 1e-9  # least ratio of the scales of a transform
+UNIT = 1e-3  # largest deviation of the length of an axis of rotation from 1
 MOST_CORNERS = 2000  # corners of a polygon that is not convex: crossings of its edges grow with the square
 RESTORE = "export the mesh anew"
 
@@ -55,7 +56,7 @@ def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
             continue
         matrix = to_world(scene, shape)
         if isinstance(matrix, str):
-            remedy = "correct the transform: three scales other than 0, finite numbers"
+            remedy = "correct the transform: scales other than 0, axes of length 1, finite numbers"
             yield Finding("transform", scene.path, name, matrix, remedy)
             continue
         if plugin not in ("ply", "obj"):
@@ -116,8 +117,10 @@ def _step(step: Element) -> FloatArray:
         case "scale":
             return np.diag([*_vector(step, neutral), 1.0])
         case "rotate":
-            angle = np.radians(_numbers(step.get("angle", "0"), 1)[0])
-            return np.asarray(trimesh.transformations.rotation_matrix(angle, _vector(step, neutral)))
+            angle, axis = np.radians(_numbers(step.get("angle", "0"), 1)[0]), _vector(step, neutral)
+            if abs(np.linalg.norm(axis) - 1) > UNIT:
+                raise ValueError("its axis is no unit vector, with which Mitsuba shears the mesh")
+            return np.asarray(trimesh.transformations.rotation_matrix(angle, axis))
         case "matrix":
             values = _numbers(step.get("value", ""))
             if len(values) == 9:

@@ -223,14 +223,25 @@ class _Work:
 
     def _cleaned(self, parts: Sequence[Part]) -> list[Part]:
         """Parts near the origin, without degenerate and doubled faces and double sheets, wound one way."""
-        if parts and max(float(np.abs(part.corners_m).max(initial=0)) for part in parts) >= FARTHEST_M:
-            low = np.concatenate([part.corners_m.reshape(-1, 3) for part in parts]).min(axis=0)
-            self._origin_m = np.where(np.abs(low) < 1000, 0, np.floor(low / 100) * 100)
-            text = ", ".join(f"{value:.12g}" for value in self._origin_m)
-            self.done.append(f"origin: {text} m subtracted; subtract it from the positions of the measurements, too")
-        parts = [replace(part, corners_m=part.corners_m - self._origin_m) for part in parts]
-        parts = [self._without_degenerate(part) for part in self._without_double_sheets(parts)]
+        parts = self._without_double_sheets(self._near_origin(parts))
+        parts = [self._without_degenerate(part) for part in parts]
         return [self._wound_one_way(part) for part in self._without_copies(parts) if len(part.corners_m)]
+
+    def _near_origin(self, parts: Sequence[Part]) -> list[Part]:
+        """Parts moved together by whole hundreds of metres where they are far from the origin."""
+        far = [part for part in parts if np.abs(part.corners_m).max(initial=0) >= FARTHEST_M]
+        if not far:
+            return list(parts)
+        low = np.concatenate([part.corners_m.reshape(-1, 3) for part in parts]).min(axis=0)
+        self._origin_m = np.where(np.abs(low) < 1000, 0, np.floor(low / 100) * 100)
+        parts = [replace(part, corners_m=part.corners_m - self._origin_m) for part in parts]
+        for part in parts:
+            if np.abs(part.corners_m).max(initial=0) >= FARTHEST_M:
+                text = "lies kilometres from other shapes"
+                self.unrepaired.append(Finding("far", part.file, part.name, text, "correct its coordinates"))
+        text = ", ".join(f"{value:.12g}" for value in self._origin_m)
+        self.done.append(f"origin: {text} m subtracted; subtract it from the positions of the measurements, too")
+        return parts
 
     def _without_degenerate(self, part: Part) -> Part:
         empty = without_area(part.corners_m)

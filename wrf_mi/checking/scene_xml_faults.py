@@ -304,7 +304,7 @@ def _shape(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
         yield Finding("parameter", path, name, "has no file", 'give one: <string name="filename" value="..."/>')
     stated = scene.file_of(shape)
     suffix = Path(stated or "").suffix.lower().removeprefix(".")
-    if plugin in ("ply", "obj") and stated and suffix != plugin:
+    if plugin in ("ply", "obj") and stated and "$" not in stated and suffix != plugin:
         text = f"of type {plugin!r}, with the file {stated[-60:]!r}"
         yield Finding("mesh", path, name, text, "give a file of that type, converted if need be")
 
@@ -322,7 +322,7 @@ def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     for identifier, bsdf in materials:
         if bsdf is None:
             yield Finding("unknown-reference", path, name, f"no <bsdf> has the id {identifier[:60]!r}", GIVE)
-        elif not is_itu(identifier) and bsdf.get("type") not in RADIO:
+        elif not is_itu(identifier) and bsdf.get("type") not in RADIO and identifier.removeprefix(DASH) not in ITU:
             nested = any(inner.get("type") in RADIO for inner in bsdf.iter("bsdf"))
             within = ", around a radio material" if nested else ""
             text = f"its material {identifier!r} is {bsdf.get('type')!r}{within}, no radio material"

@@ -19,8 +19,8 @@ from ..scene.mesh.surfaces import Body, shared_edges
 NEAREST_M, FARTHEST_M = 3e-6, 3e-3
 """Distances of parallel sheets between which a path that passes both is lost.
 
-A ray that goes on behind a face starts a little off it: nearer sheets are passed together, as one. Farther ones are
-two walls of a thin solid, such as a pane of glass."""
+A ray that goes on behind a face starts a little off it: sheets nearer than that are passed together. In Sionna RT 2.2
+paths were lost up to 7 mm in a room; the bound leaves out panes of glass."""
 SHRUNK = 0.98  # size of triangles that are compared, so that neighbours in a plane do not touch
 NORMAL_STEP = 2e-3  # step to which normals are rounded: parallel sheets agree to single precision
 SIDE = np.array([0.9, 0.41, 0.17])

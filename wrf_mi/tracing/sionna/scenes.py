@@ -76,7 +76,15 @@ def load_scene(
         raise InputError(f"{source}: a mesh has no radio material; give one, such as concrete, or {PERFECT}")
     if not mesh and material is not None:
         raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
-    scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
+    try:
+        return _checked(path, source, material if mesh else None), stated_m, laws
+    except InputError as error:
+        raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
+
+
+def _checked(path: Path, source: str | Path, material: str | None) -> Any:
+    """A ``sionna.rt.Scene`` of a scene file, or of a mesh with a material; `InputError` for one that traces wrongly."""
+    scene = _from_xml(path) if material is None else _from_mesh(path, material)
     if not scene.objects:
         raise InputError(f"{source}: holds no surface; give a scene with triangles")
     bounds = scene.mi_scene.bbox()
@@ -85,7 +93,7 @@ def load_scene(
         text = f"{height:.0f} m high, as if in millimetres"
         raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
     require_near(corners_m, source)
-    return scene, stated_m, laws
+    return scene
 
 
 def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float, float]]]:
