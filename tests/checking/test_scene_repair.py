@@ -16,7 +16,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
 from wrf_mi.checking import Repair, check_scene, repair_scene
-from wrf_mi.checking.scene_repair import ascii_name, meant
+from wrf_mi.checking.material_repair import ascii_name, meant
 from wrf_mi.checking.triangle_faults import wound_one_way
 from wrf_mi.core import InputError
 from wrf_mi.tracing.sionna.scenes import open_scene

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from wrf_mi_scenes import scenes
@@ -15,13 +15,13 @@ from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..core.files import one_line
 from ..core.yaml_files import read_yaml
-from ..datasets.folder_files import shown
 from ..scene.coordinates import (
     FARTHEST_M,
     HIGHEST_M,
     LARGEST_M,
     SMALLEST_M,
     UNITS_M,
+    Y_UP,
     Up,
     extent,
     looks_y_up,
@@ -47,10 +47,21 @@ LIGHT_M_PER_S = 299_792_458.0
 PHASE_SHARE = 0.01  # share of a wavelength that rounding may move a surface by: 4 degrees of phase
 FEWEST_POINTS = 1000
 """Points of a scan below which a room's six sides have too few each for a plane's noise."""
-CENTIMETRES_M = 150.0  # height of scenes from which centimetres are suspected; cities with hills have more,
-SLENDER = 1.0  # but not in less length and width than this many heights
+SLENDER = 4.0  # length or width in heights from which a high scene is a city and not a room in centimetres
 SIONNA_HZ = 3.5e9  # carrier of a scene of Sionna RT until another one is set
 VIEWPOINTS = (".e57", ".pcd", ".ptx")  # formats of scans that state where the scanner stood
+
+
+class Largest(NamedTuple):
+    """Bounds of scenes in metres: largest side and height, and the height from which centimetres are suspected."""
+
+    side_m: float
+    height_m: float
+    usual_height_m: float
+
+
+BUILDING = Largest(LARGEST_M, HIGHEST_SCENE_M, HIGHEST_M)
+SCENE = Largest(np.inf, HIGHEST_SCENE_M, 1.5 * HIGHEST_M)  # cities are kilometres wide
 
 
 @dataclass(frozen=True)
@@ -121,26 +132,34 @@ def checked(
     where = locate(source)
     record = data if isinstance(data, Record) or data is None else load_record(data)
     carriers_hz = [frequency_hz] if frequency_hz is not None else _carriers(record)
-    if where.path.suffix.lower() == ".xml":
-        return _check_xml(where, str(source), record, carriers_hz)
-    if not has_faces(where.path):
+    is_xml = where.path.suffix.lower() == ".xml"
+    if not is_xml and not has_faces(where.path):
         return Checked(where, _check_scan(where.path, str(source), units, up), None, ())
-    findings, parts = _split(mesh_file_parts(where.path))
-    scale = UNITS_M[units]
-    placed = [Part(p.name, "", p.file, _upright(p.corners_m, p.file, up) * scale) for p in parts]
-    for part in placed:
-        findings += part_findings(part)
-    findings += between_parts(placed)
-    findings += _places(placed, where.path, record, carriers_hz, is_mesh=True, up=up)
-    count = sum(len(part.corners_m) for part in placed)
-    report = SceneReport(str(source), tuple(findings), shapes=len(placed), faces=count)
-    return Checked(where, report, None, tuple(placed))
+    scene = read_xml(where.path) if is_xml else None
+    if isinstance(scene, Finding):
+        return Checked(where, SceneReport(str(source), (*where.findings, scene)), None, ())
+    results = mesh_file_parts(where.path) if scene is None else scene_parts(scene)
+    findings, parts = list(where.findings), list[Part]()
+    findings += [] if scene is None else _of_file(scene, where, carriers_hz)
+    for result in results:
+        if isinstance(result, Finding):
+            findings.append(result)
+        else:
+            corners_m = _upright(result.corners_m, where.path, up) * UNITS_M[units]
+            parts.append(replace(result, corners_m=corners_m))
+    findings += _of_triangles(parts, where.path, carriers_hz, is_stated=up is not None)
+    findings += [] if record is None else _devices(parts, where.path, record)
+    if scene is not None and not any(finding.level == "fault" for finding in findings):
+        findings += opened(where.path)
+    count = len(parts) if scene is None else len(scene.shapes)
+    faces = sum(len(part.corners_m) for part in parts)
+    return Checked(where, SceneReport(str(source), tuple(findings), count, faces), scene, tuple(parts))
 
 
 def _upright(corners: FloatArray, file: Path, up: Up | None) -> FloatArray:
     """Corners with z up; readers of formats with y up have turned them as their specification states."""
     if up_of(file, None) == "y":
-        return corners if up in (None, "y") else corners @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T
+        return corners if up in (None, "y") else corners @ Y_UP[:3, :3].T
     return turned(corners, up or "z")
 
 
@@ -185,38 +204,16 @@ def _folder(folder: Path) -> Source:
         return Source(xml, findings=(Finding("folder", folder, "", text, remedy),))
 
 
-def _split(results: Iterator[Part | Finding]) -> tuple[list[Finding], list[Part]]:
-    findings, parts = list[Finding](), list[Part]()
-    for result in results:
-        if isinstance(result, Finding):
-            findings.append(result)
-        else:
-            parts.append(result)
-    return findings, parts
-
-
-def _check_xml(where: Source, name: str, record: Record | None, carriers_hz: Sequence[float]) -> Checked:
-    scene = read_xml(where.path)
-    if isinstance(scene, Finding):
-        return Checked(where, SceneReport(name, (*where.findings, scene)), None, ())
-    findings = [*where.findings, *xml_findings(scene)]
+def _of_file(scene: SceneXml, where: Source, carriers_hz: Sequence[float]) -> Iterator[Finding]:
+    """Findings about a scene file, but for thicknesses that its folder states, and its materials at the carriers."""
     stated = {f"<bsdf> mat-{material}" for material in where.thickness_m}
-    findings = [each for each in findings if each.kind != "default-thickness" or each.shape not in stated]
-    about_files, parts = _split(scene_parts(scene))
-    findings += about_files
-    for part in parts:
-        findings += part_findings(part)
-    findings += between_parts(parts)
-    findings += _ranges(scene, carriers_hz)
-    findings += _places(parts, where.path, record, carriers_hz, is_mesh=False)
-    if not any(finding.level == "fault" for finding in findings):
-        findings += _opened(where.path)
-    count = sum(len(part.corners_m) for part in parts)
-    report = SceneReport(name, tuple(findings), shapes=len(scene.shapes), faces=count)
-    return Checked(where, report, scene, tuple(parts))
+    for finding in xml_findings(scene):
+        if finding.kind != "default-thickness" or finding.shape not in stated:
+            yield finding
+    yield from _ranges(scene, carriers_hz)
 
 
-def _opened(path: Path) -> Iterator[Finding]:
+def opened(path: Path) -> Iterator[Finding]:
     """Sionna RT's reason to refuse a scene file in which no fault was found."""
     from sionna import rt
 
@@ -240,19 +237,13 @@ def _carriers(record: Record | None) -> list[float]:
 def _ranges(scene: SceneXml, carriers_hz: Sequence[float]) -> Iterator[Finding]:
     """Materials of ITU-R P.2040 that are not known at the carriers, by shape."""
     for name, shape in scene.shapes:
-        for _, bsdf in scene.materials(shape):
-            material = itu_type(bsdf) if bsdf is not None else None
-            if material is None:
-                continue
-            for hz in carriers_hz or [SIONNA_HZ]:
-                if in_itu_range(material, hz):
-                    continue
-                extended = material in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= hz < 1e9
-                kind = "below-range" if extended else "material-range"
-                text = f"{material} is not known at {hz / 1e9:g} GHz"
+        for material in {itu_type(bsdf) for _, bsdf in scene.materials(shape) if bsdf is not None} - {None}:
+            outside = [hz for hz in carriers_hz or [SIONNA_HZ] if not in_itu_range(str(material), hz)]
+            if outside:
+                extended = material in BELOW_1_GHZ and all(CONSTANTS_FROM_HZ <= hz < 1e9 for hz in outside)
+                text = f"{material} is not known at {outside[0] / 1e9:g} GHz"
                 remedy = "choose another material, or give constants (relative_permittivity, conductivity)"
-                yield Finding(kind, scene.path, name, text, remedy)
-                break
+                yield Finding("below-range" if extended else "material-range", scene.path, name, text, remedy)
 
 
 def itu_type(bsdf: Any) -> str | None:
@@ -265,27 +256,21 @@ def itu_type(bsdf: Any) -> str | None:
     return material if material in ITU else None
 
 
-def _places(
-    parts: Sequence[Part],
-    path: Path,
-    record: Record | None,
-    carriers_hz: Sequence[float],
-    is_mesh: bool,
-    up: Up | None = None,
-) -> Iterator[Finding]:
-    """Findings about the coordinates of all parts together, and about devices inside solids."""
+def _of_triangles(parts: list[Part], path: Path, carriers_hz: Sequence[float], is_stated: bool) -> Iterator[Finding]:
+    """Findings about triangles and coordinates; ``is_stated``: which axis is up."""
+    for part in parts:
+        yield from part_findings(part)
+    yield from between_parts(parts)
     filled = [part for part in parts if len(part.corners_m)]
     if not filled:
         return
     yield from _distances(filled, carriers_hz)
     corners = np.concatenate([part.corners_m for part in filled])
-    finite = bool(np.abs(corners).max() < 1e30) and bool(np.ptp(corners.reshape(-1, 3), axis=0).max() > 0)
-    wrong = list(_units(corners.reshape(-1, 3), path, is_mesh)) if finite else []
-    yield from wrong
-    if finite and up is None and not wrong:
-        yield from _up(sampled(corners), path)
-    if record is not None:
-        yield from _devices(filled, path, record)
+    if not np.ptp(corners.reshape(-1, 3), axis=0).max() > 0:
+        return
+    # A mesh may be cut out of a larger one and have strays; a scene file was made to be traced.
+    wrong = list(_units(corners.reshape(-1, 3), path, BUILDING if path.suffix.lower() != ".xml" else SCENE))
+    yield from wrong or ([] if is_stated else _up(sampled(corners), path))
 
 
 def _distances(parts: Sequence[Part], carriers_hz: Sequence[float]) -> Iterator[Finding]:
@@ -302,15 +287,14 @@ def _distances(parts: Sequence[Part], carriers_hz: Sequence[float]) -> Iterator[
             yield Finding("coarse-phase", part.file, part.name, f"{text}; wavelength {shortest_m:.3g} m", remedy)
 
 
-def _units(points: FloatArray, path: Path, is_mesh: bool) -> Iterator[Finding]:
+def _units(points: FloatArray, path: Path, largest: Largest) -> Iterator[Finding]:
     """Units of points [n, 3] that look like others than metres."""
-    size = np.ptp(extent(points) if is_mesh else points, axis=0)
+    size = np.ptp(extent(points), axis=0)
     text = f"extent {' x '.join(f'{side:.4g}' for side in size)} m"
-    if size[2] > HIGHEST_SCENE_M or (is_mesh and size.max() > LARGEST_M):
+    if size[2] > largest.height_m or size.max() > largest.side_m:
         yield Finding("units", path, "", text, "millimetres are stated by --units mm (or cut out one building)")
-    elif size[2] > (HIGHEST_M if is_mesh else CENTIMETRES_M) and max(size[:2]) < SLENDER * HIGHEST_SCENE_M * 2:
-        if is_mesh or max(size[:2]) < 4 * size[2]:
-            yield Finding("doubtful-units", path, "", text, "centimetres are stated by --units cm")
+    elif size[2] > largest.usual_height_m and max(size[:2]) < SLENDER * size[2]:
+        yield Finding("doubtful-units", path, "", text, "centimetres are stated by --units cm")
     elif size.max() < SMALLEST_M:
         yield Finding("doubtful-units", path, "", f"{text}, small for a room", "other units are stated by --units")
 
@@ -325,16 +309,15 @@ def _up(points: FloatArray, path: Path) -> Iterator[Finding]:
 def _devices(parts: Sequence[Part], path: Path, record: Record) -> Iterator[Finding]:
     """Devices of a record inside closed bodies that are no rooms."""
     places = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
+    solids = [(part.name, body) for part in parts for body in bodies(part.corners_m) if body.closed]
     for what, positions in places.items():
         known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-        for part in parts:
-            within = np.zeros(len(known), bool)
-            for body in bodies(part.corners_m):
-                if body.closed and np.ptp(body.bounds_m, axis=0).min() <= THICKEST_SOLID_M:
-                    within |= in_solid(positions[known], body.corners_m)
-            if rows := known[within].tolist():
-                text = f"{len(rows)} of {len(positions)} {what} inside, first {shown(rows[0] + 1)}"
-                yield Finding("device-inside", path, part.name, text, "correct the positions, or the scene's frame")
+        for name, body in solids:
+            if np.ptp(body.bounds_m, axis=0).min() > THICKEST_SOLID_M:
+                continue
+            if rows := known[in_solid(positions[known], body.corners_m)].tolist():
+                text = f"{len(rows)} of {len(positions)} {what} inside, first number {rows[0] + 1}"
+                yield Finding("device-inside", path, name, text, "correct the positions, or the scene's frame")
 
 
 def _check_scan(path: Path, name: str, units: str, up: Up | None) -> SceneReport:
@@ -353,10 +336,8 @@ def _check_scan(path: Path, name: str, units: str, up: Up | None) -> SceneReport
     if far >= FARTHEST_M:
         text = f"coordinates up to {far:.0f} m"
         findings.append(Finding("far-scan", path, "", text, "give wrf-mi mesh --origin X,Y,Z"))
-    elif not (wrong := list(_units(points, path, is_mesh=True))) and up is None:
-        findings += _up(points, path)
     else:
-        findings += wrong
+        findings += list(_units(points, path, BUILDING)) or ([] if up else _up(points, path))
     if path.suffix.lower() not in VIEWPOINTS:
         text = "does not state where the scanner stood"
         remedy = "nothing to do; E57, PCD and PTX state it"

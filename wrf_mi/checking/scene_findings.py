@@ -93,6 +93,10 @@ class Finding:
         """How serious it is."""
         return KINDS[self.kind][0]
 
+    def as_dict(self) -> dict[str, str]:
+        """Plain values for JSON."""
+        return {**vars(self), "file": str(self.file), "level": self.level}
+
 
 @dataclass(frozen=True)
 class SceneReport:
@@ -149,9 +153,7 @@ class SceneReport:
             "shapes": self.shapes,
             "faces": self.faces,
             "points": self.points,
-            "findings": [
-                {**vars(finding), "file": str(finding.file), "level": finding.level} for finding in self.findings
-            ],
+            "findings": [finding.as_dict() for finding in self.findings],
         }
 
 

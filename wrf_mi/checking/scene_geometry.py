@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import inside, one_line
 from ..core.memory import require_memory
+from ..core.types import IntArray
 from ..scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
 from ..scene.mesh.polygon_files import Polygons
 from ..scene.mesh.surfaces import bodies
 from ..tracing.sionna.scene_shapes import placed_mesh, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
-from .scene_xml_faults import PARAMETERS, SceneXml, number
+from .scene_xml_faults import PARAMETERS, SceneXml, number, similar_file
 from .triangle_faults import copies, double_sheets, is_flat, open_solids, without_area, wound_both_ways
 
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
@@ -30,7 +32,7 @@ MOST_CORNERS = 2000  # corners of a polygon that is not convex: crossings of its
 RESTORE = "export the mesh anew"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """A shape of a scene, or a part of a mesh, with its triangles.
 
@@ -52,31 +54,36 @@ def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
     for name, shape in scene.shapes:
         materials = [identifier for identifier, _ in scene.materials(shape)]
         part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)))
-        if (plugin := shape.get("type", "")) not in PARAMETERS or plugin == "serialized":
-            continue
-        matrix = to_world(scene, shape)
+        plugin = shape.get("type", "")
+        matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
             remedy = "correct the transform: scales other than 0, axes of length 1, finite numbers"
             yield Finding("transform", scene.path, name, matrix, remedy)
-            continue
-        if plugin not in ("ply", "obj"):
+        elif plugin in ("ply", "obj"):
+            yield from _from_file(scene, shape, part, matrix)
+        elif plugin in PARAMETERS:
             yield from _analytic(scene, shape, part)
-            continue
-        try:
-            file = inside(scene.path.parent, scene.file_of(shape), scene.path)
-        except InputError:
-            continue  # named already
-        if not file.is_file() or file.suffix.lower() != f".{plugin}":
-            continue
-        part = replace(part, file=file)
-        for result in read_triangles(part, plugin):
-            if isinstance(result, Finding):
-                yield result
-            else:
-                placed = trimesh.transform_points(result.corners_m.reshape(-1, 3), matrix)
-                yield replace(result, corners_m=placed.reshape(-1, 3, 3))
-        if not np.array_equal(matrix, np.eye(4)):
-            yield Finding("moved", file, name, "to_world moves the mesh", "nothing to do; --repair applies it")
+
+
+def _from_file(scene: SceneXml, shape: Element, part: Part, matrix: FloatArray) -> Iterator[Part | Finding]:
+    """A shape with a mesh file, or with one of the same name elsewhere in the folder, in the scene's frame."""
+    plugin, stated = shape.get("type", ""), scene.file_of(shape) or ""
+    try:
+        file: Path | None = inside(scene.path.parent, stated, scene.path)
+    except InputError:
+        file = None  # named by `xml_findings`
+    if file is None or not file.is_file():
+        file = similar_file(scene.path.parent, stated)
+    if file is None or file.suffix.lower() != f".{plugin}":
+        return
+    for result in read_triangles(replace(part, file=file), plugin):
+        if isinstance(result, Finding):
+            yield result
+        else:
+            placed = trimesh.transform_points(result.corners_m.reshape(-1, 3), matrix)
+            yield replace(result, corners_m=placed.reshape(-1, 3, 3))
+    if not np.array_equal(matrix, np.eye(4)):
+        yield Finding("moved", file, part.name, "to_world moves the mesh", "nothing to do; --repair applies it")
 
 
 def _analytic(scene: SceneXml, shape: Element, part: Part) -> Iterator[Part | Finding]:
@@ -264,25 +271,27 @@ def between_parts(parts: list[Part]) -> Iterator[Finding]:
     yield from _near_sheets(parts, corners, owner)
 
 
-def _near_sheets(parts: list[Part], corners: FloatArray, owner: np.ndarray) -> Iterator[Finding]:
+def _near_sheets(parts: list[Part], corners: FloatArray, owner: IntArray) -> Iterator[Finding]:
     """Pairs of parts with faces too near to each other, as sheets or as walls of two solids."""
-    materials = {name: number for number, name in enumerate(dict.fromkeys(part.material for part in parts))}
-    pairs = double_sheets(corners, np.array([materials[part.material] for part in parts])[owner])
-    flat = {k: _in_sheets(parts[k]) for k in np.unique(owner[pairs])}
-    first = np.concatenate([[0], np.cumsum([len(part.corners_m) for part in parts])])
-    kinds: dict[tuple[int, int], list[bool]] = {}
-    for a, b in pairs:
-        i, j = owner[a], owner[b]
-        kinds.setdefault((i, j), []).append(bool(flat[i][a - first[i]] or flat[j][b - first[j]]))
-    for (i, j), sheets in kinds.items():
-        kind = "double-sheet" if any(sheets) else "party-wall"
+    pairs = double_sheets(corners, materials_of(parts)[owner])
+    involved = np.unique(owner[pairs])
+    flat = np.zeros(len(corners), bool)
+    for k in involved:
+        flat[owner == k] = _in_sheets(parts[k])
+    for i, j in np.unique(owner[pairs], axis=0):
+        kind = "double-sheet" if flat[pairs[(owner[pairs] == (i, j)).all(axis=1)]].any() else "party-wall"
         other = "" if i == j else f" of {parts[i].name or 'the mesh'}"
         text = f"faces within 3 mm of faces{other} of the same material"
         remedy = "leave one of both, or put them apart by a centimetre"
         yield Finding(kind, parts[j].file, parts[j].name, text, remedy)
 
 
-def _in_sheets(part: Part) -> np.ndarray:
+def materials_of(parts: Sequence[Part]) -> IntArray:
+    """Number of each part's material [n]."""
+    return np.unique([part.material for part in parts], return_inverse=True)[1].reshape(-1)
+
+
+def _in_sheets(part: Part) -> NDArray[np.bool_]:
     """Which triangles of a part belong to flat bodies."""
     flat = np.zeros(len(part.corners_m), bool)
     for body in bodies(part.corners_m):

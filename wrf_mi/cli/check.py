@@ -36,6 +36,6 @@ def check_command(a: Arguments) -> int:
         show(a.json, report.as_dict(), "\n".join(report.lines()))
         return 1 if report.ok and a.strict and report.of_level("warning") else 0 if report.ok else 2
     form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
-    repair = repair_scene(a.scene, a.repair, material=a.material, replace_existing=a.replace, **form)
+    repair = repair_scene(a.scene, a.repair, material=a.material, overwrite=a.replace, **form)
     show(a.json, repair.as_dict(), "\n".join(repair.lines()))
     return 2 if repair.unrepaired else 0
