@@ -255,7 +255,9 @@ def _device(d: Damaged) -> None:
     box = trimesh.creation.box((1.0, 0.6, 1.5))
     d.store(box.vertices + BOX_AT_M, box.faces)
     receiver = Receiver("station", BOX_AT_M, np.array([0.0, 0.0, 0.0, 1.0]))
-    d.record = Record("walk", "rssi", np.array([[1.0, 1, 1], [1, 1, 1.2]]), (receiver,), -50 + np.zeros((1, 2, 1)))
+    d.record = Record(
+        "walk", "rssi", np.array([[1.0, 1, 1], [1, 1, 1.2]]), (receiver,), np.full((1, 2, 1), -50, np.float32)
+    )
 
 
 def _range(d: Damaged) -> None:
@@ -381,10 +383,14 @@ def whole_scenes(folder: Path, cities: bool = False) -> Iterator[Path]:
     files = sorted(Path(file) for file in vars(shipped).values() if isinstance(file, str) and file.endswith(".xml"))
     yield from (file for file in files if cities or file.stat().st_size < 10_000)
     rng = np.random.default_rng(3)
-    makers = (trimesh.creation.box, trimesh.creation.icosphere, trimesh.creation.cylinder, trimesh.creation.capsule)
+    makers: tuple[Callable[[], trimesh.Trimesh], ...] = (
+        trimesh.creation.box,
+        trimesh.creation.icosphere,
+        lambda: trimesh.creation.cylinder(radius=1, height=2),
+        trimesh.creation.capsule,
+    )
     for number in range(SOLIDS + (0 if cities else 4)):
-        maker = makers[number % len(makers)]
-        solid = maker(radius=1, height=2) if number % 4 == 2 else maker()
+        solid = makers[number % len(makers)]()
         solid.apply_scale(float(rng.uniform(0.6, 4)))
         solid.apply_translation(rng.uniform(-5, 5, 3))
         yield write_scene(folder / f"solid_{number}", {"solid": ("itu_metal", solid)}, "whole solid")

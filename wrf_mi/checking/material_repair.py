@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element, SubElement
 
@@ -12,9 +12,8 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ..scene.folder import plain_name
 from ..tracing.sionna.materials import BELOW_1_GHZ, in_itu_range
-from .scene_check import itu_type
 from .scene_geometry import Part
-from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_itu, short_name
+from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_itu, itu_type, short_name
 from .triangle_repair import label
 
 ODD = r"[^A-Za-z0-9_.-]"  # characters that ids and file names of a repaired scene do not have
@@ -51,13 +50,16 @@ class MaterialRepair:
 
     def of(self, part: Part, shape: Element | None) -> Element | None:
         """BSDF that a part is to have; None where nothing says which material it is."""
-        stated = [] if self.scene is None or shape is None else self.scene.materials(shape)
-        for identifier, bsdf in stated:
+        stated = {} if self.scene is None or shape is None else dict(self.scene.materials(shape))
+        for identifier, bsdf in stated.items():
             radio = None if bsdf is None else self._radio(bsdf)
             if radio is not None:
                 return self._add(identifier or part.name, radio)
-        names = [*(identifier for identifier, _ in stated), part.name or part.file.stem]
-        guessed = next((material for material in map(meant, names) if material), None)
+        return self._by_name(part, [*stated, part.name or part.file.stem])
+
+    def _by_name(self, part: Part, names: Sequence[str]) -> Element | None:
+        """Material that one of some names means, or the default."""
+        guessed = next(filter(None, map(meant, names)), None)
         material = guessed or self.default
         if material is None:
             return None
@@ -91,9 +93,9 @@ class MaterialRepair:
     def _slab(self, bsdf: Element, material: str) -> Element:
         """A material of ITU-R P.2040 with its thickness, colour and scattering."""
         stated = bsdf.find("float[@name='thickness']")
-        names = [name for name in (short_name(bsdf.get("id", "")), f"itu_{material}") if name in self.thickness_m]
         thickness_m = SIONNA_THICKNESS_M if stated is None else float(stated.get("value", "nan"))
-        slab = itu_bsdf(material, self.thickness_m[names[0]] if names else thickness_m, self.frequency_hz)
+        of_kind = self.thickness_m.get(f"itu_{material}", thickness_m)
+        slab = itu_bsdf(material, self.thickness_m.get(short_name(bsdf.get("id", "")), of_kind), self.frequency_hz)
         for colour in [each for each in bsdf.iter("rgb") if each.get("name") in COLOURS][:1]:
             SubElement(slab, "rgb", name="color", value=colour.get("value", ""))
         if bsdf.get("type") in RADIO:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from wrf_mi_scenes import scenes
@@ -41,7 +41,7 @@ from ..tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from .building import THICKEST_SOLID_M, in_solid
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import Part, between_parts, mesh_file_parts, part_findings, scene_parts
-from .scene_xml_faults import ITU, SceneXml, is_itu, read_xml, xml_findings
+from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
 
 LIGHT_M_PER_S = 299_792_458.0
 PHASE_SHARE = 0.01  # share of a wavelength that rounding may move a surface by: 4 degrees of phase
@@ -58,6 +58,13 @@ class Largest(NamedTuple):
     side_m: float
     height_m: float
     usual_height_m: float
+
+
+class Frame(NamedTuple):
+    """Unit of a source's coordinates, and the axis that is up; None: that of its format."""
+
+    units: str
+    up: Up | None
 
 
 BUILDING = Largest(LARGEST_M, HIGHEST_SCENE_M, HIGHEST_M)
@@ -129,31 +136,46 @@ def checked(
         raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
     if frequency_hz is not None and not 0 < frequency_hz < 1e15:
         raise InputError(f"frequency {frequency_hz:g} Hz: give a carrier above 0")
-    where = locate(source)
+    where, frame = locate(source), Frame(units, up)
     record = data if isinstance(data, Record) or data is None else load_record(data)
     carriers_hz = [frequency_hz] if frequency_hz is not None else _carriers(record)
-    is_xml = where.path.suffix.lower() == ".xml"
-    if not is_xml and not has_faces(where.path):
-        return Checked(where, _check_scan(where.path, str(source), units, up), None, ())
-    scene = read_xml(where.path) if is_xml else None
+    if where.path.suffix.lower() == ".xml":
+        return _check_xml(where, str(source), frame, record, carriers_hz)
+    if not has_faces(where.path):
+        return Checked(where, _check_scan(where.path, str(source), frame), None, ())
+    findings, parts = _placed(mesh_file_parts(where.path), where.path, frame)
+    findings += _of_triangles(parts, where.path, frame, record, carriers_hz)
+    report = SceneReport(str(source), tuple(findings), len(parts), _faces(parts))
+    return Checked(where, report, None, tuple(parts))
+
+
+def _check_xml(where: Source, name: str, frame: Frame, record: Record | None, carriers_hz: Sequence[float]) -> Checked:
+    scene = read_xml(where.path)
     if isinstance(scene, Finding):
-        return Checked(where, SceneReport(str(source), (*where.findings, scene)), None, ())
-    results = mesh_file_parts(where.path) if scene is None else scene_parts(scene)
-    findings, parts = list(where.findings), list[Part]()
-    findings += [] if scene is None else _of_file(scene, where, carriers_hz)
+        return Checked(where, SceneReport(name, (*where.findings, scene)), None, ())
+    about_files, parts = _placed(scene_parts(scene), where.path, frame)
+    findings = [*where.findings, *_of_file(scene, where, carriers_hz), *about_files]
+    findings += _of_triangles(parts, where.path, frame, record, carriers_hz)
+    if not any(finding.level == "fault" for finding in findings):
+        findings += opened(where.path)
+    report = SceneReport(name, tuple(findings), len(scene.shapes), _faces(parts))
+    return Checked(where, report, scene, tuple(parts))
+
+
+def _placed(results: Iterator[Part | Finding], file: Path, frame: Frame) -> tuple[list[Finding], list[Part]]:
+    """Findings, and parts in metres with z up."""
+    findings, parts = list[Finding](), list[Part]()
     for result in results:
         if isinstance(result, Finding):
             findings.append(result)
         else:
-            corners_m = _upright(result.corners_m, where.path, up) * UNITS_M[units]
+            corners_m = _upright(result.corners_m, file, frame.up) * UNITS_M[frame.units]
             parts.append(replace(result, corners_m=corners_m))
-    findings += _of_triangles(parts, where.path, carriers_hz, is_stated=up is not None)
-    findings += [] if record is None else _devices(parts, where.path, record)
-    if scene is not None and not any(finding.level == "fault" for finding in findings):
-        findings += opened(where.path)
-    count = len(parts) if scene is None else len(scene.shapes)
-    faces = sum(len(part.corners_m) for part in parts)
-    return Checked(where, SceneReport(str(source), tuple(findings), count, faces), scene, tuple(parts))
+    return findings, parts
+
+
+def _faces(parts: Sequence[Part]) -> int:
+    return sum(len(part.corners_m) for part in parts)
 
 
 def _upright(corners: FloatArray, file: Path, up: Up | None) -> FloatArray:
@@ -237,40 +259,46 @@ def _carriers(record: Record | None) -> list[float]:
 def _ranges(scene: SceneXml, carriers_hz: Sequence[float]) -> Iterator[Finding]:
     """Materials of ITU-R P.2040 that are not known at the carriers, by shape."""
     for name, shape in scene.shapes:
-        for material in {itu_type(bsdf) for _, bsdf in scene.materials(shape) if bsdf is not None} - {None}:
-            outside = [hz for hz in carriers_hz or [SIONNA_HZ] if not in_itu_range(str(material), hz)]
-            if outside:
-                extended = material in BELOW_1_GHZ and all(CONSTANTS_FROM_HZ <= hz < 1e9 for hz in outside)
-                text = f"{material} is not known at {outside[0] / 1e9:g} GHz"
+        known = {itu_type(bsdf) for _, bsdf in scene.materials(shape) if bsdf is not None}
+        for material in filter(None, known):
+            kind, hz = _range(material, carriers_hz or [SIONNA_HZ])
+            if kind:
+                text = f"{material} is not known at {hz / 1e9:g} GHz"
                 remedy = "choose another material, or give constants (relative_permittivity, conductivity)"
-                yield Finding("below-range" if extended else "material-range", scene.path, name, text, remedy)
+                yield Finding(kind, scene.path, name, text, remedy)
 
 
-def itu_type(bsdf: Any) -> str | None:
-    """Material of ITU-R P.2040 that Sionna RT makes of a BSDF, without ``itu_``; None for another one."""
-    identifier = bsdf.get("id", "")
-    if not is_itu(identifier) and bsdf.get("type") != "itu-radio-material":
-        return None
-    stated = bsdf.find("string[@name='type']")
-    material = identifier.removeprefix("mat-")[4:] if stated is None else stated.get("value", "")
-    return material if material in ITU else None
+def _range(material: str, carriers_hz: Sequence[float]) -> tuple[str, float]:
+    """Kind of the finding about a material, and the first carrier outside of its range; empty if there is none."""
+    outside = [hz for hz in carriers_hz if not in_itu_range(material, hz)]
+    if not outside:
+        return "", 0.0
+    extended = material in BELOW_1_GHZ and all(CONSTANTS_FROM_HZ <= hz < 1e9 for hz in outside)
+    return "below-range" if extended else "material-range", outside[0]
 
 
-def _of_triangles(parts: list[Part], path: Path, carriers_hz: Sequence[float], is_stated: bool) -> Iterator[Finding]:
-    """Findings about triangles and coordinates; ``is_stated``: which axis is up."""
+def _of_triangles(
+    parts: list[Part], path: Path, frame: Frame, record: Record | None, carriers_hz: Sequence[float]
+) -> Iterator[Finding]:
+    """Findings about triangles, coordinates, and devices inside solids."""
     for part in parts:
         yield from part_findings(part)
     yield from between_parts(parts)
-    filled = [part for part in parts if len(part.corners_m)]
-    if not filled:
-        return
+    if filled := [part for part in parts if len(part.corners_m)]:
+        yield from _coordinates(filled, path, frame, carriers_hz)
+    if record is not None:
+        yield from _devices(filled, path, record)
+
+
+def _coordinates(filled: Sequence[Part], path: Path, frame: Frame, carriers_hz: Sequence[float]) -> Iterator[Finding]:
+    """Findings about units, the axis that is up, and distances from the origin."""
     yield from _distances(filled, carriers_hz)
     corners = np.concatenate([part.corners_m for part in filled])
     if not np.ptp(corners.reshape(-1, 3), axis=0).max() > 0:
         return
     # A mesh may be cut out of a larger one and have strays; a scene file was made to be traced.
     wrong = list(_units(corners.reshape(-1, 3), path, BUILDING if path.suffix.lower() != ".xml" else SCENE))
-    yield from wrong or ([] if is_stated else _up(sampled(corners), path))
+    yield from wrong or ([] if frame.up else _up(sampled(corners), path))
 
 
 def _distances(parts: Sequence[Part], carriers_hz: Sequence[float]) -> Iterator[Finding]:
@@ -320,10 +348,10 @@ def _devices(parts: Sequence[Part], path: Path, record: Record) -> Iterator[Find
                 yield Finding("device-inside", path, name, text, "correct the positions, or the scene's frame")
 
 
-def _check_scan(path: Path, name: str, units: str, up: Up | None) -> SceneReport:
+def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
     """Findings about a scan."""
     try:
-        points = read_points(path, units, up)
+        points = read_points(path, frame.units, frame.up)
     except InputError as error:
         text, _, remedy = one_line(error).removeprefix(f"{path}").lstrip(":, ").rpartition("; ")
         kind = "not-finite" if "not finite" in text else "empty-mesh" if "no points" in text else "mesh"
@@ -337,7 +365,7 @@ def _check_scan(path: Path, name: str, units: str, up: Up | None) -> SceneReport
         text = f"coordinates up to {far:.0f} m"
         findings.append(Finding("far-scan", path, "", text, "give wrf-mi mesh --origin X,Y,Z"))
     else:
-        findings += list(_units(points, path, BUILDING)) or ([] if up else _up(points, path))
+        findings += list(_units(points, path, BUILDING)) or ([] if frame.up else _up(points, path))
     if path.suffix.lower() not in VIEWPOINTS:
         text = "does not state where the scanner stood"
         remedy = "nothing to do; E57, PCD and PTX state it"

@@ -129,19 +129,26 @@ def _step(step: Element) -> FloatArray:
                 raise ValueError("its axis is no unit vector, with which Mitsuba shears the mesh")
             return np.asarray(trimesh.transformations.rotation_matrix(angle, axis))
         case "matrix":
-            values = _numbers(step.get("value", ""))
-            if len(values) == 9:
-                return np.block([[values.reshape(3, 3), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
-            if len(values) == 16:
-                return values.reshape(4, 4)
-            raise ValueError(f"{len(values)} numbers; give 9 or 16")
+            return _matrix(_numbers(step.get("value", "")))
         case "lookat":
             origin, target, up = (_numbers(step.get(name, ""), 3) for name in ("origin", "target", "up"))
             forward = trimesh.unitize(target - origin)
             left = trimesh.unitize(np.cross(up, forward))
-            rotation = np.column_stack([left, np.cross(forward, left), forward])
-            return np.block([[rotation, origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+            return _matrix(np.column_stack([left, np.cross(forward, left), forward, origin]).ravel())
     raise ValueError("unknown")
+
+
+def _matrix(values: FloatArray) -> FloatArray:
+    """Matrix [4, 4] by the numbers of its first three columns and rows, of its first three rows, or all."""
+    matrix = np.eye(4)
+    match len(values):
+        case 9:
+            matrix[:3, :3] = values.reshape(3, 3)
+        case 12 | 16:
+            matrix[: len(values) // 4] = values.reshape(-1, 4)
+        case _:
+            raise ValueError(f"{len(values)} numbers; give 9 or 16")
+    return matrix
 
 
 def _vector(step: Element, neutral: float) -> FloatArray:

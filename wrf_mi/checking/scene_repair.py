@@ -14,6 +14,7 @@ import trimesh
 import yaml
 
 from ..core import InputError
+from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically
 from ..scene.coordinates import FARTHEST_M, Up
 from ..scene.folder import FACTS_FILE, XML_FILE, plain_name
@@ -128,37 +129,41 @@ def repair_scene(
     materials = MaterialRepair(before.scene, before.source.thickness_m, default, frequency_hz)
     shapes = {} if before.scene is None else dict(before.scene.shapes)
     bsdfs = [materials.of(part, shapes.get(part.name)) for part in parts]
-    names = _names(parts, shapes, [short_name(bsdf.get("id", "")) for bsdf in bsdfs if bsdf is not None])
-    done = [*_routine(before), *done, *materials.done]
-    done += [f"{label(part)}: named {name}" for part, name in names.items() if short_name(label(part)) != name]
-    if origin_m.any():
-        text = ", ".join(f"{value:.12g}" for value in origin_m)
-        done.insert(0, f"origin: {text} m subtracted; subtract it from the positions of the measurements, too")
+    names = _names(parts, shapes, bsdfs)
+    done = [*_shift(origin_m), *_routine(before), *done, *materials.done, *_renamed(names)]
     unrepaired = [*_unrepaired(before), *_left(parts, bsdfs, before.source.path)]
     if unrepaired:
         return Repair(None, tuple(done), tuple(unrepaired), None)
     with atomic_folder(Path(out), overwrite) as folder:
-        (folder / "meshes").mkdir()
-        for part, name in names.items():
-            mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(part.corners_m), process=False)
-            mesh.merge_vertices()
-            (folder / "meshes" / f"{name}.ply").write_bytes(plain_ply(mesh))
-        root = _scene([each for each in bsdfs if each is not None], list(names.values()))
-        write_atomically(folder / XML_FILE, ElementTree.tostring(root, encoding="unicode") + "\n")
-        facts = {
-            "description": f"{len(parts)} surfaces repaired by wrf-mi check",
-            "frame": "that of the source, less origin_m",
-            "units": "m",
-            "xml": XML_FILE,
-            "source": str(source),
-            "origin_m": origin_m.tolist(),
-            "repairs": done,
-        }
-        write_atomically(folder / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
+        _write(folder, names, bsdfs, {"source": str(source), "origin_m": origin_m.tolist(), "repairs": done})
         for finding in opened(folder / XML_FILE):
             raise InputError(f"{source}: not repaired, as {finding.text}; report this with the scene")
     after = check_scene(out, frequency_hz=frequency_hz)
     return Repair(Path(out), tuple(done), tuple(after.of_level("fault")), after)
+
+
+def _write(folder: Path, names: Mapping[Part, str], bsdfs: Sequence[Element | None], facts: Mapping[str, Any]) -> None:
+    """Write meshes, scene file and ``scene.yml`` into an empty folder."""
+    (folder / "meshes").mkdir()
+    for part, name in names.items():
+        mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(part.corners_m), process=False)
+        mesh.merge_vertices()
+        (folder / "meshes" / f"{name}.ply").write_bytes(plain_ply(mesh))
+    root = _scene([bsdf for bsdf in bsdfs if bsdf is not None], list(names.values()))
+    write_atomically(folder / XML_FILE, ElementTree.tostring(root, encoding="unicode") + "\n")
+    frame = {"frame": "that of the source, less origin_m", "units": "m", "xml": XML_FILE}
+    facts = {"description": f"{len(names)} surfaces repaired by wrf-mi check", **frame, **facts}
+    write_atomically(folder / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
+
+
+def _shift(origin_m: FloatArray) -> list[str]:
+    text = ", ".join(f"{value:.12g}" for value in origin_m)
+    remedy = "subtract it from the positions of the measurements, too"
+    return [f"origin: {text} m subtracted; {remedy}"] if origin_m.any() else []
+
+
+def _renamed(names: Mapping[Part, str]) -> list[str]:
+    return [f"{label(part)}: named {name}" for part, name in names.items() if short_name(label(part)) != name]
 
 
 def _routine(before: Checked) -> list[str]:
@@ -188,9 +193,10 @@ def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) ->
     return left if parts else [Finding("no-shapes", path, "", "nothing has an area", "give a scene with surfaces")]
 
 
-def _names(parts: Sequence[Part], shapes: Mapping[str, Element], materials: Sequence[str]) -> dict[Part, str]:
+def _names(parts: Sequence[Part], shapes: Mapping[str, Element], bsdfs: Sequence[Element | None]) -> dict[Part, str]:
     """Safe names of parts that neither another one, nor a material, has: both are items of a scene of Sionna RT."""
     names = dict[Part, str]()
+    materials = [short_name(bsdf.get("id", "")) for bsdf in bsdfs if bsdf is not None]
     for number, part in enumerate(parts, start=1):
         identifier = shapes[part.name].get("id", "") if part.name in shapes else part.name
         wanted = short_name(ascii_name(identifier)) or ("" if part.file.suffix == ".xml" else part.file.stem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import numpy as np
 from defusedxml.common import DefusedXmlException
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
@@ -45,6 +47,7 @@ XML_MEMORY = 40  # bytes of elements for each byte of a file
 VERSION = re.compile(r"(\d+)\.\d+\.\d+")
 PICTURES = ("emitter", "sensor", "integrator")
 DASH = "mat-"  # begin of ids of Blender's exporter, which Sionna RT leaves out
+OWN_ID = "give each element an id of its own"
 GIVE = 'give the shape a material: <ref id="mat-itu_concrete" name="bsdf"/>, or --repair with --material NAME'
 
 
@@ -135,6 +138,7 @@ def xml_findings(scene: SceneXml) -> Iterator[Finding]:
         yield Finding("no-shapes", path, "", "holds no <shape>", "give a scene with surfaces")
     yield from _elements(scene)
     yield from _ids(scene)
+    yield from _odd_ids(scene)
     for number, bsdf in enumerate(root.findall("bsdf"), start=1):
         yield from bsdf_findings(scene, f"<bsdf> {bsdf.get('id') or number}", bsdf)
     for name, shape in scene.shapes:
@@ -146,24 +150,29 @@ def xml_findings(scene: SceneXml) -> Iterator[Finding]:
 
 def _elements(scene: SceneXml) -> Iterator[Finding]:
     """Elements and plugins that are unknown, parameters that are left open, and files."""
-    shapes = {id(shape): name for name, shape in scene.shapes}
-    stack = [(child, "", False) for child in reversed(list(scene.root))]
-    while stack:
-        element, name, converted = stack.pop()
-        name = shapes.get(id(element), name)
-        # Sionna RT replaces these with all that they hold.
-        converted |= element.tag == "bsdf" and is_itu(element.get("id", ""))
-        stack.extend((child, name, converted) for child in reversed(list(element)))
-        tag, plugin = element.tag, element.get("type", "")
+    for element, name, is_converted in _walk(scene):
+        tag, plugin, value = element.tag, element.get("type", ""), element.get("value", "")
         known = PLUGINS.get(tag, "").split()
         if tag != "shape" and (plugin not in known if plugin else tag not in VALUES):
             what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
             yield Finding("element", scene.path, name, f"{what} is unknown in scenes", "remove or replace it")
-        if tag in ("string", "default", "float") and "$" in element.get("value", ""):
-            text = f"the value {element.get('value', '')[:40]} is left to the caller"
+        if "$" in value:
+            text = f"the value {value[:40]} is left to the caller"
             yield Finding("parameter", scene.path, name, text, "write the value in its place")
-        elif tag == "string" and element.get("name") in FILES and not converted:
-            yield from _file(scene, name, element.get("value", ""))
+        elif tag == "string" and element.get("name") in FILES and not is_converted:
+            yield from _file(scene, name, value)
+
+
+def _walk(scene: SceneXml) -> Iterator[tuple[Element, str, bool]]:
+    """Elements below the first, the name of their shape, and whether they are in a BSDF that Sionna RT replaces."""
+    shapes = {id(shape): name for name, shape in scene.shapes}
+    stack = [(child, "", False) for child in reversed(list(scene.root))]
+    while stack:
+        element, name, is_converted = stack.pop()
+        name = shapes.get(id(element), name)
+        is_converted |= element.tag == "bsdf" and is_itu(element.get("id", ""))
+        stack.extend((child, name, is_converted) for child in reversed(list(element)))
+        yield element, name, is_converted
 
 
 def is_itu(identifier: str) -> bool:
@@ -200,31 +209,40 @@ def similar_file(folder: Path, stated: str) -> Path | None:
 
 
 def _ids(scene: SceneXml) -> Iterator[Finding]:
-    """Ids and names that come twice or are odd."""
-    first: dict[str, str] = {}
-    names: dict[str, str] = {}
+    """Ids, and names that Sionna RT makes of them, that come twice."""
     used = {identifier for _, shape in scene.shapes for identifier, _ in scene.materials(shape)}
-    shapes = {id(shape) for _, shape in scene.shapes}
-    inline = [(bsdf, name) for name, shape in scene.shapes for bsdf in shape.findall("bsdf")]
-    tops = [(element, "") for element in scene.root if element.tag != "shape"]
-    for element, name in [*tops, *((shape, name) for name, shape in scene.shapes), *inline]:
-        identifier = element.get("id", "")
-        if not identifier:
-            continue
+    first: dict[str, Element] = {}
+    short: dict[str, str] = {}
+    for element, name in _with_ids(scene):
+        identifier, tag = element.get("id", ""), element.tag
+        same = short.get(short_name(identifier))
         if identifier in first:
-            text = f"<{element.tag}> has the id {identifier!r}, as <{first[identifier]}> before it"
-            yield Finding("duplicate-id", scene.path, name, text, "give each element an id of its own")
-        elif element.tag == "shape" or (element.tag == "bsdf" and identifier in used):
-            short = short_name(identifier)
-            if short in names:
-                text = f"{identifier!r} has the name {short!r} in Sionna RT, as {names[short]!r} has"
-                yield Finding("duplicate-id", scene.path, name, text, "give each element an id of its own")
-            names.setdefault(short, identifier)
-        first.setdefault(identifier, element.tag)
-        if id(element) in shapes and identifier == MERGED:
+            text = f"<{tag}> has the id {identifier!r}, as <{first[identifier].tag}> before it"
+            yield Finding("duplicate-id", scene.path, name, text, OWN_ID)
+        elif tag == "shape" or (tag == "bsdf" and identifier in used):  # unused BSDFs are not opened
+            if same is not None:
+                text = f"{identifier!r} has the name {short_name(identifier)!r} in Sionna RT, as {same!r} has"
+                yield Finding("duplicate-id", scene.path, name, text, OWN_ID)
+            short.setdefault(short_name(identifier), identifier)
+        first.setdefault(identifier, element)
+
+
+def _odd_ids(scene: SceneXml) -> Iterator[Finding]:
+    """Ids that Sionna RT has for itself, or that other systems mangle."""
+    for element, name in _with_ids(scene):
+        identifier, tag = element.get("id", ""), element.tag
+        if tag == "shape" and identifier == MERGED:
             yield Finding("reserved-id", scene.path, name, "Sionna RT has this id for itself", "give it another id")
-        if odd_name(identifier) and element.tag in ("shape", "bsdf"):
+        if odd_name(identifier) and tag in ("shape", "bsdf"):
             yield Finding("odd-name", scene.path, name, f"the id {identifier!r}", "rename it (--repair does)")
+
+
+def _with_ids(scene: SceneXml) -> list[tuple[Element, str]]:
+    """Elements with ids, and the name of the shape that they are or are in."""
+    elements = [(element, "") for element in scene.root if element.tag != "shape"]
+    for name, shape in scene.shapes:
+        elements += [(shape, name), *((bsdf, name) for bsdf in shape.findall("bsdf"))]
+    return [(element, name) for element, name in elements if element.get("id")]
 
 
 def bsdf_findings(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
@@ -235,39 +253,53 @@ def bsdf_findings(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Findin
         text = f"<bsdf> ({plugin}) has no id"
         yield Finding("bsdf-id", scene.path, where, text, 'give it one of its own, such as id="mat-my_material"')
     if is_itu(identifier) or plugin == "itu-radio-material":
-        stated = bsdf.find("string[@name='type']")
-        default = name[4:] if is_itu(identifier) else ""
-        material = default if stated is None else stated.get("value", "")
-        if material not in ITU:
-            remedy = f"known are {', '.join(ITU)}, and constants of your own"
-            yield Finding("unknown-material", scene.path, where, f"ITU-R P.2040 has no {material!r}", remedy)
-        elif bsdf.find("float[@name='thickness']") is None:
-            remedy = "nothing to do if that is right; thickness_m of a scene folder overrides it"
-            yield Finding("default-thickness", scene.path, where, "no thickness: Sionna RT takes 0.1 m", remedy)
+        yield from _itu(scene, where, bsdf)
     elif name in ITU:
         remedy = "ids of materials of ITU-R P.2040 begin with mat-itu_"
         yield Finding("unknown-material", scene.path, where, f"the id {identifier!r} lacks itu_", remedy)
-    if plugin in RADIO and not is_itu(identifier):
+    if plugin == "absorber-radio-material":
+        yield Finding("absorber", scene.path, where, "an absorber", "nothing to do in wrf-mi")
+    elif plugin in RADIO and not is_itu(identifier):
         yield from _values(scene, where, bsdf)
+
+
+def stated_itu(bsdf: Element) -> str:
+    """Material of ITU-R P.2040 that a BSDF states by its type or id, without ``itu_``."""
+    stated = bsdf.find("string[@name='type']")
+    identifier = bsdf.get("id", "")
+    named = identifier.removeprefix(DASH)[4:] if is_itu(identifier) else ""
+    return named if stated is None else stated.get("value", "")
+
+
+def itu_type(bsdf: Element) -> str | None:
+    """Material of ITU-R P.2040 that Sionna RT makes of a BSDF, without ``itu_``; None for another one."""
+    is_one = is_itu(bsdf.get("id", "")) or bsdf.get("type") == "itu-radio-material"
+    return material if is_one and (material := stated_itu(bsdf)) in ITU else None
+
+
+def _itu(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
+    """Findings about a BSDF that Sionna RT makes a material of ITU-R P.2040 of."""
+    if (material := stated_itu(bsdf)) not in ITU:
+        remedy = f"known are {', '.join(ITU)}, and constants of your own"
+        yield Finding("unknown-material", scene.path, where, f"ITU-R P.2040 has no {material!r}", remedy)
+    elif bsdf.find("float[@name='thickness']") is None:
+        remedy = "nothing to do if that is right; thickness_m of a scene folder overrides it"
+        yield Finding("default-thickness", scene.path, where, "no thickness: Sionna RT takes 0.1 m", remedy)
 
 
 def _values(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
     """Numbers of a radio material that are out of bounds, and parameters that it does not have."""
-    path, plugin = scene.path, bsdf.get("type", "")
-    if plugin == "absorber-radio-material":
-        yield Finding("absorber", path, where, "an absorber", "nothing to do in wrf-mi")
-        return
     stated = {child.get("name", ""): child.get("value", "") for child in bsdf if child.tag in ("float", "string")}
-    if plugin == "itu-radio-material":
+    if bsdf.get("type") == "itu-radio-material":
         stated.pop("type", None)
-    for name, value in stated.items():
-        low, high = BOUNDS.get(name, (0, 0))
-        if name not in BOUNDS or number(value) is None or not low <= float(value) <= high:
-            text = f"{name} is {value[:40]!r}"
-            yield Finding("material-values", path, where, text, f"Sionna RT takes {_bounds_text()}")
-    if plugin == "radio-material" and "relative_permittivity" not in stated:
+    elif "relative_permittivity" not in stated:
         remedy = "state relative_permittivity and conductivity (S/m)"
-        yield Finding("no-constants", path, where, "no relative permittivity: that of air is taken", remedy)
+        yield Finding("no-constants", scene.path, where, "no relative permittivity: that of air is taken", remedy)
+    for name, text in stated.items():
+        value, (low, high) = number(text), BOUNDS.get(name, (np.inf, np.inf))
+        if value is None or not low <= value <= high:
+            remedy = f"Sionna RT takes {_bounds_text()}"
+            yield Finding("material-values", scene.path, where, f"{name} is {text[:40]!r}", remedy)
 
 
 def _bounds_text() -> str:
@@ -293,27 +325,33 @@ def _shape(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     if plugin in SMOOTH:
         text = f"a {plugin}, and Sionna RT traces triangles alone"
         yield Finding("shape-type", path, name, text, "--repair makes a mesh of it")
-    names = [scene.parameter(child) for child in shape if child.tag in VALUES and child.tag != "ref"]
-    known = (*PARAMETERS[plugin], *ALL_SHAPES)
-    for wrong in dict.fromkeys(each for each in names if each not in known or names.count(each) > 1):
-        twice = wrong in known
-        text = f"the parameter {wrong[:40]!r} is {'stated twice' if twice else f'none of a {plugin}'}"
-        remedy = "remove one of both" if twice else f"remove it, or write it as {', '.join(known)}"
-        yield Finding("parameter" if twice else "unknown-parameter", path, name, text, remedy)
-    if "filename" in known and "filename" not in names:
-        yield Finding("parameter", path, name, "has no file", 'give one: <string name="filename" value="..."/>')
+    yield from _parameters(scene, name, shape)
     stated = scene.file_of(shape)
-    suffix = Path(stated or "").suffix.lower().removeprefix(".")
-    if plugin in ("ply", "obj") and stated and "$" not in stated and suffix != plugin:
+    if plugin in ("ply", "obj") and stated and "$" not in stated and not stated.lower().endswith(f".{plugin}"):
         text = f"of type {plugin!r}, with the file {stated[-60:]!r}"
         yield Finding("mesh", path, name, text, "give a file of that type, converted if need be")
+
+
+def _parameters(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
+    """Parameters of a shape that it does not have, or that are missing or stated twice."""
+    path, plugin = scene.path, shape.get("type", "")
+    names = [scene.parameter(child) for child in shape if child.tag in VALUES and child.tag != "ref"]
+    known = (*PARAMETERS[plugin], *ALL_SHAPES)
+    for stated, count in Counter(names).items():
+        if stated not in known:
+            remedy = f"remove it, or write it as {', '.join(known)}"
+            yield Finding("unknown-parameter", path, name, f"no {plugin} has the parameter {stated[:40]!r}", remedy)
+        elif count > 1:
+            yield Finding("parameter", path, name, f"the parameter {stated!r} is stated twice", "remove one of both")
+    if "filename" in known and "filename" not in names:
+        yield Finding("parameter", path, name, "has no file", 'give one: <string name="filename" value="..."/>')
 
 
 def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     """The BSDF of a shape."""
     path, materials = scene.path, scene.materials(shape)
-    for bsdf in shape.findall("bsdf"):
-        yield from bsdf_findings(scene, name, bsdf)
+    for inline in shape.findall("bsdf"):
+        yield from bsdf_findings(scene, name, inline)
     if not materials:
         yield Finding("no-material", path, name, "has no material", GIVE)
     if len(materials) > 1:
@@ -322,9 +360,10 @@ def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     for identifier, bsdf in materials:
         if bsdf is None:
             yield Finding("unknown-reference", path, name, f"no <bsdf> has the id {identifier[:60]!r}", GIVE)
-        elif not is_itu(identifier) and bsdf.get("type") not in RADIO and identifier.removeprefix(DASH) not in ITU:
-            nested = any(inner.get("type") in RADIO for inner in bsdf.iter("bsdf"))
-            within = ", around a radio material" if nested else ""
-            text = f"its material {identifier!r} is {bsdf.get('type')!r}{within}, no radio material"
+            continue
+        plugin, is_named = bsdf.get("type", ""), is_itu(identifier) or identifier.removeprefix(DASH) in ITU
+        if plugin not in RADIO and not is_named:
+            within = any(inner.get("type") in RADIO for inner in bsdf.iter("bsdf"))
+            text = f"its material {identifier!r} is {plugin!r}{', around a radio material' if within else ''}"
             remedy = "name it mat-itu_concrete or the like, or give constants; --repair does with --material NAME"
             yield Finding("not-radio", path, name, text, remedy)

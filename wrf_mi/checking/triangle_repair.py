@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..scene.coordinates import FARTHEST_M
 from ..scene.mesh.surfaces import bodies
 from .scene_geometry import Part, materials_of
@@ -19,28 +21,13 @@ NEAR_ZERO_M = 1000.0
 
 def repaired_triangles(parts: Sequence[Part]) -> tuple[list[Part], FloatArray, list[str]]:
     """Repaired parts, the origin [3] that was subtracted in metres, and what was done to which part."""
-    origin_m = _origin(parts)
-    near = [replace(part, corners_m=part.corners_m - origin_m) for part in parts]
-    in_plane = _one_plane(near)
-    done = [
-        f"{label(part)}: sheet moved by millimetres into the plane of another one"
-        for part, before in zip(in_plane, near, strict=True)
-        if part is not before
-    ]
-    valid = [replace(part, corners_m=part.corners_m[~without_area(part.corners_m)]) for part in in_plane]
-    single = _without_copies(valid)
-    for before, between, after in zip(in_plane, valid, single, strict=True):
-        for count, what in (
-            (len(before.corners_m) - len(between.corners_m), "faces without an area"),
-            (len(between.corners_m) - len(after.corners_m), "copies of faces"),
-        ):
-            done += [f"{label(after)}: {count} {what} left out"] if count else []
-    wound = [part for part in single if len(part.corners_m)]
-    for number, part in enumerate(wound):
-        if any(map(wound_both_ways, bodies(part.corners_m))):
-            wound[number] = replace(part, corners_m=wound_one_way(part.corners_m))
-            done.append(f"{label(part)}: faces wound one way")
-    return wound, origin_m, done
+    origin_m, done = _origin(parts), list[str]()
+    stage = [replace(part, corners_m=part.corners_m - origin_m) for part in parts]
+    for repair, text in STAGES:
+        before, stage = stage, repair(stage)
+        changed = [after for after, part in zip(stage, before, strict=True) if after is not part]
+        done += [f"{label(part)}: {text}" for part in changed]
+    return [part for part in stage if len(part.corners_m)], origin_m, done
 
 
 def label(part: Part) -> str:
@@ -64,22 +51,38 @@ def _one_plane(parts: list[Part]) -> list[Part]:
     owner = np.repeat(np.arange(len(parts)), [len(each) for each in corners])
     row = np.concatenate([np.arange(len(each)) for each in corners])
     pairs = double_sheets(np.concatenate(corners), materials_of(parts)[owner])
-    sheets = {k: [b for b in bodies(corners[k]) if is_flat(b)] for k in np.unique(owner[pairs]).tolist()}
+    sheet = [_sheet_numbers(each) for each in corners]
     moved = set[tuple[int, int]]()
     # The later of two sheets moves; where it is a wall of a solid, the other one.
     for fixed, other in [*pairs.tolist(), *pairs[:, ::-1].tolist()]:
-        k, f = int(owner[other]), int(owner[fixed])
-        number = next((n for n, body in enumerate(sheets[k]) if row[other] in body.faces), None)
-        still = next((n for n, body in enumerate(sheets[f]) if row[fixed] in body.faces), -1)
-        if number is None or {(k, number), (f, still)} & moved:
+        still, mover = ((int(owner[face]), int(sheet[owner[face]][row[face]])) for face in (fixed, other))
+        if mover[1] < 0 or {mover, still} & moved:
             continue
-        plane, faces = corners[f][row[fixed]], sheets[k][number].faces
-        normal = np.cross(plane[1] - plane[0], plane[2] - plane[0])
-        normal /= np.linalg.norm(normal)
-        corners[k][faces] -= ((corners[k][faces] - plane[0]) @ normal)[..., None] * normal
-        moved.add((k, number))
+        faces = sheet[mover[0]] == mover[1]
+        corners[mover[0]][faces] = _in_plane(corners[mover[0]][faces], corners[still[0]][row[fixed]])
+        moved.add(mover)
     changed = {k for k, _ in moved}
     return [replace(part, corners_m=corners[k]) if k in changed else part for k, part in enumerate(parts)]
+
+
+def _in_plane(corners_m: FloatArray, triangle_m: FloatArray) -> FloatArray:
+    """Corners [f, 3, 3] projected onto the plane of a triangle [3, 3]."""
+    normal = np.cross(triangle_m[1] - triangle_m[0], triangle_m[2] - triangle_m[0])
+    normal /= np.linalg.norm(normal)
+    return np.asarray(corners_m - ((corners_m - triangle_m[0]) @ normal)[..., None] * normal)
+
+
+def _sheet_numbers(corners_m: FloatArray) -> IntArray:
+    """Number of the flat body of each triangle [f, 3, 3]; -1 in others."""
+    numbers = np.full(len(corners_m), -1)
+    for number, body in enumerate(bodies(corners_m)):
+        if is_flat(body):
+            numbers[body.faces] = number
+    return numbers
+
+
+def _with_area(parts: list[Part]) -> list[Part]:
+    return [_only(part, ~without_area(part.corners_m)) for part in parts]
 
 
 def _without_copies(parts: list[Part]) -> list[Part]:
@@ -88,5 +91,26 @@ def _without_copies(parts: list[Part]) -> list[Part]:
         return parts
     doubled = copies(np.concatenate([part.corners_m for part in parts]))
     ends = np.cumsum([len(part.corners_m) for part in parts])[:-1]
-    rows = np.split(~doubled, ends)
-    return [replace(part, corners_m=part.corners_m[row]) for part, row in zip(parts, rows, strict=True)]
+    return [_only(part, row) for part, row in zip(parts, np.split(~doubled, ends), strict=True)]
+
+
+def _only(part: Part, rows: NDArray[np.bool_]) -> Part:
+    return part if rows.all() else replace(part, corners_m=part.corners_m[rows])
+
+
+def _wound(parts: list[Part]) -> list[Part]:
+    return [
+        replace(part, corners_m=wound_one_way(part.corners_m))
+        if any(map(wound_both_ways, bodies(part.corners_m)))
+        else part
+        for part in parts
+    ]
+
+
+STAGES: tuple[tuple[Callable[[list[Part]], list[Part]], str], ...] = (
+    (_one_plane, "sheet moved by millimetres into the plane of another one"),
+    (_with_area, "faces without an area left out"),
+    (_without_copies, "copies of faces left out"),
+    (_wound, "faces wound one way"),
+)
+"""Repairs in their order, and what is said of the parts that they change."""
