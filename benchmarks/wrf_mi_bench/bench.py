@@ -123,6 +123,7 @@ _OWN: Mapping[str, Check] = {
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
+    "damaged-scenes": _here("faults of scenes named", "damaged_scenes:main"),
     "sentinels": _here(
         "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"
     ),

@@ -56,6 +56,7 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
 def test_commands_are_complete() -> None:
     expected = {
         "doctor",
+        "check",
         "data",
         "mesh",
         "correct",

@@ -16,7 +16,18 @@ from ..core.files import os_failure
 from ..version import __version__
 from .options import Parser
 
-MODULES = ("doctor", "data", "scenes", "train", "runs", "maps", "export", "bench", "demo")  # in the order of the help
+MODULES = (
+    "doctor",
+    "check",
+    "data",
+    "scenes",
+    "train",
+    "runs",
+    "maps",
+    "export",
+    "bench",
+    "demo",
+)  # in the order of the help
 
 
 def build_parser() -> Parser:

@@ -92,16 +92,18 @@ def read_obj(path: Path) -> Polygons:
 
 def _obj_statements(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Words of each statement that is not empty, and its first line from 1."""
-    pending, first = "", 0
+    pieces, first = list[str](), 0  # of a statement that goes on in the next line; joined once, as there may be many
     # Universal line ends; names may be in any encoding, and are not used.
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         for number, line in enumerate(stream, 1):
-            first = first if pending else number
-            text = pending + line.partition("#")[0].rstrip()
-            pending = f"{text[:-1]} " if text.endswith("\\") else ""
-            if not pending and (words := text.split()):
-                yield first, words
-    if words := pending.split():
+            first = first if pieces else number
+            text = line.partition("#")[0].rstrip()
+            pieces.append(text.removesuffix("\\"))
+            if not text.endswith("\\"):
+                if words := " ".join(pieces).split():
+                    yield first, words
+                pieces = []
+    if words := " ".join(pieces).split():
         yield first, words
 
 

@@ -89,10 +89,8 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
                 raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
             if plugin in MESH_PLUGINS:
                 content = _mesh_content(shape)
-            elif (mesh := _unit_shape(plugin)) is not None:
-                content = _placed_content(mesh, shape, root.get("version", ""), f"{path}: {name}")
             else:
-                continue
+                content = _placed_content(shape, root.get("version", ""), f"{path}: {name}")
         except InputError as error:
             raise InputError(f"{path}: {name}: {one_line(error)}") from None
         if content is None:
@@ -128,13 +126,13 @@ def _own_triangles(file: Path, plugin: str, state: tuple[int, int, int] | None) 
     corners = np.asarray(mesh.vertices, np.float32)[mesh.faces]
     if not np.isfinite(corners).all():
         raise InputError(f"{file}: an invalid vertex position, not a finite number; correct it")
-    if _same_triangles(corners, _triangles_by_mitsuba(file, plugin)):
+    if same_triangles(corners, triangles_by_mitsuba(file, plugin)):
         return None
     logger.info("%s: read as %d triangles, which Mitsuba reads otherwise or not at all", file, len(corners))
     return plain_ply(mesh)
 
 
-def _triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
+def triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
     """Corners [f, 3, 3] of a mesh file as Mitsuba reads it; none where it refuses the file."""
     import mitsuba as mi
 
@@ -161,7 +159,7 @@ def _quiet_mitsuba() -> Iterator[None]:
         mi.set_log_level(level)
 
 
-def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
+def same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
     """Whether triangles [f, 3, 3] are the same, in any order and with any order of their corners."""
     if first.shape != second.shape or np.array_equal(first, second):
         return first.shape == second.shape
@@ -170,30 +168,61 @@ def _same_triangles(first: NDArray[np.float32], second: NDArray[np.float32]) -> 
     return all(np.array_equal(*(part[np.lexsort(part.T)][:, k] for part in rows)) for k in range(3))
 
 
-def _placed_content(mesh: trimesh.Trimesh, shape: Element, version: str, where: str) -> bytes:
-    """PLY of a unit shape's mesh in the scene's frame; the shape loses its parameters."""
+def placed_mesh(shape: Element, version: str) -> trimesh.Trimesh | None:
+    """Mesh of a shape without a file in the scene's frame; None for another shape.
+
+    Args:
+        shape: a cube, rectangle, disk, cylinder or sphere.
+        version: version of its scene file; older ones have other names of parameters.
+
+    Returns:
+        The mesh, with the matrix that places it as ``to_world`` in its metadata.
+
+    Raises:
+        InputError: a parameter that Mitsuba does not know, or no area.
+    """
     import mitsuba as mi
 
+    plugin = shape.get("type", "")
+    mesh = trimesh.creation.box((2, 2, 2)) if plugin == "cube" else _unit_shape(plugin)
+    if mesh is None:
+        return None
     # Mitsuba reads the parameters: its to_world then holds centre, radius and ends, too, and it names unknown ones.
-    alone = Element("scene", version=version)  # older versions have other names of parameters
-    stated = SubElement(alone, "shape", type=shape.get("type", ""))
+    alone = Element("scene", version=version)
+    stated = SubElement(alone, "shape", type=plugin)
     stated.extend([child for child in shape if child.tag in VALUES])
-    for child in stated:
-        shape.remove(child)
     try:
         with _quiet_mitsuba():
             loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
-        to_world = mi.traverse(loaded.shapes()[0])["to_world"].matrix.numpy().reshape(4, 4).astype(float)
+        parameters = mi.traverse(loaded.shapes()[0])
+        if "to_world" in parameters:
+            to_world = parameters["to_world"].matrix.numpy().reshape(4, 4).astype(float)
+        else:  # a cube is a mesh, whose vertices are placed
+            corners = np.asarray(parameters["vertex_positions"].numpy().reshape(-1, 3), float)
+            faces = parameters["faces"].numpy().reshape(-1, 3)
+            mesh, to_world = trimesh.Trimesh(corners, faces, process=False), np.eye(4)
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"cannot be opened ({reason(error)}); correct the shape") from None
-    placed = mesh.copy()
     if np.isfinite(to_world).all():
-        placed.apply_transform(to_world)
-    if not np.isfinite(to_world).all() or not placed.area_faces.min() > 0:
+        mesh.apply_transform(to_world)
+    if not np.isfinite(mesh.vertices).all() or not np.isfinite(to_world).all() or not mesh.area_faces.min() > 0:
         raise InputError("has no area; give a radius and a transform that leave one")
-    if (plugin := shape.get("type", "")) != "rectangle":
+    mesh.metadata["to_world"] = to_world
+    return mesh
+
+
+def _placed_content(shape: Element, version: str, where: str) -> bytes | None:
+    """PLY of `placed_mesh` where Mitsuba has no triangles; the shape then loses its parameters."""
+    plugin = shape.get("type", "")
+    placed = None if plugin == "cube" else placed_mesh(shape, version)
+    if placed is None:
+        return None
+    for child in [child for child in shape if child.tag in VALUES]:
+        shape.remove(child)
+    if plugin != "rectangle":
         # Facets of a sphere lie off it by both the angle between meridians and that between parallels.
         round_axes, angles = (3, 2) if plugin == "sphere" else (2, 1)
+        to_world = placed.metadata["to_world"]
         off_m = (1 - np.cos(np.pi / SEGMENTS) ** angles) * np.linalg.norm(to_world[:3, :round_axes], 2)
         logger.info("%s: a %s as %d triangles, up to %.2g m off it", where, plugin, len(placed.faces), off_m)
     return plain_ply(placed)
@@ -307,7 +336,15 @@ def load_scene(
         raise InputError(f"{source}: a mesh has no radio material; give one, such as concrete, or {PERFECT}")
     if not mesh and material is not None:
         raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
-    scene = _from_mesh(path, str(material)) if mesh else _from_xml(path)
+    try:
+        return _checked(path, source, material if mesh else None), stated_m, laws
+    except InputError as error:
+        raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
+
+
+def _checked(path: Path, source: str | Path, material: str | None) -> Any:
+    """A ``sionna.rt.Scene`` of a scene file, or of a mesh with a material; `InputError` for one that traces wrongly."""
+    scene = _from_xml(path) if material is None else _from_mesh(path, material)
     if not scene.objects:
         raise InputError(f"{source}: holds no surface; give a scene with triangles")
     bounds = scene.mi_scene.bbox()
@@ -316,7 +353,7 @@ def load_scene(
         text = f"{height:.0f} m high, as if in millimetres"
         raise InputError(f"{source}: {text}; scale the coordinates to metres (multiply by 0.001)")
     require_near(corners_m, source)
-    return scene, stated_m, laws
+    return scene
 
 
 def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float, float]]]:

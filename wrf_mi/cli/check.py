@@ -1,0 +1,41 @@
+"""``wrf-mi check``: why a scene does not open in Sionna RT, and a repaired copy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .options import Arguments, add_command
+from .output import show
+
+
+def add_parser(commands: Any) -> None:
+    """Add ``check`` to the commands."""
+    text = "find what keeps a scene, mesh or scan from opening or makes its paths wrong, and repair a copy"
+    parser = add_command(commands, "check", check_command, text)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, mesh or scan")
+    add("--data", metavar="DATASET", help="data set whose devices must not be inside solids, and whose carrier counts")
+    add("--frequency", type=float, metavar="HZ", help="carrier at which materials and phases are checked")
+    add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
+    add("--up", choices=("y", "z"), help="axis that is up (default: y in GLB, else z)")
+    add("--repair", metavar="OUT", help="scene folder to make, which plain Sionna RT opens; the source is not changed")
+    add("--material", metavar="NAME", help="for --repair: material of shapes whose names mean none, e.g. concrete")
+    add("--replace", action="store_true", help="for --repair: replace an existing folder")
+    add("--strict", action="store_true", help="exit status 1 if there are warnings")
+
+
+def check_command(a: Arguments) -> int:
+    """Report faults (exit status 2), warnings (0, or 1 if asked) and notes of a scene, or repair it."""
+    from ..checking import check_scene, repair_scene
+    from ..core import InputError
+
+    if a.repair is None and (a.material or a.replace):
+        raise InputError("check: --material and --replace belong to --repair OUT; give a folder, or omit them")
+    if a.repair is None:
+        report = check_scene(a.scene, data=a.data, frequency_hz=a.frequency, units=a.units, up=a.up)
+        show(a.json, report.as_dict(), "\n".join(report.lines()))
+        return 1 if report.ok and a.strict and report.of_level("warning") else 0 if report.ok else 2
+    form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
+    repair = repair_scene(a.scene, a.repair, material=a.material, overwrite=a.replace, **form)
+    show(a.json, repair.as_dict(), "\n".join(repair.lines()))
+    return 2 if repair.unrepaired else 0
