@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,19 +15,21 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import Up, check_extent, require_fine, require_near, warn_of_up
+from .coordinates import STATING_UP, Y_UP, Up, check_extent, local_origin, require_fine, require_near, require_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
-from .mesh.surfaces import Surface, moved, sampled
+from .mesh.surfaces import Surface, bounds, box_of, moved, sampled
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
-from .scan.points import read_points
+from .scan.points import Scan, read_scan
+
+logger = logging.getLogger(__name__)
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -34,10 +37,10 @@ RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
 def make_scene(
-    points_file: str | Path,
+    points_file: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
-    units: str = "m",
+    units: str | None = None,
     up: Up | None = None,
     origin_m: Sequence[float] | None = None,
     materials: str | Path | Materials | None = None,
@@ -53,15 +56,17 @@ def make_scene(
     r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
-        points_file: a 3D scan (`wrf_mi.scene.scan.points.read_points`); a plan in two dimensions
+        points_file: a 3D scan, or several in one frame (`wrf_mi.scene.scan.points.read_scan`); a plan in two dimensions
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
-        up: axis of a scan or mesh that is up, y or z; None: y in GLB, as glTF specifies, else z, with a warning if the
-            coordinates look otherwise.
+        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m.
+        up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
+            coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
             as in a national grid, single precision would move walls. Positions of measurements have to be less by it.
+            None: the file's origin, or where that is too far away, and neither a registration nor positions say where
+            the scene lies, a point of hundreds of metres near it, which is stored and logged.
         materials: rules and exceptions, or a ``materials.yml`` (or scene folder) to read them from.
         height_m: height from floor to ceiling, required for a plan and refused otherwise.
         floor_m: z of a plan's floor.
@@ -95,7 +100,8 @@ def make_scene(
     'open'
     >>> shutil.rmtree(folder)
     """
-    file, out = Path(points_file), Path(out)
+    files = [Path(f) for f in ([points_file] if isinstance(points_file, str | Path) else points_file)]
+    file, out = files[0], Path(out)
     if out.exists() and not replace:
         raise InputError(f"{out}: exists; remove it or choose another folder")
     if registration is not None and register_walls_of is not None:
@@ -107,7 +113,9 @@ def make_scene(
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     shift = _shift(file, origin_m)
-    points = grid = None
+    scan = grid = None
+    if other := next((f for f in files[1:] if is_plan(f) or has_faces(f) or is_plan(file) or has_faces(file)), None):
+        raise InputError(f"{other}: several files are scans of one place, and {file} and this one are not; give one")
     if is_plan(file):
         surfaces, grid = _read_plan(file, units, up, height_m, floor_m, resolution_m, row_0)
     elif height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
@@ -115,8 +123,16 @@ def make_scene(
     elif has_faces(file):
         surfaces = _read_faces(file, units, up)
     else:
-        points = _read_scan(file, units, up, None if matrix is not None or known_walls is not None else shift)
-        surfaces = surfaces_from_points(points)
+        scan = _read_scan(files, units, up)
+    extent_m = box_of(surfaces) if scan is None else scan.points_m
+    framed = matrix is not None or known_walls is not None
+    if origin_m is None and not framed and measured is None and (origin_m := local_origin(extent_m)):
+        shift = _shift(file, origin_m)
+        logger.info("%s: lies far from its origin; %s becomes the origin", file, origin_m)
+    if scan is not None:
+        if not framed:  # before minutes are spent on its planes
+            require_near(trimesh.transform_points(bounds(scan.points_m), shift), file)
+        surfaces = _scan_surfaces(scan, file, up)
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
@@ -129,11 +145,11 @@ def make_scene(
         placed,
         frame=_frame(file, origin_m, matrix),
         origin_m=origin_m,
-        source=str(file),
+        source=", ".join(map(str, files)),
         materials=materials,
         registration=matrix,
-        points_m=None if points is None else trimesh.transform_points(_sample(points), motion),
-        counts={} if points is None else {"points": len(points)},
+        points_m=None if scan is None else trimesh.transform_points(_sample(scan.points_m), motion),
+        counts={} if scan is None else {"points": len(scan.points_m)},
         replace=replace,
     )
     return read_scene_folder(out)
@@ -171,7 +187,7 @@ def _rigid(registration: ArrayLike) -> FloatArray:
 
 def _read_plan(
     file: Path,
-    units: str,
+    units: str | None,
     up: Up | None,
     height_m: float | None,
     floor_m: float,
@@ -184,7 +200,7 @@ def _read_plan(
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
     if height_m is None:
         raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
-    if units != "m":
+    if units not in (None, "m"):
         raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
@@ -193,21 +209,42 @@ def _read_plan(
     return walls, plan if isinstance(plan, PlanGrid) else None
 
 
-def _read_faces(file: Path, units: str, up: Up | None) -> list[Surface]:
-    surfaces = read_mesh(file, units, up)
-    warn_of_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])), file, up)
-    return planes_of_mesh(surfaces)
+def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
+    raw = read_mesh(file, units, up)
+    require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
+    surfaces = planes_of_mesh(raw)
+    if up is None and file.suffix.lower() not in STATING_UP and not _has_floor(surfaces):
+        _check_turned(planes_of_mesh(moved(raw, Y_UP.T)), file)
+    return surfaces
 
 
-def _read_scan(file: Path, units: str, up: Up | None, motion: FloatArray | None) -> FloatArray:
-    """Points [n, 3] of a scan, refused where the motion [4, 4] to the scene, if it is known, leaves them far away."""
-    points = read_points(file, units, up)
-    check_extent(points, file)
-    require_fine(points, file)
-    warn_of_up(points, file, up)
-    if motion is not None:
-        require_near(trimesh.transform_points(points, motion), file)  # before minutes are spent on its planes
-    return points
+def _read_scan(files: Sequence[Path], units: str | None, up: Up | None) -> Scan:
+    scan = read_scan(files, units, up)
+    check_extent(scan.points_m, files[0])
+    require_fine(scan.points_m, files[0])
+    require_up(scan.points_m, files[0], up)
+    return scan
+
+
+def _scan_surfaces(scan: Scan, file: Path, up: Up | None) -> list[Surface]:
+    surfaces = surfaces_from_points(scan.points_m, scan.viewpoints_m, scan.viewpoint)
+    if up is None and not _has_floor(surfaces):
+        try:
+            turned = surfaces_from_points(trimesh.transform_points(scan.points_m, Y_UP.T))
+        except InputError:
+            return surfaces
+        _check_turned(turned, file)
+    return surfaces
+
+
+def _has_floor(surfaces: Sequence[Surface]) -> bool:
+    return any(surface.kind == "floor" for surface in surfaces)
+
+
+def _check_turned(turned: Sequence[Surface], file: Path) -> None:
+    """Refuse a file, read with z up, that has no floor unless y is up, where it has the given surfaces."""
+    if _has_floor(turned):
+        raise InputError(f"{file}: has no floor with z up, and one with y up; give --up y, or --up z if it is right")
 
 
 def is_plan(path: str | Path) -> bool:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import shapely
+from scipy import ndimage
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ..mesh.outline import fill_shadows, join, outline, triangulated
-from ..mesh.planes import Face, Plane, kinds, near, over, with_axes
-from ..mesh.surfaces import KINDS, Surface, number_names
-from .planes import BAND, find_planes, fit, layers
-from .points import thin
+from ...core.types import IntArray
+from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
+from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
+from ..mesh.surfaces import KINDS, Kind, Surface, number_names
+from .planes import BAND, find_planes, fit, layers, sparse_walls, thin
+from .sight import Sight, seen, sights_of
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +30,11 @@ LEAST_CONTRAST = 2.0
 """Least density of points in a plane relative to the density beside it; chance alignments have less."""
 TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 """Bounds of the angle by which planes are turned: a levelled scanner and its registration leave the lower."""
+LEAST_PART, LEAST_FILLED = 0.4, 0.5
+"""Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
+wall of few points that it fills."""
+MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
+UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
 ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
 
 
@@ -39,14 +46,18 @@ class _Piece(Face):
     recesses: Sequence[Any] = ()
 
 
-def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
+def surfaces_from_points(
+    points_m: FloatArray, viewpoints_m: FloatArray | None = None, viewpoint: IntArray | None = None
+) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
     Things that are not flat (chairs, plants) are left out: a rough skin over them would reflect in directions that
-    nothing measured supports.
+    nothing measured supports. So are surfaces of other places that a scanner saw through a door or window.
 
     Args:
         points_m: shape [n, 3], metres, z upwards; any origin.
+        viewpoints_m: places of the scanners where they are known [k, 3].
+        viewpoint: number of each point's place [n], -1 for none.
 
     Returns:
         Surfaces by kind, the largest first; several polygons may make up one. Vertices in the frame of the points.
@@ -56,23 +67,40 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     """
     # Far from the origin (a national grid) single precision cannot hold millimetres.
     shift = np.floor(np.median(points_m, axis=0))
-    points = points_m - shift
+    # Copies of a point, which some scanners write, would make strays look like surfaces.
+    _, distinct = np.unique((points_m - shift) @ UNLIKE, return_index=True)
+    points = points_m[distinct] - shift
+    numbers = np.full(len(points), -1) if viewpoint is None else viewpoint[distinct]
+    places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
     cloud = thin(points)
     planes, noise = find_planes(cloud)
-    pieces = _pieces(planes, points.astype(np.float32), noise)
+    scan = _Scan(points.astype(np.float32), noise, sights_of(points, places, numbers, -shift))
+    middle_m = float(np.median(cloud.points_m[:, 2]))
+    pieces, roles = scan.roles(scan.pieces(planes), middle_m)
+    walls = _of_kind(pieces, roles, "wall")
+    outside = scan.outside(walls)
+    sparse = sparse_walls(cloud.points_m, [piece.plane for piece in walls], planes, noise)
+    if outside.any() or sparse:
+        scan.free &= ~outside
+        pieces, roles = scan.roles(scan.pieces([*planes, *sparse], walls), middle_m)
+        walls = _of_kind(pieces, roles, "wall")
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
     planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
-    roles = kinds(pieces, float(np.median(cloud.points_m[:, 2])))
     reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
     areas = join(planes, areas, reach)
     # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
-    things = np.ones(len(cloud.points_m), bool)
+    things, near_things = scan.free.copy(), np.ones(len(cloud.points_m), bool)
     for plane, area, kind in zip(planes, areas, roles, strict=True):
         if kind != "other":
-            things &= ~over(plane, area, cloud.points_m, BAND * noise)
+            things &= ~over(plane, area, scan.points_m, BAND * noise)
+            near_things &= ~over(plane, area, cloud.points_m, BAND * noise)
     for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
-        areas[i] = fill_shadows(piece.plane, areas[i], kind, cloud.points_m[things], noise)
+        if kind != "other":
+            areas[i] = scan.without_shadows(piece.plane, areas[i], walls, things)
+        areas[i] = fill_shadows(piece.plane, areas[i], kind, cloud.points_m[near_things], noise)
+        if kind == "floor":
+            areas[i] = fill_blind(piece.plane, areas[i], walls, points, BAND * noise)
         if piece.recesses:
             areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
     areas = [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
@@ -85,33 +113,107 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     return surfaces
 
 
-def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[_Piece]:
-    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first."""
-    pieces = list[_Piece]()
-    free = np.ones(len(points), bool)
-    for refined in _refined(planes, points, noise_m):
-        plane, parallel = layers(refined, points, free, noise_m)
-        recesses = []
-        for layer in parallel:
-            area, cell = outline(layer.plane, points[layer.rows])
-            if area.area >= SMALLEST_M2:
-                pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
-                free[layer.rows] = False
-                recesses += [] if layer.before else [area]
-        in_plane = near(plane, points, 2 * noise_m) & free
-        for layer in parallel:
-            in_plane[layer.rows] = layer.before  # a wall goes on behind a board
-        rows = np.flatnonzero(in_plane)
-        if len(rows) < FEWEST_POINTS:
-            continue
-        area, cell = outline(plane, points[rows])
-        # Densities per standard deviation of distance: within 2, and from 3 to 6, on both sides.
-        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
-        inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
-        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
-            pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
-            free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
-    return pieces
+def _of_kind(pieces: Sequence[_Piece], roles: Sequence[Kind], kind: Kind) -> list[_Piece]:
+    return [piece for piece, role in zip(pieces, roles, strict=True) if role == kind]
+
+
+class _Scan:
+    """Points [n, 3] of a scan, those that may belong to surfaces [n], their noise, and the scanners."""
+
+    def __init__(self, points_m: FloatArray, noise_m: float, sights: Sequence[Sight]) -> None:
+        self.points_m, self.noise_m, self.sights = points_m, noise_m, sights
+        self.free = np.ones(len(points_m), bool)
+
+    def pieces(self, planes: Sequence[Plane], walls: Sequence[Face] = ()) -> list[_Piece]:
+        """Planes and their parallel layers with the areas that free points cover, those of most points first."""
+        pieces = list[_Piece]()
+        points, noise_m, free = self.points_m, self.noise_m, self.free.copy()
+        for refined in _refined(planes, points, noise_m):
+            plane, parallel = layers(refined, points, free, noise_m)
+            recesses = []
+            for layer in parallel:
+                area, cell = outline(layer.plane, points[layer.rows])
+                if area.area >= SMALLEST_M2:
+                    pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
+                    free[layer.rows] = False
+                    recesses += [] if layer.before else [area]
+            in_plane = near(plane, points, 2 * noise_m) & free
+            for layer in parallel:
+                in_plane[layer.rows] = layer.before  # a wall goes on behind a board
+            rows = np.flatnonzero(in_plane)
+            if len(rows) < FEWEST_POINTS:
+                continue
+            area, cell = outline(plane, points[rows])
+            area = self._completed(plane, area, walls, free)
+            # Densities per standard deviation of distance: within 2, and from 3 to 6, on both sides.
+            away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
+            inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
+            if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
+                pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
+                free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
+        return pieces
+
+    def _completed(self, plane: Plane, area: Any, walls: Sequence[Face], free: Mask) -> Any:
+        """An area with the places about it that beams met, where points are too sparse to show it."""
+        band_m = BAND * self.noise_m
+        in_plane = np.flatnonzero(free & (np.abs(plane.distance(self.points_m)) < band_m))
+        if not self.sights or not len(in_plane):
+            return area
+        raster = Raster.around(plane.flat(self.points_m[in_plane]).astype(float))
+        row, _ = seen(self.sights, plane, plane.lift(raster.centres_m), walls, band_m, free)
+        on = raster.image((row >= 0) & free[row])
+        # Where another surface crosses the plane, a strip as wide as the band lies in it.
+        strip = int(np.ceil(2 * band_m / raster.cell_m)) + 1
+        return raster.grown(area, ndimage.binary_opening(on, np.ones((strip, strip))))
+
+    def roles(self, pieces: Sequence[_Piece], middle_m: float) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces with their roles, walls with their parts behind things; without sparse planes that are no walls."""
+        short = dict(zip(pieces, kinds(pieces, middle_m), strict=True))
+        whole = [self._up_to_levels(piece, short) for piece in pieces]
+        chosen, roles = list[_Piece](), kinds(whole, middle_m)
+        for piece, longer, role in zip(pieces, whole, roles, strict=True):
+            filled = longer.area.area / shapely.envelope(longer.area).area
+            if not piece.plane.sparse or (role == "wall" and filled >= LEAST_FILLED):
+                chosen.append(longer if role == "wall" else piece)
+        return chosen, kinds(chosen, middle_m)
+
+    def _up_to_levels(self, piece: _Piece, roles: Mapping[Face, Kind]) -> _Piece:
+        """An upright piece with the places that things hide between the floor and the ceiling."""
+        if not self.sights or piece.slope > UPRIGHT or np.ptp(piece.span_m) < LEAST_PART * WALL_HEIGHT_M:
+            return piece
+        levels = {face: role for face, role in roles.items() if role in ("floor", "ceiling")}
+        off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
+        (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
+        for height in storey(piece, levels):
+            if np.isfinite(height):
+                at = piece.area.centroid.y + height - middle[2]
+                low, high = min(low, at), max(high, at)
+        area = self.without_shadows(piece.plane, piece.area, (), off, shapely.box(left, low, right, high))
+        return replace(piece, area=area)
+
+    def without_shadows(
+        self, plane: Plane, area: Any, walls: Sequence[Face], things: Mask, within: Any | None = None
+    ) -> Any:
+        """An area with the places that things hide from all scanners, within its bounds or other ones."""
+        if not self.sights or area.is_empty:
+            return area
+        within = shapely.envelope(area) if within is None else within
+        raster = Raster.around(shapely.get_coordinates(within))
+        _, hidden = seen(self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things)
+        return raster.grown(area, raster.image(hidden) & raster.covered(within) & ~raster.covered(area))
+
+    def outside(self, walls: Sequence[Face]) -> Mask:
+        """Points that scanners saw through openings of walls; none of a scanner that saw much there.
+
+        A door two metres away is 4 % of all directions: a scanner with a tenth of its returns behind walls stands in a
+        doorway, or a rectangle about pieces of a wall spans an open plan.
+        """
+        outside = np.zeros(len(self.points_m), bool)
+        for sight in self.sights:
+            behind = sight.behind(sight.points_m, walls, max(BAND * self.noise_m, REACH_M))
+            if behind.mean() < MOST_OUTSIDE:
+                outside[sight.rows[behind]] = True
+        return outside
 
 
 def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:

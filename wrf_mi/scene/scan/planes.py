@@ -16,13 +16,21 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.signal import find_peaks
+from scipy.spatial import cKDTree
 from skimage.filters import apply_hysteresis_threshold
 
+from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
-from .points import Thinned, lidar_package
+from ..coordinates import extra_package
+from ..mesh.planes import LEVEL, THICKEST_M, WALL_HEIGHT_M, Mask, Plane, near, with_axes
 
+VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
+MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
+NORMAL_RADIUS_M, NORMAL_NEIGHBOURS, FEWEST_NEIGHBOURS = 0.15, 50, 16
+"""Radius of the points that tell a normal, and the most and fewest of them; the fewest reach farther where need be."""
+STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
+"""A mean farther from its neighbours than usual by this many standard deviations is a stray."""
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
 """Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
 joins the walls of a sparse room around its corners, but finds narrow faces."""
@@ -44,11 +52,55 @@ LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
 """Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
 GROWN_ERRORS = 2.0  # the same of cells beside
 LAYER_M2, LAYER_CELLS = 0.3, 8  # least size of a layer
+SPARSE_M2, SPARSE_CONTRAST, SPARSE_AROUND_M = 2.0, 2.0, 0.5
+"""Least area of the cells with points of a wall of few points, also relative to that of planes within a distance."""
+MOST_LEAN, LEAN_RAD = 3, np.radians(1.0)  # steps by which walls are sought that lean, as in scans of a poor scanner
+SAME_HEADING_RAD = np.radians(3.0)  # angle up to which walls count as parallel
 FLATNESS = 2.0
 """Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
 MEDIAN_ERROR = 1.25  # standard error of a median, in that of a mean
 TUKEY = 4.685  # constant of the biweight
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median absolute deviations
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """A thinned point cloud: mean of the points in each cell [m, 3], their number [m], and unit normals [m, 3]."""
+
+    points_m: FloatArray
+    count: FloatArray
+    normals: FloatArray
+
+
+def thin(points_m: FloatArray) -> Thinned:
+    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
+    o3d = extra_package("open3d")
+    voxel = VOXEL_M
+    mean, count = _cells(points_m, voxel)
+    while len(mean) > MOST_VOXELS:
+        voxel *= 1.25
+        mean, count = _cells(points_m, voxel)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
+    cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
+    if len(rows) < STRAY_NEIGHBOURS:
+        raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
+    radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.asarray(cloud.points)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, NORMAL_NEIGHBOURS))
+    normals = np.array(cloud.normals)
+    # Far from the scanner a radius holds a few points, whose noise tilts the normal.
+    few = cKDTree(points).query_ball_point(points, radius, return_length=True) < FEWEST_NEIGHBOURS
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FEWEST_NEIGHBOURS))
+    normals[few] = np.asarray(cloud.normals)[few]
+    return Thinned(points, count[rows], normals)
+
+
+def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:
+    """Mean [m, 3] and number [m] of the points in each cell."""
+    cell = ((points_m - points_m.min(axis=0)) / voxel_m).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    _, inverse = np.unique(key, return_inverse=True)
+    count = np.bincount(inverse).astype(float)
+    return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
 
 
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
@@ -72,6 +124,57 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         for plane in planes:
             free &= ~near(plane, cloud.points_m, BAND * noise)
     return planes, noise
+
+
+def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+    """Planes parallel or square to walls in the points [n, 3] of no plane, too few for a flat patch.
+
+    A wall far away, or seen through a gap, has few points, but these lie in one plane over a room's height.
+    """
+    free, headings = np.ones(len(points_m), bool), list[FloatArray]()
+    for plane in planes:
+        free &= ~near(plane, points_m, BAND * noise_m)
+    # Of a scanner that is not level, walls are upright in the frame of the floor.
+    up = next((plane.normal for plane in planes if abs(plane.normal[2]) > LEVEL), np.array([0.0, 0.0, 1.0]))
+    for wall in walls:
+        for normal in (wall.normal, np.cross(up, wall.normal)):
+            if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
+                headings.append(normal / np.linalg.norm(normal))
+    points, candidates = points_m[free], list[tuple[float, Plane]]()
+    for normal in headings:
+        for lean in np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD:
+            candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
+    chosen = list[Plane]()
+    for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
+        if not any(_repeats(plane, other, AROUND * noise_m) for other in chosen):
+            chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
+    return chosen
+
+
+def _parallel_planes(points: FloatArray, normal: FloatArray, noise_m: float) -> list[tuple[float, Plane]]:
+    """Planes of a direction in which points [n, 3] lie over a larger area than beside them, and these areas."""
+    if not len(points):
+        return []
+    across, side = points @ normal, CELL_RANGE_M[1]
+    low, step = across.min(), 2 * noise_m
+    along = np.floor(np.stack([points @ np.cross((0, 0, 1), normal), points[:, 2]]) / side)
+    bins = np.floor((across - low) / step)
+    cells = np.unique(np.stack([bins, *along]).astype(int), axis=1)[0]
+    covered = np.convolve(np.bincount(cells), np.ones(2)) * side**2  # a plane lies in two neighbouring bins
+    usual = ndimage.median_filter(covered, 2 * int(SPARSE_AROUND_M / step) + 1, mode="constant")
+    peaks, _ = find_peaks(np.pad(covered, 1), height=SPARSE_M2, distance=AROUND / 2)
+    planes = []
+    for peak in peaks - 1:
+        inside = np.abs(across - low - peak * step) < step
+        if covered[peak] < SPARSE_CONTRAST * usual[peak] or np.count_nonzero(inside) < FEWEST_VOXELS:
+            continue
+        chosen = points[np.abs(across - np.median(across[inside])) < BAND * noise_m]
+        centre = chosen.mean(axis=0)
+        plane = with_axes(Plane(normal, float(centre @ normal), np.empty((0, 4, 3)), centre, np.inf, sparse=True))
+        bounds = np.quantile(plane.flat(chosen), LAYER_CORE, axis=0)
+        if np.ptp(bounds, axis=0)[1] >= WALL_HEIGHT_M / 2:
+            planes.append((float(covered[peak]), replace(plane, patches_m=plane.rectangle(*bounds)[None])))
+    return planes
 
 
 def fit(
@@ -147,7 +250,7 @@ def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:
     """Boxes around the flat patches of a part of a cloud."""
     if np.count_nonzero(free) < FEWEST_VOXELS:
         return []
-    o3d = lidar_package("open3d")
+    o3d = extra_package("open3d")
     part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m[free]))
     part.normals = o3d.utility.Vector3dVector(cloud.normals[free])
     boxes = part.detect_planar_patches(
