@@ -33,6 +33,7 @@ TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 LEAST_PART, LEAST_FILLED = 0.4, 0.5
 """Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
 wall of few points that it fills."""
+PASSES = 2
 MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
 UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
 ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
@@ -78,10 +79,13 @@ def surfaces_from_points(
     middle_m = float(np.median(cloud.points_m[:, 2]))
     pieces, roles = scan.roles(scan.pieces(planes), middle_m)
     walls = _of_kind(pieces, roles, "wall")
-    outside = scan.outside(walls)
     sparse = sparse_walls(cloud.points_m, [piece.plane for piece in walls], planes, noise)
-    if outside.any() or sparse:
-        scan.free &= ~outside
+    for number in range(PASSES):
+        # Walls bound the room, and a wall that is found by few points bounds the others.
+        outside = scan.outside(walls)
+        if not (outside & scan.free).any() and not (sparse and number == 0):
+            break
+        scan.free = ~outside
         pieces, roles = scan.roles(scan.pieces([*planes, *sparse], walls), middle_m)
         walls = _of_kind(pieces, roles, "wall")
     if not pieces:

@@ -146,7 +146,7 @@ def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[
             candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
     chosen = list[Plane]()
     for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
-        if not any(_repeats(plane, other, AROUND * noise_m) for other in chosen):
+        if not any(_repeats(plane, other, AROUND * noise_m) for other in [*planes, *chosen]):
             chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
     return chosen
 
