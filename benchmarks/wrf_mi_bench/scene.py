@@ -17,8 +17,8 @@ from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.memory import peak_memory_mb
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
-from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.coordinates import extra_package
+from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.scan.simulated import OUTLIERS, RANGE_NOISE_M, RAYS_PER_POSE, simulate_scan
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.surfaces import scene_surfaces

@@ -13,8 +13,8 @@ from made_rooms import attic, by_kind, closed_box, l_shape, sampled, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.scene import coordinates
+from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.scene.scan.cloud import surfaces_from_points
 
 PLANE_M = 0.003

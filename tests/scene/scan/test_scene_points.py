@@ -12,10 +12,10 @@ import trimesh
 from made_rooms import closed_box, sampled
 
 from wrf_mi.core import InputError
+from wrf_mi.scene import coordinates
 from wrf_mi.scene.coordinates import check_extent, extra_package
 from wrf_mi.scene.make import is_plan, make_scene
 from wrf_mi.scene.mesh.files import read_mesh
-from wrf_mi.scene import coordinates
 from wrf_mi.scene.scan.points import read_points
 
 POINTS = np.array([[0.5, 1.25, -2.0], [3.0, 4.5, 5.0], [6.0, -7.75, 8.0]])
