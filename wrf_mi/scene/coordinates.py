@@ -92,7 +92,7 @@ def looks_y_up(points_m: FloatArray) -> bool:
 def warn_of_up(points_m: FloatArray, name: str | Path, stated: Up | None = None) -> None:
     """Log that points [n, 3], z up, of a file for which no axis was stated look as if another than `up_of` were up."""
     if stated is None and looks_y_up(points_m):
-        logger.warning("%s; state it by wrf-mi mesh --up", _up_text(points_m, name))
+        logger.warning("%s, or --up %s", _up_text(points_m, name), up_of(name, None))
 
 
 def require_up(points_m: FloatArray, name: str | Path, stated: Up | None) -> None:
@@ -103,7 +103,7 @@ def require_up(points_m: FloatArray, name: str | Path, stated: Up | None) -> Non
     if Path(name).suffix.lower() in STATING_UP:
         warn_of_up(points_m, name, stated)
     elif stated is None and looks_y_up(points_m):
-        raise InputError(f"{_up_text(points_m, name)}; give --up y, or --up z if it is right")
+        raise InputError(f"{_up_text(points_m, name)}, or --up {up_of(name, None)} if it is right")
 
 
 def _up_text(points_m: FloatArray, name: str | Path) -> str:
@@ -111,7 +111,8 @@ def _up_text(points_m: FloatArray, name: str | Path) -> str:
     _, along_y, along_z = np.ptp(extent(points_m), axis=0)
     other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
     size = f"{sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file"
-    return f"{name}: looks as if {other} were up ({size}), and is read with {up} up"
+    text = f"{name}: looks as if {other} were up ({size}), and is read with {up} up"
+    return f"{text}; state it by wrf-mi mesh --up {other}"
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:

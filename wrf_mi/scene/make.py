@@ -244,7 +244,8 @@ def _has_floor(surfaces: Sequence[Surface]) -> bool:
 def _check_turned(turned: Sequence[Surface], file: Path) -> None:
     """Refuse a file, read with z up, that has no floor unless y is up, where it has the given surfaces."""
     if _has_floor(turned):
-        raise InputError(f"{file}: has no floor with z up, and one with y up; give --up y, or --up z if it is right")
+        remedy = "state it by wrf-mi mesh --up y, or --up z if it is right"
+        raise InputError(f"{file}: has no floor with z up, and one with y up; {remedy}")
 
 
 def is_plan(path: str | Path) -> bool:

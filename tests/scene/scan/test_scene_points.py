@@ -159,8 +159,13 @@ def test_unusable_meshes_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_package_and_missing_library_have_their_own_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"need no_such_package: pip install 'wrf-mi\[lidar\]'"):
-        extra_package("no_such_package")
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    monkeypatch.setattr(coordinates, "import_module", missing)
+    for name, extra in coordinates.EXTRAS.items():
+        with pytest.raises(InputError, match=rf"need {name}: pip install 'wrf-mi\[{extra}\]'"):
+            extra_package(name)
 
     def unlinked(name: str) -> None:
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")

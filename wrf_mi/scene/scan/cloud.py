@@ -69,7 +69,7 @@ def surfaces_from_points(
     # Far from the origin (a national grid) single precision cannot hold millimetres.
     shift = np.floor(np.median(points_m, axis=0))
     # Copies of a point, which some scanners write, would make strays look like surfaces.
-    _, distinct = np.unique((points_m - shift) @ UNLIKE, return_index=True)
+    distinct = np.sort(np.unique((points_m - shift) @ UNLIKE, return_index=True)[1])
     points = points_m[distinct] - shift
     numbers = np.full(len(points), -1) if viewpoint is None else viewpoint[distinct]
     places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
