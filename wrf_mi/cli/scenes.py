@@ -27,7 +27,7 @@ def _add_mesh(commands: Any) -> None:
     parser = add_command(commands, "mesh", mesh_command, text)
     add = parser.add_argument
     text = "scans of one place (E57, PCD, PTS, PTX, PLY, LAS, LAZ, XYZ, NPZ), a plan (NPZ, PNG, ROS map YAML, CSV) or "
-    text += "a mesh (OBJ, STL, GLB, PLY, OFF, COLLADA, USD)"
+    text += "a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
     add("--units", help="unit of the coordinates: m, cm, mm or ft (default: that of COLLADA and USD, else m)")

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 STATING_READERS = {".dae": read_collada, **dict.fromkeys(USD_SUFFIXES, read_usd)}
 """Readers of files that state their unit and the axis that is up."""
-SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", ".off", *STATING_READERS)
+SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS)
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
 SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise

@@ -6,6 +6,7 @@ trimesh reads COLLADA, too, but cuts concave polygons into fans, and drops unit 
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +36,17 @@ def read_collada(path: Path) -> Content:
         parsed_xml(path)
     except DefusedXmlException:
         raise InputError(f"{path}: has a document type or entities; remove them") from None
-    with path.open("rb") as stream:
+    with path.open("rb") as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # it computes with numpy.matrix
         content = collada.Collada(stream, aux_file_loader=lambda name: inside(path.parent, name, path).read_bytes())
-    parts = []
-    for geometry in content.scene.objects("geometry") if content.scene else ():
-        for primitive in geometry.primitives():
-            if primitive.vertex is None or not hasattr(primitive, "normal_index"):
-                continue  # lines
-            index = np.asarray(primitive.vertex_index)
-            sizes = primitive.polyends - primitive.polystarts if index.ndim == 1 else np.full(len(index), 3)
-            parts.append(_polygons(primitive.vertex, index, sizes, geometry.original.id))
+        parts = []
+        for geometry in content.scene.objects("geometry") if content.scene else ():
+            for primitive in geometry.primitives():
+                if primitive.vertex is None or not hasattr(primitive, "normal_index"):
+                    continue  # lines
+                index = np.asarray(primitive.vertex_index)
+                sizes = np.diff(primitive.polyindex)[:, 0] if index.ndim == 1 else np.full(len(index), 3)
+                parts.append(_polygons(primitive.vertex, index, sizes, geometry.original.id))
     up = str(content.assetInfo.upaxis or "Y_UP")
     return parts, float(content.assetInfo.unitmeter or 1.0), _up(path, up)
 
@@ -117,6 +119,6 @@ class Beside:
         """The file beside which they are."""
         self._path = path
 
-    def get(self, name: str) -> bytes:
+    def __getitem__(self, name: str) -> bytes:
         """Content of a file; `InputError` for one outside the folder."""
         return inside(self._path.parent, name, self._path).read_bytes()
