@@ -208,12 +208,18 @@ def _read_pcd(file: Path) -> list[Part]:
     header = {words[0]: words[1:] for line in head.decode("ascii", "replace").splitlines() if (words := line.split())}
     if not found or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or "POINTS" not in header:
         raise ValueError("no header of a PCD file with x, y, z and POINTS")
-    count = int(header["POINTS"][0])
-    sizes = [int(size) * int(n) for size, n in zip(header["SIZE"], header.get("COUNT", ["1"] * 1000), strict=False)]
-    record = LEAST_ROW if kind == "ascii" else sum(sizes)
+    count, fields = int(header["POINTS"][0]), header["FIELDS"]
+    lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
+    record = sum(int(size) * length for size, length in zip(header["SIZE"], lengths, strict=True))
     most = file.stat().st_size * (MOST_LZF if kind == "binary_compressed" else 1)
-    _check_count(file, count, count * record, most)
-    ((points, _),) = _read_apart(file, count * max(record, 24))
+    _check_count(file, count, count * (LEAST_ROW if kind == "ascii" else record), most)
+    if kind == "ascii":  # Open3D fills what a file lacks with whatever is in memory
+        columns = [sum(lengths[: fields.index(axis)]) for axis in "xyz"]
+        with file.open(encoding="ascii") as text:
+            rows = islice(text, len(head.splitlines()) + 1, None)
+            points = np.loadtxt(islice(rows, count), usecols=columns, ndmin=2)
+    else:
+        ((points, _),) = _read_apart(file, count * max(record, 24))
     if len(points) != count:
         raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off or damaged")
     place = np.array(header.get("VIEWPOINT", ["nan"] * 3)[:3], float)
