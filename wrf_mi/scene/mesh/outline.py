@@ -30,7 +30,8 @@ STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
 """A stray part of an area is smaller than this share of the whole and sparser than this share."""
 SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
-RECTANGLE_SHARE = 0.88  # least share of its tightest rectangle that a rectangular area fills
+RECTANGLE_SHARE, GROWN_SHARE = 0.88, 0.96
+"""Least share of its tightest rectangle that a rectangular area fills; also of one with places told by beams."""
 SCAN_LINES = 31
 SHADOW_CELL_M = 0.1
 BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
@@ -106,7 +107,7 @@ class Raster:
         inside = self.covered(area)
         parts, count = ndimage.label(mask | inside)
         meets = np.isin(np.arange(count + 1), np.unique(parts[inside])) & (np.arange(count + 1) > 0)
-        beyond = ndimage.binary_opening(meets[parts] & ~inside, np.ones((3, 3)))
+        beyond = ndimage.binary_opening(meets[parts] & ~inside, np.ones((2, 2)))
         added = _boxes(large_parts(beyond, LEAST_ADDED_M2 / self.cell_m**2), self.low_m, self.cell_m)
         if added.is_empty:
             return area
@@ -114,7 +115,13 @@ class Raster:
         cells = _boxes(mask | inside, self.low_m, self.cell_m)
         seam = shapely.intersection(shapely.buffer(added, 2 * self.cell_m, join_style="mitre"), cells)
         whole = shapely.union_all([area, added, seam], grid_size=GRID_M)
-        return shapely.union_all([_rectangle(part) or part.simplify(1.2 * self.cell_m) for part in polygons(whole)])
+        whole = shapely.union_all([whole, *(hole for hole in _holes(whole) if hole.area < SMALL_HOLE_M2)])
+        parts = [_rectangle(part, GROWN_SHARE) or part.simplify(1.2 * self.cell_m) for part in polygons(whole)]
+        return shapely.union_all(parts)
+
+
+def _holes(area: Any) -> list[Any]:
+    return [shapely.polygons(ring) for part in polygons(area) for ring in part.interiors]
 
 
 def fill_blind(plane: Plane, area: Any, walls: Sequence[Face], points_m: FloatArray, band_m: float) -> Any:
@@ -127,7 +134,7 @@ def fill_blind(plane: Plane, area: Any, walls: Sequence[Face], points_m: FloatAr
     lines = [shapely.transform(wall.area, lambda uv, wall=wall: plane.flat(wall.plane.lift(uv))) for wall in walls]
     about = shapely.buffer(shapely.union_all([shapely.boundary(line) for line in lines]), 2 * band_m)
     filled = [area]
-    for ring in (shapely.polygons(ring) for part in polygons(area) for ring in part.interiors):
+    for ring in _holes(area):
         walled = shapely.intersection(ring.exterior, about).length > HIDDEN_SHARE * ring.exterior.length
         if ring.area <= LARGEST_BLIND_M2 and not walled and not shapely.contains_xy(ring, flat).any():
             filled.append(ring)
@@ -283,10 +290,10 @@ def _covered(count: NDArray[Any], cell: float) -> Mask:
     return mask & ~np.concatenate([[False], stray])[label]
 
 
-def _rectangle(part: Any) -> Any | None:
+def _rectangle(part: Any, share: float = RECTANGLE_SHARE) -> Any | None:
     """The rectangle of a polygon that is rectangular but for noise, or None; its sides are medians of the polygon's."""
     for tight in (shapely.envelope(part), part.minimum_rotated_rectangle):
-        if part.area < RECTANGLE_SHARE * tight.area:
+        if part.area < share * tight.area:
             continue
         (x, y), (x1, y1) = tight.exterior.coords[:2]
         angle, pivot = np.degrees(np.arctan2(y1 - y, x1 - x)), (x, y)

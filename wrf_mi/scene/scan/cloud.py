@@ -79,7 +79,7 @@ def surfaces_from_points(
     middle_m = float(np.median(cloud.points_m[:, 2]))
     pieces, roles = scan.roles(scan.pieces(planes), middle_m)
     walls = _of_kind(pieces, roles, "wall")
-    sparse = sparse_walls(cloud.points_m, [piece.plane for piece in walls], planes, noise)
+    sparse = sparse_walls(cloud.all_m, [piece.plane for piece in walls], planes, noise)
     for number in range(PASSES):
         # Walls bound the room, and a wall that is found by few points bounds the others.
         outside = scan.outside(walls)

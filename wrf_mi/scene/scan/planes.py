@@ -65,11 +65,19 @@ NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median
 
 @dataclass(frozen=True)
 class Thinned:
-    """A thinned point cloud: mean of the points in each cell [m, 3], their number [m], and unit normals [m, 3]."""
+    """A thinned point cloud.
+
+    Attributes:
+        points_m: mean of the points in each cell, without strays [m, 3].
+        count: their number [m].
+        normals: unit normals [m, 3].
+        all_m: all means [k, 3]: far from a scanner surfaces are as sparse as strays.
+    """
 
     points_m: FloatArray
     count: FloatArray
     normals: FloatArray
+    all_m: FloatArray
 
 
 def thin(points_m: FloatArray) -> Thinned:
@@ -91,7 +99,7 @@ def thin(points_m: FloatArray) -> Thinned:
     few = cKDTree(points).query_ball_point(points, radius, return_length=True) < FEWEST_NEIGHBOURS
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FEWEST_NEIGHBOURS))
     normals[few] = np.asarray(cloud.normals)[few]
-    return Thinned(points, count[rows], normals)
+    return Thinned(points, count[rows], normals, mean)
 
 
 def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:

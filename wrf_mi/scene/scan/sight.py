@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.planes import Face, Mask, Plane
+from ..mesh.planes import LEVEL, Face, Mask, Plane
 
 MOST_BEAMS = 400_000  # beams of a scanner that are used: 0.3 degrees apart over the sphere
 DIRECTIONS = 4000  # directions by which a scan is judged
@@ -130,13 +130,15 @@ def seen(
         before: points of the cloud that hide what is behind them.
 
     Returns:
-        Number of the return [n] from the plane next to each point, -1 for none; and which points are hidden by others.
+        Number of the return [n] from the plane next to each point, -1 for none; and which points are hidden by others,
+        or on a floor not looked at: a scanner is blind below itself.
     """
     on, hidden, open_ = np.full(len(targets_m), -1), np.zeros(len(targets_m), bool), np.zeros(len(targets_m), bool)
     for sight in sights:
         state, row = sight.on_plane(plane, targets_m, band_m)
-        state[sight.behind(targets_m, walls, band_m)] = UNSEEN
-        on = np.where(state == ON, row, on)
-        open_ |= state == BEYOND
-        hidden |= (state == BEFORE) & before[row]
+        inside = ~sight.behind(targets_m, walls, band_m)
+        is_floor = abs(plane.normal[2]) > LEVEL and targets_m[:, 2].mean() < sight.place_m[2]
+        on = np.where((state == ON) & inside, row, on)
+        open_ |= (state == BEYOND) & inside
+        hidden |= inside & (((state == BEFORE) & before[row]) | (is_floor & (state == UNSEEN)))
     return on, hidden & (on < 0) & ~open_
