@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -29,10 +30,10 @@ from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
 from .scan.points import Scan, read_scan
 
-logger = logging.getLogger(__name__)
-
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
+Storey = tuple[float | None, float, float | None, Row0 | None]
+"""Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -113,33 +114,21 @@ def make_scene(
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     shift = _shift(file, origin_m)
-    scan = grid = None
-    if other := next((f for f in files[1:] if is_plan(f) or has_faces(f) or is_plan(file) or has_faces(file)), None):
-        raise InputError(f"{other}: several files are scans of one place, and {file} and this one are not; give one")
-    if is_plan(file):
-        surfaces, grid = _read_plan(file, units, up, height_m, floor_m, resolution_m, row_0)
-    elif height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
-        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
-    elif has_faces(file):
-        surfaces = _read_faces(file, units, up)
-    else:
-        scan = _read_scan(files, units, up)
-    extent_m = box_of(surfaces) if scan is None else scan.points_m
-    framed = matrix is not None or known_walls is not None
-    if origin_m is None and not framed and measured is None and (origin_m := local_origin(extent_m)):
+    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0))
+    if origin_m is None and matrix is known_walls is measured is None:
+        origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
-        logger.info("%s: lies far from its origin; %s becomes the origin", file, origin_m)
-    if scan is not None:
-        if not framed:  # before minutes are spent on its planes
-            require_near(trimesh.transform_points(bounds(scan.points_m), shift), file)
-        surfaces = _scan_surfaces(scan, file, up)
+    if source.scan is not None and matrix is known_walls is None:  # before minutes are spent on its planes
+        require_near(trimesh.transform_points(source.extent_m, shift), file)
+    surfaces = source.surfaces(up)
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
     if measured is not None:
-        mirrored = reflections(surfaces, file, grid, motion, known_walls)
+        mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
+    scanned = None if source.scan is None else source.scan.points_m
     write_scene(
         out,
         placed,
@@ -148,11 +137,59 @@ def make_scene(
         source=", ".join(map(str, files)),
         materials=materials,
         registration=matrix,
-        points_m=None if scan is None else trimesh.transform_points(_sample(scan.points_m), motion),
-        counts={} if scan is None else {"points": len(scan.points_m)},
+        points_m=None if scanned is None else trimesh.transform_points(_sample(scanned), motion),
+        counts={} if scanned is None else {"points": len(scanned)},
         replace=replace,
     )
     return read_scene_folder(out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Content of files: surfaces of a plan or mesh, with the cells of an occupancy grid, or else a scan."""
+
+    file: Path
+    parts: Sequence[Surface] = ()
+    grid: PlanGrid | None = None
+    scan: Scan | None = None
+
+    @property
+    def extent_m(self) -> FloatArray:
+        """Lowest and highest coordinates [2, 3]."""
+        return box_of(self.parts) if self.scan is None else bounds(self.scan.points_m)
+
+    def surfaces(self, up: Up | None) -> Sequence[Surface]:
+        """The surfaces, those of a scan after the search for its planes, which takes minutes for large ones."""
+        if self.scan is None:
+            return self.parts
+        surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        if up is None and not _has_floor(surfaces):
+            with suppress(InputError):
+                turned = surfaces_from_points(trimesh.transform_points(self.scan.points_m, Y_UP.T))
+                if _has_floor(turned):
+                    surfaces = turned
+            if _has_floor(surfaces):
+                raise _other_up(self.file)
+        return surfaces
+
+
+def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey: Storey) -> _Source:
+    file = files[0]
+    if len(files) > 1 and (flat := [f for f in files if is_plan(f) or has_faces(f)]):
+        raise InputError(f"{flat[0]}: several files are scans of one place, and this is none; give it alone")
+    if is_plan(file):
+        surfaces, grid = _read_plan(file, units, up, *storey)
+        return _Source(file, surfaces, grid)
+    height_m, floor_m, resolution_m, row_0 = storey
+    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
+    if has_faces(file):
+        return _Source(file, _read_faces(file, units, up))
+    scan = read_scan(files, units, up)
+    check_extent(scan.points_m, file)
+    require_fine(scan.points_m, file)
+    require_up(scan.points_m, file, up)
+    return _Source(file, scan=scan)
 
 
 def _shift(file: Path, origin_m: Sequence[float] | None) -> FloatArray:
@@ -213,27 +250,9 @@ def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
     raw = read_mesh(file, units, up)
     require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
     surfaces = planes_of_mesh(raw)
-    if up is None and file.suffix.lower() not in STATING_UP and not _has_floor(surfaces):
-        _check_turned(planes_of_mesh(moved(raw, Y_UP.T)), file)
-    return surfaces
-
-
-def _read_scan(files: Sequence[Path], units: str | None, up: Up | None) -> Scan:
-    scan = read_scan(files, units, up)
-    check_extent(scan.points_m, files[0])
-    require_fine(scan.points_m, files[0])
-    require_up(scan.points_m, files[0], up)
-    return scan
-
-
-def _scan_surfaces(scan: Scan, file: Path, up: Up | None) -> list[Surface]:
-    surfaces = surfaces_from_points(scan.points_m, scan.viewpoints_m, scan.viewpoint)
-    if up is None and not _has_floor(surfaces):
-        try:
-            turned = surfaces_from_points(trimesh.transform_points(scan.points_m, Y_UP.T))
-        except InputError:
-            return surfaces
-        _check_turned(turned, file)
+    unstated = up is None and file.suffix.lower() not in STATING_UP
+    if unstated and not _has_floor(surfaces) and _has_floor(planes_of_mesh(moved(raw, Y_UP.T))):
+        raise _other_up(file)
     return surfaces
 
 
@@ -241,11 +260,9 @@ def _has_floor(surfaces: Sequence[Surface]) -> bool:
     return any(surface.kind == "floor" for surface in surfaces)
 
 
-def _check_turned(turned: Sequence[Surface], file: Path) -> None:
-    """Refuse a file, read with z up, that has no floor unless y is up, where it has the given surfaces."""
-    if _has_floor(turned):
-        remedy = "state it by wrf-mi mesh --up y, or --up z if it is right"
-        raise InputError(f"{file}: has no floor with z up, and one with y up; {remedy}")
+def _other_up(file: Path) -> InputError:
+    remedy = "state it by wrf-mi mesh --up y, or --up z if it is right"
+    return InputError(f"{file}: has no floor with z up, and one with y up; {remedy}")
 
 
 def is_plan(path: str | Path) -> bool:

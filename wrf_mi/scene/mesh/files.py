@@ -75,22 +75,9 @@ def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | No
         elif suffix in POLYGON_READERS:
             parts = _polygon_parts(POLYGON_READERS[suffix](file))
         else:
-            _check_size(file)
-            # Without a name no other file is looked for: materials and textures are not used.
-            with file.open("rb") as stream:
-                if suffix == ".gltf":
-                    options: dict[str, Any] = {"resolver": Beside(file)}
-                    source: Any = BytesIO(bare_gltf(stream.read()))
-                else:
-                    source, options = stream, {}
-                dump: list[Any] = trimesh.load_scene(source, file_type=suffix[1:], process=False, **options).dump()
-            parts = [part for part in dump if len(getattr(part, "faces", ()))]
+            parts = _trimesh_parts(file)
         for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
-            faces, count = np.asarray(part.faces), len(part.vertices)
-            if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
-                raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
-            if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
-                raise ValueError(f"a face names a vertex that is not among its {count}")
+            _check_part(part)
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
                 raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
             part.vertices = turned(np.asarray(part.vertices, float), up or stated)
@@ -99,6 +86,25 @@ def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | No
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
         raise InputError(f"{file}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
     return parts, unit_m
+
+
+def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
+    _check_size(file)
+    options: dict[str, Any] = {"file_type": file.suffix.lower()[1:], "process": False}
+    # Without a name no other file is looked for: materials and textures are not used.
+    source: Any = BytesIO(file.read_bytes())
+    if file.suffix.lower() == ".gltf":
+        source, options["resolver"] = BytesIO(bare_gltf(source.read())), Beside(file)
+    dump: list[Any] = trimesh.load_scene(source, **options).dump()
+    return [part for part in dump if len(getattr(part, "faces", ()))]
+
+
+def _check_part(part: trimesh.Trimesh) -> None:
+    faces, count = np.asarray(part.faces), len(part.vertices)
+    if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
+        raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
+        raise ValueError(f"a face names a vertex that is not among its {count}")
 
 
 def _polygon_parts(polygons: Polygons) -> list[trimesh.Trimesh]:

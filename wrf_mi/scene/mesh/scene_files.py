@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from defusedxml.common import DefusedXmlException
@@ -69,14 +70,9 @@ def read_usd(path: Path) -> Content:
             raise InputError(f"{path}: has a layer outside its folder, {layer.realPath}; export one file")
     moves, parts = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()), []
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        shape = UsdGeom.Gprim(prim)
-        if not shape and not prim.IsA(UsdGeom.PointInstancer):
-            continue
-        if shape and (shape.ComputePurpose() == "guide" or shape.ComputeVisibility() == "invisible"):
+        if not _is_surface(prim, UsdGeom):
             continue
         if not prim.IsA(UsdGeom.Mesh):
-            if prim.IsA(UsdGeom.Curves) or prim.IsA(UsdGeom.Points):
-                continue
             raise InputError(f"{path}: {prim.GetPath()} is a {prim.GetTypeName()}; export it as a mesh")
         mesh, time = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
         attributes = (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr())
@@ -85,6 +81,15 @@ def read_usd(path: Path) -> Content:
         moved = vertices.reshape(-1, 3).astype(float) @ matrix[:3, :3] + matrix[3, :3]
         parts.append(_polygons(moved, corners, sizes, str(prim.GetPath())))
     return parts, float(UsdGeom.GetStageMetersPerUnit(stage)), _up(path, str(UsdGeom.GetStageUpAxis(stage)))
+
+
+def _is_surface(prim: Any, geometry: Any) -> bool:
+    """Whether a visible part of a USD stage has surfaces, by the package's module ``UsdGeom``."""
+    shape = geometry.Gprim(prim)
+    if not shape:
+        return bool(prim.IsA(geometry.PointInstancer))
+    drawn = shape.ComputePurpose() != "guide" and shape.ComputeVisibility() != "invisible"
+    return drawn and not prim.IsA(geometry.Curves) and not prim.IsA(geometry.Points)
 
 
 def _polygons(vertices: ArrayLike, corners: IntArray, sizes: IntArray, name: str) -> Polygons:

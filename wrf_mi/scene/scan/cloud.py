@@ -17,7 +17,7 @@ from ...core.types import IntArray
 from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
-from .planes import BAND, find_planes, fit, layers, sparse_walls, thin
+from .planes import BAND, Thinned, find_planes, fit, layers, sparse_walls, thin
 from .sight import Sight, seen, sights_of
 
 logger = logging.getLogger(__name__)
@@ -75,58 +75,68 @@ def surfaces_from_points(
     places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
     cloud = thin(points)
     planes, noise = find_planes(cloud)
-    scan = _Scan(points.astype(np.float32), noise, sights_of(points, places, numbers, -shift))
-    middle_m = float(np.median(cloud.points_m[:, 2]))
-    pieces, roles = scan.roles(scan.pieces(planes), middle_m)
-    walls = _of_kind(pieces, roles, "wall")
-    sparse = sparse_walls(cloud.all_m, [piece.plane for piece in walls], planes, noise)
-    for number in range(PASSES):
-        # Walls bound the room, and a wall that is found by few points bounds the others.
-        outside = scan.outside(walls)
-        if not (outside & scan.free).any() and not (sparse and number == 0):
-            break
-        scan.free = ~outside
-        pieces, roles = scan.roles(scan.pieces([*planes, *sparse], walls), middle_m)
-        walls = _of_kind(pieces, roles, "wall")
+    scan = _Scan(points.astype(np.float32), cloud, noise, sights_of(points, places, numbers, -shift))
+    pieces, roles = scan.room(planes)
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
-    planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
-    reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
-    areas = join(planes, areas, reach)
-    # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
-    things, near_things = scan.free.copy(), np.ones(len(cloud.points_m), bool)
-    for plane, area, kind in zip(planes, areas, roles, strict=True):
-        if kind != "other":
-            things &= ~over(plane, area, scan.points_m, BAND * noise)
-            near_things &= ~over(plane, area, cloud.points_m, BAND * noise)
-    for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
-        if kind != "other":
-            areas[i] = scan.without_shadows(piece.plane, areas[i], walls, things)
-        areas[i] = fill_shadows(piece.plane, areas[i], kind, cloud.points_m[near_things], noise)
-        if kind == "floor":
-            areas[i] = fill_blind(piece.plane, areas[i], walls, points, BAND * noise)
-        if piece.recesses:
-            areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
-    areas = [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
-    logger.info("%d planes in %d points, noise %.1f mm", len(planes), len(points), 1e3 * noise)
-    order = sorted(range(len(planes)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
+    areas = scan.closed(pieces, roles)
+    logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
+    order = sorted(range(len(pieces)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
     surfaces = []
     for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
         vertices, faces = triangulated(areas[i])
-        surfaces.append(Surface(name, roles[i], planes[i].lift(vertices) + shift, faces))
+        surfaces.append(Surface(name, roles[i], pieces[i].plane.lift(vertices) + shift, faces))
     return surfaces
 
 
-def _of_kind(pieces: Sequence[_Piece], roles: Sequence[Kind], kind: Kind) -> list[_Piece]:
-    return [piece for piece, role in zip(pieces, roles, strict=True) if role == kind]
+def _walls(pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[_Piece]:
+    return [piece for piece, role in zip(pieces, roles, strict=True) if role == "wall"]
 
 
 class _Scan:
-    """Points [n, 3] of a scan, those that may belong to surfaces [n], their noise, and the scanners."""
+    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, their noise, the scanners."""
 
-    def __init__(self, points_m: FloatArray, noise_m: float, sights: Sequence[Sight]) -> None:
-        self.points_m, self.noise_m, self.sights = points_m, noise_m, sights
+    def __init__(self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight]) -> None:
+        self.points_m, self.cloud, self.noise_m, self.sights = points_m, cloud, noise_m, sights
         self.free = np.ones(len(points_m), bool)
+
+    def room(self, planes: Sequence[Plane]) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces of planes and their roles, with walls of few points, without what lies behind walls."""
+        pieces, roles = self.roles(self.pieces(planes))
+        walls = _walls(pieces, roles)
+        sparse = sparse_walls(self.cloud.all_m, [piece.plane for piece in walls], planes, self.noise_m)
+        for number in range(PASSES):
+            # Walls bound the room, and a wall that is found by few points bounds the others.
+            outside = self.outside(walls)
+            if not (outside & self.free).any() and not (sparse and number == 0):
+                break
+            self.free = ~outside
+            pieces, roles = self.roles(self.pieces([*planes, *sparse], walls))
+            walls = _walls(pieces, roles)
+        if not self.free.all():
+            logger.info("%d points behind openings of walls make no surfaces", np.count_nonzero(~self.free))
+        return pieces, roles
+
+    def closed(self, pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[Any]:
+        """Areas of pieces with their shadows filled, joined where they meet."""
+        planes, walls = [piece.plane for piece in pieces], _walls(pieces, roles)
+        reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
+        areas, band_m = join(planes, [piece.area for piece in pieces], reach), BAND * self.noise_m
+        # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
+        things, thinned = self.free.copy(), np.ones(len(self.cloud.points_m), bool)
+        for plane, area, kind in zip(planes, areas, roles, strict=True):
+            if kind != "other":
+                things &= ~over(plane, area, self.points_m, band_m)
+                thinned &= ~over(plane, area, self.cloud.points_m, band_m)
+        for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
+            if kind != "other":
+                areas[i] = self.without_shadows(piece.plane, areas[i], walls, things)
+            areas[i] = fill_shadows(piece.plane, areas[i], kind, self.cloud.points_m[thinned], self.noise_m)
+            if kind == "floor":
+                areas[i] = fill_blind(piece.plane, areas[i], walls, self.points_m, band_m)
+            if piece.recesses:
+                areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
+        return [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
 
     def pieces(self, planes: Sequence[Plane], walls: Sequence[Face] = ()) -> list[_Piece]:
         """Planes and their parallel layers with the areas that free points cover, those of most points first."""
@@ -170,9 +180,10 @@ class _Scan:
         strip = int(np.ceil(2 * band_m / raster.cell_m)) + 1
         return raster.grown(area, ndimage.binary_opening(on, np.ones((strip, strip))))
 
-    def roles(self, pieces: Sequence[_Piece], middle_m: float) -> tuple[list[_Piece], list[Kind]]:
+    def roles(self, pieces: Sequence[_Piece]) -> tuple[list[_Piece], list[Kind]]:
         """Pieces with their roles, walls with their parts behind things; without sparse planes that are no walls."""
-        short = dict(zip(pieces, kinds(pieces, middle_m), strict=True))
+        middle_m = float(np.median(self.cloud.points_m[:, 2]))
+        short: dict[Face, Kind] = dict(zip(pieces, kinds(pieces, middle_m), strict=True))
         whole = [self._up_to_levels(piece, short) for piece in pieces]
         chosen, roles = list[_Piece](), kinds(whole, middle_m)
         for piece, longer, role in zip(pieces, whole, roles, strict=True):

@@ -139,15 +139,15 @@ def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[
 
     A wall far away, or seen through a gap, has few points, but these lie in one plane over a room's height.
     """
-    free, headings = np.ones(len(points_m), bool), list[FloatArray]()
+    free = np.ones(len(points_m), bool)
     for plane in planes:
         free &= ~near(plane, points_m, BAND * noise_m)
     # Of a scanner that is not level, walls are upright in the frame of the floor.
     up = next((plane.normal for plane in planes if abs(plane.normal[2]) > LEVEL), np.array([0.0, 0.0, 1.0]))
-    for wall in walls:
-        for normal in (wall.normal, np.cross(up, wall.normal)):
-            if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
-                headings.append(normal / np.linalg.norm(normal))
+    headings = list[FloatArray]()
+    for normal in (side for wall in walls for side in (wall.normal, np.cross(up, wall.normal))):
+        if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
+            headings.append(normal / np.linalg.norm(normal))
     points, candidates = points_m[free], list[tuple[float, Plane]]()
     for normal in headings:
         for lean in np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -96,7 +96,10 @@ def read_scan(paths: Sequence[str | Path], units: str | None = None, up: Up | No
 def _parts(file: Path) -> list[Part]:
     """The scans of a file, each with points, all of them finite."""
     try:
-        parts = [(np.asarray(points, float), viewpoint) for points, viewpoint in _read(file)]
+        parts = [
+            (np.asarray(points, float), viewpoint)
+            for points, viewpoint in READERS.get(file.suffix.lower(), _read_vertices)(file)
+        ]
     except InputError:
         raise
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
@@ -114,33 +117,26 @@ def _parts(file: Path) -> list[Part]:
     return parts
 
 
-def _read(file: Path) -> list[Part] | Iterator[Part]:
-    match file.suffix.lower():
-        case ".npz":
-            arrays = stored_arrays(file, ("xyz_m", "points"))
-            if not arrays:
-                raise InputError(f"{file}: no array points or xyz_m in it; give one [m, 3]")
-            points: Any = arrays["xyz_m" if "xyz_m" in arrays else "points"]
-        case ".las" | ".laz":
-            return _read_las(file)
-        case ".e57":
-            return _read_e57(file)
-        case ".pcd":
-            return _read_pcd(file)
-        case ".pts" | ".ptx":
-            return _read_blocks(file)
-        case ".xyz" | ".txt":
-            with file.open(encoding="utf-8-sig") as text:
-                commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
-            columns, delimiter = (0, 1, 2), "," if commas else None
-            points = np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
-        case ".ply":
-            points = read_ply(file).vertices
-        case ".obj":
-            points = read_obj(file).vertices
-        case suffix:
-            with file.open("rb") as stream:  # without a name no other file is looked for
-                points = getattr(trimesh.load(stream, file_type=suffix.removeprefix(".")), "vertices", [])
+def _read_npz(file: Path) -> list[Part]:
+    arrays = stored_arrays(file, ("xyz_m", "points"))
+    if not arrays:
+        raise InputError(f"{file}: no array points or xyz_m in it; give one [m, 3]")
+    return [(arrays["xyz_m" if "xyz_m" in arrays else "points"], None)]
+
+
+def _read_text(file: Path) -> list[Part]:
+    with file.open(encoding="utf-8-sig") as text:
+        commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
+    delimiter = "," if commas else None
+    return [(np.loadtxt(file, usecols=(0, 1, 2), delimiter=delimiter, ndmin=2, encoding="utf-8-sig"), None)]
+
+
+def _read_vertices(file: Path) -> list[Part]:
+    suffix = file.suffix.lower()
+    if suffix in (".ply", ".obj"):
+        return [((read_ply if suffix == ".ply" else read_obj)(file).vertices, None)]
+    with file.open("rb") as stream:  # without a name no other file is looked for
+        points: Any = getattr(trimesh.load(stream, file_type=suffix.removeprefix(".")), "vertices", [])
     return [(points, None)]
 
 
@@ -201,13 +197,8 @@ def _read_e57(file: Path) -> list[Part]:
 def _read_pcd(file: Path) -> list[Part]:
     """Points of a PCD file (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
     extra_package("open3d")
-    with file.open("rb") as stream:
-        head, found, _ = stream.read(PCD_HEADER).partition(b"\nDATA ")
-        stream.seek(len(head) + len(found))
-        kind = stream.readline().decode("ascii", "replace").strip()
-    header = {words[0]: words[1:] for line in head.decode("ascii", "replace").splitlines() if (words := line.split())}
-    if not found or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or "POINTS" not in header:
-        raise ValueError("no header of a PCD file with x, y, z and POINTS")
+    header, lines = _pcd_header(file)
+    kind = header["DATA"][0]
     count, fields = int(header["POINTS"][0]), header["FIELDS"]
     lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
     record = sum(int(size) * length for size, length in zip(header["SIZE"], lengths, strict=True))
@@ -216,14 +207,24 @@ def _read_pcd(file: Path) -> list[Part]:
     if kind == "ascii":  # Open3D fills what a file lacks with whatever is in memory
         columns = [sum(lengths[: fields.index(axis)]) for axis in "xyz"]
         with file.open(encoding="ascii") as text:
-            rows = islice(text, len(head.splitlines()) + 1, None)
-            points = np.loadtxt(islice(rows, count), usecols=columns, ndmin=2)
+            points = np.loadtxt(islice(text, lines, lines + count), usecols=columns, ndmin=2)
     else:
         ((points, _),) = _read_apart(file, count * max(record, 24))
     if len(points) != count:
         raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off or damaged")
     place = np.array(header.get("VIEWPOINT", ["nan"] * 3)[:3], float)
-    return [(_returns(points, ~np.isnan(points).any(axis=1), file), place if np.isfinite(place).all() else None)]
+    return [(_returns(points, ~np.isnan(points), file), place if np.isfinite(place).all() else None)]
+
+
+def _pcd_header(file: Path) -> tuple[dict[str, list[str]], int]:
+    """Words of the lines of a PCD file's header by their first, and their number."""
+    with file.open("rb") as stream:
+        head, found, rest = stream.read(PCD_HEADER).partition(b"\nDATA ")
+    lines = [*head.decode("ascii", "replace").split("\n"), "DATA " + rest.split(b"\n")[0].decode("ascii", "replace")]
+    header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    if not found or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not {"POINTS", "SIZE"} <= set(header):
+        raise ValueError("no header of a PCD file with x, y, z, SIZE and POINTS")
+    return header, len(lines)
 
 
 def _read_blocks(file: Path) -> Iterator[Part]:
@@ -238,10 +239,7 @@ def _read_blocks(file: Path) -> Iterator[Part]:
             count = int(line)
             if file.suffix.lower() == ".ptx":
                 count *= int(next(stream, ""))
-                lines = [[float(word) for word in next(stream, "").split()] for _ in range(PTX_LINES)]
-                pose = np.array(lines[-4:])
-                if pose.shape != (4, 4) or not np.isfinite(pose).all():
-                    raise ValueError("a scan without the 4 x 4 matrix of its pose")
+                pose = _ptx_pose(stream)
             if count < 0 or count * LEAST_ROW > file.stat().st_size:
                 raise ValueError(f"states {count} points, and has {file.stat().st_size} bytes")
             points = np.loadtxt(islice(stream, count), usecols=(0, 1, 2), ndmin=2) if count else np.empty((0, 3))
@@ -250,12 +248,27 @@ def _read_blocks(file: Path) -> Iterator[Part]:
             if pose is None:
                 yield points, None
             else:  # rows are multiplied from the left, and the scanner is at the origin of its scan
-                points = _returns(points, points.any(axis=1), file)
+                points = _returns(points, points != 0, file)
                 yield points @ pose[:3, :3] + pose[3, :3], pose[3, :3]
 
 
-def _returns(points: FloatArray, returned: Mask, file: Path) -> FloatArray:
-    """Points of directions with a return; those without are no points of the format."""
+def _ptx_pose(stream: Iterator[str]) -> FloatArray:
+    pose = np.array([[float(word) for word in next(stream, "").split()] for _ in range(PTX_LINES)][-4:])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError("a scan without the 4 x 4 matrix of its pose")
+    return pose
+
+
+def _returns(points: FloatArray, valid: Mask, file: Path) -> FloatArray:
+    """Points of directions with a return, which have a valid coordinate; those without are none of the format."""
+    returned = valid.any(axis=1)
     if missing := len(points) - np.count_nonzero(returned):
         logger.info("%s: %d of %d directions without a return", file, missing, len(points))
     return points[returned]
+
+
+READERS: dict[str, Callable[[Path], Iterable[Part]]] = {
+    **{".npz": _read_npz, ".las": _read_las, ".laz": _read_las, ".e57": _read_e57, ".pcd": _read_pcd},
+    **{".pts": _read_blocks, ".ptx": _read_blocks, ".xyz": _read_text, ".txt": _read_text},
+}
+"""Readers of points by the ending of a file; others are read as the vertices of a mesh."""

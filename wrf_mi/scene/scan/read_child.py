@@ -56,7 +56,7 @@ def _pcd(file: str) -> list[tuple[np.ndarray, list[float]]]:
     import open3d
 
     # Places without a return are NaN in PCD, and left out by the caller.
-    return [(np.asarray(open3d.io.read_point_cloud(file, format="pcd").points), [np.nan] * 3)]
+    return [(np.asarray(open3d.io.read_point_cloud(Path(file), format="pcd").points), [np.nan] * 3)]
 
 
 if __name__ == "__main__":
