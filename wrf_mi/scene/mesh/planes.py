@@ -72,10 +72,7 @@ class Plane:
         """The parallel plane at a distance along the normal, patches included."""
         shift = distance_m * self.normal
         return replace(
-            self,
-            offset_m=self.offset_m + distance_m,
-            patches_m=self.patches_m + shift,
-            centre_m=self.centre_m + shift,
+            self, offset_m=self.offset_m + distance_m, patches_m=self.patches_m + shift, centre_m=self.centre_m + shift
         )
 
     def rectangle(self, low_m: FloatArray, high_m: FloatArray) -> FloatArray:

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
 from numpy.typing import ArrayLike
 
 from ...core import InputError
 from ...core.files import inside
 from ...core.types import IntArray
 from ..coordinates import Up, extra_package
-from ..xml_file import parsed_xml
 from .polygon_files import Polygons
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -34,7 +34,7 @@ def read_collada(path: Path) -> Content:
     """
     collada = extra_package("collada")
     try:
-        parsed_xml(path)
+        parse(path, forbid_dtd=True)
     except DefusedXmlException:
         raise InputError(f"{path}: has a document type or entities; remove them") from None
     with path.open("rb") as stream, warnings.catch_warnings():

@@ -17,8 +17,8 @@ from ...core.types import IntArray
 from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
-from .planes import BAND, Thinned, find_planes, fit, layers, sparse_walls, thin
-from .sight import Sight, seen, sights_of
+from .planes import BAND, Thinned, find_planes, fit, layers, thin
+from .sight import Sight, seen, sights_of, sparse_walls
 
 logger = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..coordinates import extra_package
-from ..mesh.planes import LEVEL, THICKEST_M, WALL_HEIGHT_M, Mask, Plane, near, with_axes
+from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
 
 VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
 MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
@@ -52,10 +52,6 @@ LAYER_ERRORS, LEAST_STEP = 4.0, 0.6
 """Least distance of a layer from its plane, in standard errors of a cell's median and in deviations of the noise."""
 GROWN_ERRORS = 2.0  # the same of cells beside
 LAYER_M2, LAYER_CELLS = 0.3, 8  # least size of a layer
-SPARSE_M2, SPARSE_CONTRAST, SPARSE_AROUND_M = 2.0, 2.0, 0.5
-"""Least area of the cells with points of a wall of few points, also relative to that of planes within a distance."""
-MOST_LEAN, LEAN_RAD = 3, np.radians(1.0)  # steps by which walls are sought that lean, as in scans of a poor scanner
-SAME_HEADING_RAD = np.radians(3.0)  # angle up to which walls count as parallel
 FLATNESS = 2.0
 """Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
 MEDIAN_ERROR = 1.25  # standard error of a median, in that of a mean
@@ -122,67 +118,16 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
         candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
-        candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
+        candidates = [c for c in candidates if not any(repeats(c, plane, REPEAT * noise) for plane in planes)]
         if not candidates:
             break
         merged, planes = _merge(cloud, [*planes, *candidates], noise), []
         for plane in merged:
-            if not any(_repeats(plane, other, 2 * noise) for other in planes):
+            if not any(repeats(plane, other, 2 * noise) for other in planes):
                 planes.append(plane)
         for plane in planes:
             free &= ~near(plane, cloud.points_m, BAND * noise)
     return planes, noise
-
-
-def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[Plane], noise_m: float) -> list[Plane]:
-    """Planes parallel or square to walls in the points [n, 3] of no plane, too few for a flat patch.
-
-    A wall far away, or seen through a gap, has few points, but these lie in one plane over a room's height.
-    """
-    free = np.ones(len(points_m), bool)
-    for plane in planes:
-        free &= ~near(plane, points_m, BAND * noise_m)
-    # Of a scanner that is not level, walls are upright in the frame of the floor.
-    up = next((plane.normal for plane in planes if abs(plane.normal[2]) > LEVEL), np.array([0.0, 0.0, 1.0]))
-    headings = list[FloatArray]()
-    for normal in (side for wall in walls for side in (wall.normal, np.cross(up, wall.normal))):
-        if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
-            headings.append(normal / np.linalg.norm(normal))
-    points, candidates = points_m[free], list[tuple[float, Plane]]()
-    for normal in headings:
-        for lean in np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD:
-            candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
-    chosen = list[Plane]()
-    for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
-        if not any(_repeats(plane, other, AROUND * noise_m) for other in [*planes, *chosen]):
-            chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
-    return chosen
-
-
-def _parallel_planes(points: FloatArray, normal: FloatArray, noise_m: float) -> list[tuple[float, Plane]]:
-    """Planes of a direction in which points [n, 3] lie over a larger area than beside them, and these areas."""
-    if not len(points):
-        return []
-    across, side = points @ normal, CELL_RANGE_M[1]
-    low, step = across.min(), 2 * noise_m
-    along = np.floor(np.stack([points @ np.cross((0, 0, 1), normal), points[:, 2]]) / side)
-    bins = np.floor((across - low) / step)
-    cells = np.unique(np.stack([bins, *along]).astype(int), axis=1)[0]
-    covered = np.convolve(np.bincount(cells), np.ones(2)) * side**2  # a plane lies in two neighbouring bins
-    usual = ndimage.median_filter(covered, 2 * int(SPARSE_AROUND_M / step) + 1, mode="constant")
-    peaks, _ = find_peaks(np.pad(covered, 1), height=SPARSE_M2, distance=AROUND / 2)
-    planes = []
-    for peak in peaks - 1:
-        inside = np.abs(across - low - peak * step) < step
-        if covered[peak] < SPARSE_CONTRAST * usual[peak] or np.count_nonzero(inside) < FEWEST_VOXELS:
-            continue
-        chosen = points[np.abs(across - np.median(across[inside])) < BAND * noise_m]
-        centre = chosen.mean(axis=0)
-        plane = with_axes(Plane(normal, float(centre @ normal), np.empty((0, 4, 3)), centre, np.inf, sparse=True))
-        bounds = np.quantile(plane.flat(chosen), LAYER_CORE, axis=0)
-        if np.ptp(bounds, axis=0)[1] >= WALL_HEIGHT_M / 2:
-            planes.append((float(covered[peak]), replace(plane, patches_m=plane.rectangle(*bounds)[None])))
-    return planes
 
 
 def fit(
@@ -245,7 +190,7 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
     return bool(shapely.distance(flat, a.region(0)) < MERGE_GAP_M)
 
 
-def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
+def repeats(plane: Plane, other: Plane, least_m: float) -> bool:
     """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
     if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
         return False

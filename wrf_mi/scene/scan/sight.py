@@ -1,4 +1,4 @@
-"""What a scanner saw of a plane: the plane itself, a thing before it, a place beyond it, or nothing.
+"""What a scanner saw of a plane (the plane, a thing before it, a place beyond it, nothing), and walls of few points.
 
 A scan from a known place says more than its points: each beam was free up to its return. The returns far from the
 scanner, and those at a grazing angle, are too sparse to show by their density where a plane ends, but the picture of
@@ -8,17 +8,20 @@ all directions has no gaps. The places where scanners stood come from the files,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.planes import LEVEL, Face, Mask, Plane
+from ..mesh.planes import LEVEL, WALL_HEIGHT_M, Face, Mask, Plane, near, with_axes
+from .planes import AROUND, BAND, CELL_RANGE_M, FEWEST_VOXELS, LAYER_CORE, fit, repeats
 
 MOST_BEAMS = 400_000  # beams of a scanner that are used: 0.3 degrees apart over the sphere
 DIRECTIONS = 4000  # directions by which a scan is judged
@@ -26,6 +29,10 @@ NEAREST = 1.5  # a direction farther from every beam than this many spacings of 
 STEP_M, STEP_SHARE = 0.3, 0.1  # least difference of neighbouring ranges that is an edge, metres and share of the range
 MOST_EDGES = 0.05  # neighbours with an edge between them: 3 % in a furnished room, many more seen from elsewhere
 LEAST_SEEN = 0.6  # least share of the sphere that a scanner saw whose place no file states: a corner sees an eighth
+SPARSE_M2, SPARSE_CONTRAST, SPARSE_AROUND_M = 2.0, 2.0, 0.5
+"""Least area of the cells with points of a wall of few points, also relative to that of planes within a distance."""
+MOST_LEAN, LEAN_RAD = 3, np.radians(1.0)  # steps by which walls are sought that lean, as in scans of a poor scanner
+SAME_HEADING_RAD = np.radians(3.0)  # angle up to which walls count as parallel
 UNSEEN, ON, BEFORE, BEYOND = range(4)
 """What the beam nearest to a point of a plane met: nothing near, the plane, a place before it, or one beyond it."""
 
@@ -142,3 +149,54 @@ def seen(
         open_ |= (state == BEYOND) & inside
         hidden |= inside & (((state == BEFORE) & before[row]) | (is_floor & (state == UNSEEN)))
     return on, hidden & (on < 0) & ~open_
+
+
+def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+    """Planes parallel or square to walls in the points [n, 3] of no plane, too few for a flat patch.
+
+    A wall far away, or seen through a gap, has few points, but these lie in one plane over a room's height.
+    """
+    free = np.ones(len(points_m), bool)
+    for plane in planes:
+        free &= ~near(plane, points_m, BAND * noise_m)
+    # Of a scanner that is not level, walls are upright in the frame of the floor.
+    up = next((plane.normal for plane in planes if abs(plane.normal[2]) > LEVEL), np.array([0.0, 0.0, 1.0]))
+    headings = list[FloatArray]()
+    for normal in (side for wall in walls for side in (wall.normal, np.cross(up, wall.normal))):
+        if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
+            headings.append(normal / np.linalg.norm(normal))
+    points, candidates = points_m[free], list[tuple[float, Plane]]()
+    for normal in headings:
+        for lean in np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD:
+            candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
+    chosen = list[Plane]()
+    for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
+        if not any(repeats(plane, other, AROUND * noise_m) for other in [*planes, *chosen]):
+            chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
+    return chosen
+
+
+def _parallel_planes(points: FloatArray, normal: FloatArray, noise_m: float) -> list[tuple[float, Plane]]:
+    """Planes of a direction in which points [n, 3] lie over a larger area than beside them, and these areas."""
+    if not len(points):
+        return []
+    across, side = points @ normal, CELL_RANGE_M[1]
+    low, step = across.min(), 2 * noise_m
+    along = np.floor(np.stack([points @ np.cross((0, 0, 1), normal), points[:, 2]]) / side)
+    bins = np.floor((across - low) / step)
+    cells = np.unique(np.stack([bins, *along]).astype(int), axis=1)[0]
+    covered = np.convolve(np.bincount(cells), np.ones(2)) * side**2  # a plane lies in two neighbouring bins
+    usual = ndimage.median_filter(covered, 2 * int(SPARSE_AROUND_M / step) + 1, mode="constant")
+    peaks, _ = find_peaks(np.pad(covered, 1), height=SPARSE_M2, distance=AROUND / 2)
+    planes = []
+    for peak in peaks - 1:
+        inside = np.abs(across - low - peak * step) < step
+        if covered[peak] < SPARSE_CONTRAST * usual[peak] or np.count_nonzero(inside) < FEWEST_VOXELS:
+            continue
+        chosen = points[np.abs(across - np.median(across[inside])) < BAND * noise_m]
+        centre = chosen.mean(axis=0)
+        plane = with_axes(Plane(normal, float(centre @ normal), np.empty((0, 4, 3)), centre, np.inf, sparse=True))
+        bounds = np.quantile(plane.flat(chosen), LAYER_CORE, axis=0)
+        if np.ptp(bounds, axis=0)[1] >= WALL_HEIGHT_M / 2:
+            planes.append((float(covered[peak]), replace(plane, patches_m=plane.rectangle(*bounds)[None])))
+    return planes
