@@ -69,6 +69,18 @@ cloud.header.scales = np.full(3, 1e-3)
 cloud.x, cloud.y, cloud.z = points.T
 cloud.write("scan.laz")
 """
+ROOM = """
+from pathlib import Path
+
+import trimesh
+
+room = trimesh.creation.box((5, 4, 2.7))
+points = ", ".join(str(tuple(vertex)) for vertex in room.vertices.tolist())
+corners = room.faces.ravel().tolist()
+mesh = f"point3f[] points = [{points}]\\nint[] faceVertexIndices = {corners}\\nint[] faceVertexCounts = {[3] * 12}"
+stated = '(\\n    metersPerUnit = 1\\n    upAxis = "Z"\\n)'
+Path("room.usda").write_text(f'#usda 1.0\\n{stated}\\ndef Mesh "Room"\\n{{\\n{mesh}\\n}}\\n')
+"""
 CAPTURE = """
 import h5py
 import numpy as np
@@ -118,6 +130,7 @@ EXTRAS = (
     Extra("cluster", ("predict field --tx positions.csv --out spread.csv --scheduler local:1",)),
     Extra("argos", ("data info capture.hdf5",), CAPTURE),
     Extra("lidar", tuple(f"mesh scan.{suffix} --out {suffix} --replace" for suffix in ("xyz", "laz")), SCAN),
+    Extra("meshes", ("mesh room.usda --out usda --replace",), ROOM),
     Extra("deepmimo", script=SCENARIO),
     Extra("docs", programs=(f"sphinx -q -b html -D execute_notebooks=0 {CHECKOUT / 'docs'} site",)),
     Extra("tests", programs=(f"pytest -q -p no:cacheprovider {CHECKOUT / 'tests' / 'core' / 'test_antenna.py'}",)),

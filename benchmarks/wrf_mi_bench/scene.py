@@ -20,13 +20,13 @@ from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.memory import peak_memory_mb
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
+from wrf_mi.scene.coordinates import extra_package
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.plan.alignment import grid_from_scans
 from wrf_mi.scene.plan.sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
 from wrf_mi.scene.plan.storey import layout_walls
 from wrf_mi.scene.plan.walls import find_walls
 from wrf_mi.scene.register import best_scale, register_walls, sample_walls
-from wrf_mi.scene.scan.points import lidar_package
 from wrf_mi.scene.scan.simulated import OUTLIERS, RANGE_NOISE_M, RAYS_PER_POSE, simulate_scan
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.surfaces import scene_surfaces
@@ -147,8 +147,8 @@ def _power_share(paths: Paths, which: IntArray, among: Any = None) -> float:
 
 def _clearance(triangles: FloatArray) -> Any:
     """A function from points [n, 3] to their distances [n] from triangles [f, 3, 3]."""
-    core = lidar_package("open3d").core
-    scene = lidar_package("open3d").t.geometry.RaycastingScene()
+    core = extra_package("open3d").core
+    scene = extra_package("open3d").t.geometry.RaycastingScene()
     scene.add_triangles(
         core.Tensor(triangles.reshape(-1, 3).astype(np.float32)),
         core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)),

@@ -97,20 +97,36 @@ def test_scans_with_y_up_are_turned_or_warned_of(tmp_path: Path, caplog: pytest.
     assert not looks_y_up(points)
 
 
-def test_a_mesh_that_looks_y_up_is_warned_of(
+def test_files_that_look_y_up_make_no_scene_until_it_is_stated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Their floors would become walls; a bare mesh that is only opened is warned of."""
     y_up(box()).export(tmp_path / "room.obj")
-    status, _, _ = call(["mesh", tmp_path / "room.obj", "--out", tmp_path / "a"], capsys)
-    (record,) = caplog.records
-    assert status == 0
+    np.savez(tmp_path / "scan.npz", points=sampled(closed_box(), 20_000) @ Y_UP[:3, :3].T)
     text = "looks as if y were up (2.5 m along y, 5 m along z of the file), and is read with z up"
-    assert record.getMessage().endswith(f"room.obj: {text}; state it by wrf-mi mesh --up y, or --up z")
-    caplog.clear()
-    call(["mesh", tmp_path / "room.obj", "--up", "z", "--out", tmp_path / "b"], capsys)
+    remedy = "state it by wrf-mi mesh --up y, or --up z"
+    for name in ("room.obj", "scan.npz"):
+        status, out, err = call(["mesh", tmp_path / name, "--out", tmp_path / "a"], capsys)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert err.endswith(f"and is read with z up; {remedy} if it is right\n")
+        assert not (tmp_path / "a").exists()
+    status, _, _ = call(["mesh", tmp_path / "room.obj", "--up", "z", "--out", tmp_path / "b"], capsys)
+    assert status == 0
     assert not caplog.records
     open_scene(tmp_path / "room.obj", 2.4e9, material="concrete")
-    assert "looks as if y were up" in caplog.text
+    (record,) = caplog.records
+    assert record.getMessage().endswith(f"room.obj: {text}; {remedy}")
+
+
+def test_a_room_whose_floor_would_be_missing_is_refused(tmp_path: Path) -> None:
+    """Two upright sides and nothing across them, until y is up: its size tells nothing."""
+    room = box((6.0, 4.0, 5.0), (1.0, 1.0, 0.5))
+    open_side = room.submesh([np.abs(room.face_normals[:, 1]) < 0.5], append=True)
+    y_up(open_side).export(tmp_path / "room.ply")
+    with pytest.raises(InputError, match=r"has no floor with z up, and one with y up; .*--up y, or --up z"):
+        make_scene(tmp_path / "room.ply", tmp_path / "scene")
+    made = make_scene(tmp_path / "room.ply", tmp_path / "scene", up="y")
+    assert sorted(made.materials.surfaces.values()) == ["ceiling", "floor", "wall", "wall"]
 
 
 HALL = (30.0, 20.0, 16.42)
@@ -153,45 +169,43 @@ def test_options_are_checked(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_national_grid_is_refused_everywhere_and_an_origin_keeps_millimetres(
+def test_a_national_grid_gets_an_origin_that_keeps_millimetres(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Stored and printed by the command; whatever else opens the file refuses it."""
     file = write_obj(tmp_path / "utm.obj", box(ROOM, GRID))
-    status, out, err = call(["mesh", file, "--out", tmp_path / "scene"], capsys)
-    assert (status, out) == (2, "")
-    assert err.count("\n") == 1
-    assert "utm.obj: coordinates up to 4485519 m" in err
-    assert "are 0.5 m apart" in err
-    assert "(wrf-mi mesh --origin 701300,4485500,1600), and from the positions of the measurements, too" in err
-    assert not (tmp_path / "scene").exists()
+    origin, low = ",".join(f"{value:.0f}" for value in LOCAL), GRID - LOCAL
+    for name, options in (("scene", []), ("stated", ["--origin", origin])):
+        status, out, err = call(["mesh", file, "--out", tmp_path / name, *options], capsys)
+        assert (status, err) == (0, "")
+        assert "origin: 701300, 4485500, 1600; subtract it from the positions of the measurements, too" in out
+        np.testing.assert_allclose(extent(tmp_path / name), [low, low + ROOM], atol=ROUNDING_M)
+        facts = yaml.safe_load((tmp_path / name / "scene.yml").read_text())
+        assert facts["origin_m"] == list(LOCAL)
+        assert facts["frame"].endswith("less the origin 701300, 4485500, 1600")
     for entry in (
         lambda: open_scene(file, 2.4e9, material="concrete"),
         lambda: read_scene(file),
         lambda: surface_of(file),
     ):
-        with pytest.raises(InputError, match="--origin 701300,4485500,1600"):
+        with pytest.raises(
+            InputError, match=r"coordinates up to 448551[89] m.* are 0.5 m apart.*--origin 701300,4485500"
+        ):
             entry()
-    origin = ",".join(f"{value:g}" if value < 1e6 else f"{value:.0f}" for value in LOCAL)
-    status, out, err = call(["mesh", file, "--out", tmp_path / "scene", "--origin", origin], capsys)
-    assert (status, err) == (0, "")
-    assert "origin: 701300, 4485500, 1600; subtract it from the positions of the measurements, too" in out
-    low = GRID - LOCAL
-    np.testing.assert_allclose(extent(tmp_path / "scene"), [low, low + ROOM], atol=ROUNDING_M)
-    facts = yaml.safe_load((tmp_path / "scene" / "scene.yml").read_text())
-    assert facts["origin_m"] == list(LOCAL)
-    assert facts["frame"].endswith("less the origin 701300, 4485500, 1600")
 
 
 def test_a_scan_in_a_national_grid_keeps_its_walls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = sampled(closed_box(), 20_000) + GRID
     file = write_las(tmp_path / "scan.las", points, 0.001)
-    made = make_scene(file, tmp_path / "scene", origin_m=LOCAL)
+    made = make_scene(file, tmp_path / "scene")
     low = GRID - LOCAL
+    assert made.origin_m == LOCAL
     np.testing.assert_allclose(extent(made.folder), [low, low + np.array([5.0, 4.0, 2.8])], atol=WALLS_M)
-    # Without a search for planes, which takes minutes for large scans.
+    # Positions are in the scene's frame, which they do not tell; without a search for planes, which takes minutes.
     monkeypatch.delattr("wrf_mi.scene.scan.cloud.find_planes")
+    (tmp_path / "positions.csv").write_text("x,y\n1,1\n2,1\n")
     with pytest.raises(InputError, match=r"scan.las: coordinates up to 4485518 m.*--origin 701300,4485500,1600"):
-        make_scene(file, tmp_path / "refused")
+        make_scene(file, tmp_path / "refused", positions=tmp_path / "positions.csv")
 
 
 def test_a_scene_folder_far_away_is_refused(tmp_path: Path) -> None:
@@ -210,8 +224,7 @@ def test_a_plan_in_a_national_grid_is_moved_with_its_positions(tmp_path: Path) -
     """Positions are in the scene's frame, and a plan that fits them better when mirrored is refused as ever."""
     outline = np.array([(0, 0), (6, 0), (6, 4), (2, 4), (2, 3), (0, 3), (0, 0)]) + GRID[:2]
     (tmp_path / "layout.csv").write_text("x,y\n" + "\n".join(f"{x:.2f},{y:.2f}" for x, y in outline) + "\n")
-    with pytest.raises(InputError, match=r"layout.csv: coordinates up to 4485518 m.*--origin 701300,4485500,0"):
-        make_scene(tmp_path / "layout.csv", tmp_path / "scene", height_m=2.5)
+    assert make_scene(tmp_path / "layout.csv", tmp_path / "far", height_m=2.5).origin_m == (701_300, 4_485_500, 0)
     places = np.array([(0.5, y) for y in np.arange(0.5, 3, 0.5)] + [(x, 3.8) for x in np.arange(2.5, 6, 0.5)])
     places += GRID[:2] - LOCAL[:2]
     for name, xy in (("right.csv", places), ("mirrored.csv", places * (1, -1) + (0, 2 * 15.72))):

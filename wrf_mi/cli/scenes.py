@@ -26,10 +26,13 @@ def _add_mesh(commands: Any) -> None:
     text = "make a scene for both tracers from a LiDAR scan, a plan or a mesh"
     parser = add_command(commands, "mesh", mesh_command, text)
     add = parser.add_argument
-    add("points", metavar="POINTS", help="scan (PLY, LAS, LAZ, XYZ, NPZ), plan (NPZ, PNG, ROS map YAML, CSV) or mesh")
+    text = "scans of one place (E57, PCD, PTS, PTX, PLY, LAS, LAZ, XYZ, NPZ), a plan (NPZ, PNG, ROS map YAML, CSV) or "
+    text += "a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
+    add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
-    add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
-    add("--up", choices=("y", "z"), help="axis that is up in a scan or mesh (default: y in GLB, else z)")
+    add("--units", help="unit of the coordinates: m, cm, mm or ft (default: that of COLLADA and USD, else m)")
+    text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
+    add("--up", choices=("y", "z"), help=text)
     text = "point of the source, metres, z up, that becomes the origin, such as 701300,4485500,0"
     add("--origin", type=_point, metavar="X,Y,Z", help=text)
     add("--height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
@@ -59,11 +62,11 @@ def mesh_command(a: Arguments) -> int:
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
     lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
-    if a.origin is not None:
-        point = ", ".join(f"{value:.12g}" for value in a.origin)
+    if scene.origin_m is not None:
+        point = ", ".join(f"{value:.12g}" for value in scene.origin_m)
         lines.append(f"origin: {point}; subtract it from the positions of the measurements, too")
     lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
-    return show(a.json, {**facts, "origin_m": a.origin}, "\n".join(lines))
+    return show(a.json, {**facts, "origin_m": scene.origin_m}, "\n".join(lines))
 
 
 def _point(text: str) -> tuple[float, ...]:

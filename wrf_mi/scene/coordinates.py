@@ -1,26 +1,35 @@
-"""Coordinates of meshes and scans: units, the axis that is up, distance from the origin, how finely they are stored."""
+"""Coordinates of meshes and scans: units, the axis that is up, distance from the origin, how finely they are stored.
+
+The packages that read some of their formats are imported here, too.
+"""
 
 from __future__ import annotations
 
 import logging
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import one_line
 
 logger = logging.getLogger(__name__)
 
 Up = Literal["y", "z"]
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit that a scan or mesh may be in
-FORMATS = ".ply, .las, .laz, .xyz, .txt, or .npz with points"  # files that points are read from
+FORMATS = ".e57, .pcd, .pts, .ptx, .ply, .las, .laz, .xyz, .txt, or .npz with points"  # files with points
+EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "collada": "meshes", "pxr": "meshes"}
+"""Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
+SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
 Y_UP_SUFFIXES = (".glb", ".gltf")  # files whose specification has y up (glTF 2.0, section 3.4)
+STATING_UP = (*Y_UP_SUFFIXES, ".dae", ".usd", ".usda", ".usdc", ".usdz")  # files that state the axis that is up
 FARTHEST_M = 2.0**14
 """Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
 LOST_M = 0.005  # steps of single precision in a file from which it is refused: nothing brings back what it has rounded
@@ -81,13 +90,29 @@ def looks_y_up(points_m: FloatArray) -> bool:
 
 
 def warn_of_up(points_m: FloatArray, name: str | Path, stated: Up | None = None) -> None:
-    """Log that points [n, 3], z up, of a file that states no axis look as if another than that of `up_of` were up."""
+    """Log that points [n, 3], z up, of a file for which no axis was stated look as if another than `up_of` were up."""
     if stated is None and looks_y_up(points_m):
-        up = up_of(name, None)
-        _, along_y, along_z = np.ptp(extent(points_m), axis=0)
-        other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
-        text = f"{name}: looks as if {other} were up ({sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file)"
-        logger.warning("%s, and is read with %s up; state it by wrf-mi mesh --up %s, or --up %s", text, up, other, up)
+        logger.warning("%s, or --up %s", _up_text(points_m, name), up_of(name, None))
+
+
+def require_up(points_m: FloatArray, name: str | Path, stated: Up | None) -> None:
+    """Refuse points [n, 3], z up, that look as if y were up in a file that states no axis; warn where it states one.
+
+    The floor of such a file would become a wall.
+    """
+    if Path(name).suffix.lower() in STATING_UP:
+        warn_of_up(points_m, name, stated)
+    elif stated is None and looks_y_up(points_m):
+        raise InputError(f"{_up_text(points_m, name)}, or --up {up_of(name, None)} if it is right")
+
+
+def _up_text(points_m: FloatArray, name: str | Path) -> str:
+    up = up_of(name, None)
+    _, along_y, along_z = np.ptp(extent(points_m), axis=0)
+    other, sides = ("y", (along_y, along_z)) if up == "z" else ("z", (along_z, along_y))
+    size = f"{sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file"
+    text = f"{name}: looks as if {other} were up ({size}), and is read with {up} up"
+    return f"{text}; state it by wrf-mi mesh --up {other}"
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:
@@ -102,13 +127,22 @@ def check_extent(points_m: FloatArray, name: str | Path) -> None:
         raise InputError(f"{text} is too small for a room; give its --units ({', '.join(UNITS_M)})")
 
 
+def local_origin(points_m: FloatArray) -> tuple[float, float, float] | None:
+    """Point of hundreds of metres near the lowest coordinates of points [n, 3]; None for points near the origin.
+
+    Farther away than `FARTHEST_M` single precision, in which scenes are traced, would move them by a millimetre.
+    """
+    if not len(points_m) or np.abs(points_m).max() < FARTHEST_M:
+        return None
+    x, y, z = (0.0 if abs(low) < 1000 else float(np.floor(low / 100) * 100) for low in points_m.min(axis=0))
+    return x, y, z
+
+
 def require_near(points_m: FloatArray, name: str | Path) -> None:
-    """Refuse (`InputError`) points [n, 3] so far away that single precision would move them by a millimetre."""
-    if not len(points_m) or (far := float(np.abs(points_m).max())) < FARTHEST_M:
+    """Refuse (`InputError`) points [n, 3] for which `local_origin` has an origin."""
+    if (origin := local_origin(points_m)) is None:
         return
-    low = points_m.min(axis=0)
-    origin = np.where(np.abs(low) < 1000, 0, np.floor(low / 100) * 100)
-    text = ",".join(f"{value:.0f}" for value in origin)
+    far, text = float(np.abs(points_m).max()), ",".join(f"{value:.0f}" for value in origin)
     apart = f"where numbers of single precision, which scenes have, are {np.spacing(np.float32(far)):.2g} m apart"
     remedy = f"subtract {text} (wrf-mi mesh --origin {text}), and from the positions of the measurements, too"
     raise InputError(f"{name}: coordinates up to {far:.0f} m, {apart}; {remedy}")
@@ -156,9 +190,20 @@ def _step(values: FloatArray) -> float:
     return float(gaps.min()) if np.abs(ratio - np.round(ratio)).max() < STEP_TOLERANCE else 0.0
 
 
-def source_file(path: str | Path, units: str, wanted: str) -> Path:
+def extra_package(name: str) -> Any:
+    """A package of `EXTRAS`; an `InputError` if it or a system library that it needs is not installed."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        raise InputError(f"scenes from such files need {name}: pip install 'wrf-mi[{EXTRAS[name]}]'") from None
+    except ImportError as error:
+        text = one_line(error)
+        raise InputError(f"{name} cannot be loaded ({text}); install that library, on Debian: {SYSTEM}") from None
+
+
+def source_file(path: str | Path, units: str | None, wanted: str) -> Path:
     """The path of a file; an `InputError` for unknown units or a missing file, whose message ends with ``wanted``."""
-    if units not in UNITS_M:
+    if units is not None and units not in UNITS_M:
         raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file; give {wanted}")

@@ -39,12 +39,21 @@ PREVIEW_FILE = "preview.png"
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Content of a scene folder: scene file for Mitsuba and Sionna RT, complete materials, and counts of its parts."""
+    """Content of a scene folder.
+
+    Attributes:
+        folder: path of the folder.
+        xml: scene file for Mitsuba and Sionna RT.
+        materials: complete materials.
+        counts: numbers of its parts.
+        origin_m: point [3] of its source, metres, that became the origin, or None.
+    """
 
     folder: Path
     xml: Path
     materials: Materials
     counts: Mapping[str, int]
+    origin_m: tuple[float, ...] | None = None
 
 
 def write_scene(
@@ -156,7 +165,8 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
     counts = facts.get("counts")
-    return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {})
+    origin_m = tuple(map(float, facts["origin_m"])) if facts.get("origin_m") else None
+    return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {}, origin_m)
 
 
 def scene_file(folder: Path, facts: Mapping[Any, Any]) -> Path:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -14,30 +16,32 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import Up, check_extent, require_fine, require_near, warn_of_up
+from .coordinates import STATING_UP, Y_UP, Up, check_extent, local_origin, require_fine, require_near, require_up
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
-from .mesh.surfaces import Surface, moved, sampled
+from .mesh.surfaces import Surface, bounds, box_of, moved, sampled
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
-from .scan.points import read_points
+from .scan.points import Scan, read_scan
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
+Storey = tuple[float | None, float, float | None, Row0 | None]
+"""Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
 def make_scene(
-    points_file: str | Path,
+    points_file: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
-    units: str = "m",
+    units: str | None = None,
     up: Up | None = None,
     origin_m: Sequence[float] | None = None,
     materials: str | Path | Materials | None = None,
@@ -53,15 +57,17 @@ def make_scene(
     r"""Make a scene folder that Mitsuba and Sionna RT both open.
 
     Args:
-        points_file: a 3D scan (`wrf_mi.scene.scan.points.read_points`); a plan in two dimensions
+        points_file: a 3D scan, or several in one frame (`wrf_mi.scene.scan.points.read_scan`); a plan in two dimensions
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft.
-        up: axis of a scan or mesh that is up, y or z; None: y in GLB, as glTF specifies, else z, with a warning if the
-            coordinates look otherwise.
+        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m.
+        up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
+            coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
             as in a national grid, single precision would move walls. Positions of measurements have to be less by it.
+            None: the file's origin, or where that is too far away, and neither a registration nor positions say where
+            the scene lies, a point of hundreds of metres near it, which is stored and logged.
         materials: rules and exceptions, or a ``materials.yml`` (or scene folder) to read them from.
         height_m: height from floor to ceiling, required for a plan and refused otherwise.
         floor_m: z of a plan's floor.
@@ -95,7 +101,8 @@ def make_scene(
     'open'
     >>> shutil.rmtree(folder)
     """
-    file, out = Path(points_file), Path(out)
+    files = [Path(f) for f in ([points_file] if isinstance(points_file, str | Path) else points_file)]
+    file, out = files[0], Path(out)
     if out.exists() and not replace:
         raise InputError(f"{out}: exists; remove it or choose another folder")
     if registration is not None and register_walls_of is not None:
@@ -107,36 +114,82 @@ def make_scene(
     measured = None if positions is None else read_positions(positions)
     known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
     shift = _shift(file, origin_m)
-    points = grid = None
-    if is_plan(file):
-        surfaces, grid = _read_plan(file, units, up, height_m, floor_m, resolution_m, row_0)
-    elif height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
-        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
-    elif has_faces(file):
-        surfaces = _read_faces(file, units, up)
-    else:
-        points = _read_scan(file, units, up, None if matrix is not None or known_walls is not None else shift)
-        surfaces = surfaces_from_points(points)
+    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0))
+    if origin_m is None and matrix is known_walls is measured is None:
+        origin_m = local_origin(source.extent_m)
+        shift = _shift(file, origin_m)
+    if source.scan is not None and matrix is known_walls is None:  # before minutes are spent on its planes
+        require_near(trimesh.transform_points(source.extent_m, shift), file)
+    surfaces = source.surfaces(up)
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
     placed = moved(surfaces, motion)
     if measured is not None:
-        mirrored = reflections(surfaces, file, grid, motion, known_walls)
+        mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
+    scanned = None if source.scan is None else source.scan.points_m
     write_scene(
         out,
         placed,
         frame=_frame(file, origin_m, matrix),
         origin_m=origin_m,
-        source=str(file),
+        source=", ".join(map(str, files)),
         materials=materials,
         registration=matrix,
-        points_m=None if points is None else trimesh.transform_points(_sample(points), motion),
-        counts={} if points is None else {"points": len(points)},
+        points_m=None if scanned is None else trimesh.transform_points(_sample(scanned), motion),
+        counts={} if scanned is None else {"points": len(scanned)},
         replace=replace,
     )
     return read_scene_folder(out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Content of files: surfaces of a plan or mesh, with the cells of an occupancy grid, or else a scan."""
+
+    file: Path
+    parts: Sequence[Surface] = ()
+    grid: PlanGrid | None = None
+    scan: Scan | None = None
+
+    @property
+    def extent_m(self) -> FloatArray:
+        """Lowest and highest coordinates [2, 3]."""
+        return box_of(self.parts) if self.scan is None else bounds(self.scan.points_m)
+
+    def surfaces(self, up: Up | None) -> Sequence[Surface]:
+        """The surfaces, those of a scan after the search for its planes, which takes minutes for large ones."""
+        if self.scan is None:
+            return self.parts
+        surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        if up is None and not _has_floor(surfaces):
+            with suppress(InputError):
+                turned = surfaces_from_points(trimesh.transform_points(self.scan.points_m, Y_UP.T))
+                if _has_floor(turned):
+                    surfaces = turned
+            if _has_floor(surfaces):
+                raise _other_up(self.file)
+        return surfaces
+
+
+def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey: Storey) -> _Source:
+    file = files[0]
+    if len(files) > 1 and (flat := [f for f in files if is_plan(f) or has_faces(f)]):
+        raise InputError(f"{flat[0]}: several files are scans of one place, and this is none; give it alone")
+    if is_plan(file):
+        surfaces, grid = _read_plan(file, units, up, *storey)
+        return _Source(file, surfaces, grid)
+    height_m, floor_m, resolution_m, row_0 = storey
+    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
+    if has_faces(file):
+        return _Source(file, _read_faces(file, units, up))
+    scan = read_scan(files, units, up)
+    check_extent(scan.points_m, file)
+    require_fine(scan.points_m, file)
+    require_up(scan.points_m, file, up)
+    return _Source(file, scan=scan)
 
 
 def _shift(file: Path, origin_m: Sequence[float] | None) -> FloatArray:
@@ -171,7 +224,7 @@ def _rigid(registration: ArrayLike) -> FloatArray:
 
 def _read_plan(
     file: Path,
-    units: str,
+    units: str | None,
     up: Up | None,
     height_m: float | None,
     floor_m: float,
@@ -184,7 +237,7 @@ def _read_plan(
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
     if height_m is None:
         raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
-    if units != "m":
+    if units not in (None, "m"):
         raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
@@ -193,21 +246,23 @@ def _read_plan(
     return walls, plan if isinstance(plan, PlanGrid) else None
 
 
-def _read_faces(file: Path, units: str, up: Up | None) -> list[Surface]:
-    surfaces = read_mesh(file, units, up)
-    warn_of_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])), file, up)
-    return planes_of_mesh(surfaces)
+def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
+    raw = read_mesh(file, units, up)
+    require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
+    surfaces = planes_of_mesh(raw)
+    unstated = up is None and file.suffix.lower() not in STATING_UP
+    if unstated and not _has_floor(surfaces) and _has_floor(planes_of_mesh(moved(raw, Y_UP.T))):
+        raise _other_up(file)
+    return surfaces
 
 
-def _read_scan(file: Path, units: str, up: Up | None, motion: FloatArray | None) -> FloatArray:
-    """Points [n, 3] of a scan, refused where the motion [4, 4] to the scene, if it is known, leaves them far away."""
-    points = read_points(file, units, up)
-    check_extent(points, file)
-    require_fine(points, file)
-    warn_of_up(points, file, up)
-    if motion is not None:
-        require_near(trimesh.transform_points(points, motion), file)  # before minutes are spent on its planes
-    return points
+def _has_floor(surfaces: Sequence[Surface]) -> bool:
+    return any(surface.kind == "floor" for surface in surfaces)
+
+
+def _other_up(file: Path) -> InputError:
+    remedy = "state it by wrf-mi mesh --up y, or --up z if it is right"
+    return InputError(f"{file}: has no floor with z up, and one with y up; {remedy}")
 
 
 def is_plan(path: str | Path) -> bool:

@@ -85,10 +85,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
 
 
 def check_positions(
-    positions_m: FloatArray,
-    surfaces: Sequence[Surface],
-    mirrored: Sequence[tuple[str, Sequence[Surface]]],
-    name: str,
+    positions_m: FloatArray, surfaces: Sequence[Surface], mirrored: Sequence[tuple[str, Sequence[Surface]]], name: str
 ) -> None:
     """Refuse a scene that measured positions [n, 3] do not fit, above all a mirrored scene.
 
@@ -114,11 +111,7 @@ def check_positions(
 
 
 def reflections(
-    surfaces: Sequence[Surface],
-    file: Path,
-    grid: PlanGrid | None,
-    motion: FloatArray,
-    known_walls_m: FloatArray | None,
+    surfaces: Sequence[Surface], file: Path, grid: PlanGrid | None, motion: FloatArray, known_walls_m: FloatArray | None
 ) -> list[tuple[str, list[Surface]]]:
     """Remedies and surfaces of the scenes of a source with its y or its x reversed.
 

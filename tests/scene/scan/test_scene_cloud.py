@@ -13,8 +13,8 @@ from made_rooms import attic, by_kind, closed_box, l_shape, sampled, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet
 
 from wrf_mi.core import InputError
+from wrf_mi.scene import coordinates
 from wrf_mi.scene.mesh.surfaces import Surface
-from wrf_mi.scene.scan import points
 from wrf_mi.scene.scan.cloud import surfaces_from_points
 
 PLANE_M = 0.003
@@ -146,7 +146,7 @@ def test_missing_open3d_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    assert points.import_module is importlib.import_module
-    monkeypatch.setattr(points, "import_module", missing)
+    assert coordinates.import_module is importlib.import_module
+    monkeypatch.setattr(coordinates, "import_module", missing)
     with pytest.raises(InputError, match=r"need open3d: pip install 'wrf-mi\[lidar\]'"):
         surfaces_from_points(np.zeros((100, 3)))

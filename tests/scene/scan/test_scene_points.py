@@ -12,11 +12,11 @@ import trimesh
 from made_rooms import closed_box, sampled
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.coordinates import check_extent
+from wrf_mi.scene import coordinates
+from wrf_mi.scene.coordinates import check_extent, extra_package
 from wrf_mi.scene.make import is_plan, make_scene
 from wrf_mi.scene.mesh.files import read_mesh
-from wrf_mi.scene.scan import points
-from wrf_mi.scene.scan.points import lidar_package, read_points
+from wrf_mi.scene.scan.points import read_points
 
 POINTS = np.array([[0.5, 1.25, -2.0], [3.0, 4.5, 5.0], [6.0, -7.75, 8.0]])
 GRID = np.array([500_000.0, 5_400_000.0, 120.0])
@@ -159,13 +159,18 @@ def test_unusable_meshes_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_package_and_missing_library_have_their_own_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"need no_such_package: pip install 'wrf-mi\[lidar\]'"):
-        lidar_package("no_such_package")
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    monkeypatch.setattr(coordinates, "import_module", missing)
+    for name, extra in coordinates.EXTRAS.items():
+        with pytest.raises(InputError, match=rf"need {name}: pip install 'wrf-mi\[{extra}\]'"):
+            extra_package(name)
 
     def unlinked(name: str) -> None:
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")
 
-    monkeypatch.setattr(points, "import_module", unlinked)
+    monkeypatch.setattr(coordinates, "import_module", unlinked)
     with pytest.raises(InputError, match=r"open3d cannot be loaded \(libusb.*apt-get install libusb-1.0-0") as caught:
-        lidar_package("open3d")
+        extra_package("open3d")
     assert "\n" not in str(caught.value)

@@ -76,7 +76,8 @@ def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dic
     for row, text in enumerate(table.frame["id"].astype(str)):
         if (name := normal_id(text)) in receivers:
             raise table.fault(f"receiver {name} is in an earlier row, too; remove one of them", row)
-        orientation = np.array(UPRIGHT) if orientations[row] is None else orientations[row]
+        stated_orientation = orientations[row]
+        orientation = np.array(UPRIGHT) if stated_orientation is None else stated_orientation
         hz = None if np.isnan(carriers[row]) else float(carriers[row])
         receivers[name] = Receiver(receiver_name(name), places[row], orientation, antennas[row], frequency_hz=hz)
     return receivers

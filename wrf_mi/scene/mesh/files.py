@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,14 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, source_file, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
+from .scene_files import USD_SUFFIXES, Beside, bare_gltf, read_collada, read_usd
 from .surfaces import Surface, number_names
 
 logger = logging.getLogger(__name__)
 
-SUFFIXES = (".ply", ".stl", ".obj", ".glb")
+STATING_READERS = {".dae": read_collada, **dict.fromkeys(USD_SUFFIXES, read_usd)}
+"""Readers of files that state their unit and the axis that is up."""
+SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS)
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
 SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
@@ -39,44 +43,68 @@ GRID = 1e-5
 
 
 def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
-    """The parts of a mesh file that have faces, with z up, in the file's unit.
+    """The parts of a mesh file that have faces, with z up, in metres where the file states its unit, else in its unit.
 
-    Polygons of OBJ and PLY are cut into triangles, concave ones too. Faces of one material of an OBJ are one part, in
-    other files those of a node or solid.
+    Polygons of OBJ, PLY, COLLADA and USD are cut into triangles, concave ones too. Faces of one material of an OBJ are
+    one part, in other files those of a node or solid.
 
     Args:
-        path: PLY, OBJ, STL, GLB, or another format that trimesh reads.
-        up: axis that is up in the file; None: y in GLB and glTF, as they specify, else z.
+        path: a file of `SUFFIXES`, or another format that trimesh reads.
+        up: axis that is up in the file; None: that which COLLADA and USD state, y in GLB and glTF, as they specify,
+            else z.
 
     Raises:
         InputError: a file that cannot be read as a mesh, is cut off, or has a face that crosses itself or names a
-            vertex that it has not.
+            vertex that it has not, or a missing package.
     """
-    file = Path(path)
-    suffix = file.suffix.lower()
+    parts, unit_m = _parts(Path(path), up)
+    for part in parts if unit_m not in (None, 1.0) else ():
+        part.vertices = part.vertices * unit_m
+    return parts
+
+
+def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | None]:
+    """The parts of a mesh file, with z up, and the unit of their coordinates in metres if the file states it."""
+    suffix, unit_m, stated = file.suffix.lower(), None, up_of(file, None)
     try:
-        if suffix in POLYGON_READERS:
+        if suffix in STATING_READERS:
+            contents, unit_m, stated = STATING_READERS[suffix](file)
+            if not 0 < unit_m < np.inf:
+                raise ValueError(f"a unit of {unit_m} m")
+            parts = [part for content in contents for part in _polygon_parts(content)]
+        elif suffix in POLYGON_READERS:
             parts = _polygon_parts(POLYGON_READERS[suffix](file))
         else:
-            _check_size(file)
-            # Without a name no other file is looked for: materials and textures are not used.
-            with file.open("rb") as stream:
-                dump: list[Any] = trimesh.load_scene(stream, file_type=suffix[1:], process=False).dump()
-            parts = [part for part in dump if len(getattr(part, "faces", ()))]
+            parts = _trimesh_parts(file)
         for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
-            faces, count = np.asarray(part.faces), len(part.vertices)
-            if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
-                raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
-            if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
-                raise ValueError(f"a face names a vertex that is not among its {count}")
+            _check_part(part)
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
-                raise InputError(f"{path}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
-            part.vertices = turned(np.asarray(part.vertices, float), up_of(file, up))
+                raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
+            part.vertices = turned(np.asarray(part.vertices, float), up or stated)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
-        raise InputError(f"{path}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
-    return parts
+        raise InputError(f"{file}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
+    return parts, unit_m
+
+
+def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
+    _check_size(file)
+    options: dict[str, Any] = {"file_type": file.suffix.lower()[1:], "process": False}
+    # Without a name no other file is looked for: materials and textures are not used.
+    source: Any = BytesIO(file.read_bytes())
+    if file.suffix.lower() == ".gltf":
+        source, options["resolver"] = BytesIO(bare_gltf(source.read())), Beside(file)
+    dump: list[Any] = trimesh.load_scene(source, **options).dump()
+    return [part for part in dump if len(getattr(part, "faces", ()))]
+
+
+def _check_part(part: trimesh.Trimesh) -> None:
+    faces, count = np.asarray(part.faces), len(part.vertices)
+    if np.ndim(part.vertices) != 2 or np.shape(part.vertices)[1] != 3:
+        raise ValueError(f"vertices of shape {list(np.shape(part.vertices))}; expected [v, 3]")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= count:
+        raise ValueError(f"a face names a vertex that is not among its {count}")
 
 
 def _polygon_parts(polygons: Polygons) -> list[trimesh.Trimesh]:
@@ -109,15 +137,16 @@ def _check_size(file: Path) -> None:
             raise ValueError("a solid without its endsolid; it is cut off")
 
 
-def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[Surface]:
+def read_mesh(path: str | Path, units: str | None = None, up: Up | None = None) -> list[Surface]:
     """The surfaces of a mesh file, each of kind "other": a surface per body that the file names.
 
     Degenerate faces and second copies of a face, which would count each path twice, are dropped (logged). Inverted
     normals stay, because radio materials act on both sides; so do edges with one, three or more faces.
 
     Args:
-        path: ``.ply``, ``.stl``, ``.obj`` or ``.glb`` with faces.
-        units: unit of its coordinates, a key of `wrf_mi.scene.coordinates.UNITS_M`.
+        path: a file of `SUFFIXES` with faces.
+        units: unit of its coordinates, a key of `wrf_mi.scene.coordinates.UNITS_M`; None: that which COLLADA and USD
+            state, else metres.
         up: axis that is up in it, see `mesh_parts`.
 
     Raises:
@@ -125,11 +154,11 @@ def read_mesh(path: str | Path, units: str = "m", up: Up | None = None) -> list[
             finite or were rounded far from the origin, or units that look like others.
     """
     file = source_file(path, units, f"a mesh ({', '.join(SUFFIXES)})")
-    parts = mesh_parts(file, up)
+    parts, stated_m = _parts(file, up)
     if not parts:
         remedy = "make a scene of points with wrf-mi mesh" if file.suffix.lower() == ".ply" else POINTS_ELSEWHERE
         raise InputError(f"{file}: has no faces, so no surface; {remedy}")
-    surfaces = sound_surfaces(parts, UNITS_M[units], file)
+    surfaces = sound_surfaces(parts, UNITS_M[units] if units else stated_m or 1.0, file)
     check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
     return surfaces
 

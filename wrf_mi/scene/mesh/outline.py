@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from shapely import affinity
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .planes import Mask, Plane
+from .planes import STOREY_M, Face, Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)
@@ -29,7 +30,8 @@ STRAY_SIZE, STRAY_DENSITY = 0.05, 0.25
 """A stray part of an area is smaller than this share of the whole and sparser than this share."""
 SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
-RECTANGLE_SHARE = 0.88  # least share of its tightest rectangle that a rectangular area fills
+RECTANGLE_SHARE, GROWN_SHARE = 0.88, 0.96
+"""Least share of its tightest rectangle that a rectangular area fills; also of one with places told by beams."""
 SCAN_LINES = 31
 SHADOW_CELL_M = 0.1
 BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
@@ -37,6 +39,9 @@ BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
 HIDDEN_SHARE = 0.5  # least share of a gap before which something stands, for the gap to be filled
 SMALLEST_GAP_M2 = 0.02
 STEEPEST = np.cos(np.radians(20))  # planes that meet at a smaller angle have no reliable line in common
+RASTER_M, MOST_CELLS = 0.1, 400_000  # side of the cells in which it is told what was seen, and their largest number
+LEAST_ADDED_M2 = 0.2  # least area by which another one grows
+LARGEST_BLIND_M2 = 12.0  # a scanner 2 m high that sees down to 45 degrees is blind below it on as much
 GRID_M = 1e-5
 PASSES = 2  # number of passes over all pairs of planes; the second pass closes the corner of three planes
 
@@ -53,16 +58,87 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
     bins = np.ceil((flat.max(axis=0) - low) / cell).astype(int) + CLOSED_CELLS + 2
     index = ((flat - low) / cell).astype(int)
     count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
-    mask = _covered(count, cell)
-    # One rectangle for each run of marked cells.
+    area = _boxes(_covered(count, cell), low, cell)
+    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
+    # Edges are moved inwards because a cell that the edge crosses counts as a whole.
+    return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
+
+
+def _boxes(mask: Mask, low: FloatArray, cell: float) -> Any:
+    """The area of the marked cells: a rectangle for each run of them."""
     steps = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(steps == 1)
     _, stop = np.nonzero(steps == -1)
     x, y0, y1 = low[0] + row * cell, low[1] + start * cell, low[1] + stop * cell
-    area = shapely.union_all(shapely.box(x, y0, x + cell, y1), grid_size=cell * 1e-3)
-    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
-    # Edges are moved inwards because a cell that the edge crosses counts as a whole.
-    return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
+    return shapely.union_all(shapely.box(x, y0, x + cell, y1), grid_size=cell * 1e-3)
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Cells over a part of a plane, in its coordinates: lowest corner [2], side, and numbers of cells."""
+
+    low_m: FloatArray
+    cell_m: float
+    shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, flat_m: FloatArray) -> Raster:
+        """Cells around points [n, 2], larger ones where there would be more than `MOST_CELLS`."""
+        low, size = flat_m.min(axis=0), np.ptp(flat_m, axis=0)
+        cell = max(RASTER_M, float(np.sqrt(np.prod(size) / MOST_CELLS)))
+        rows, columns = (np.ceil(size / cell).astype(int) + 1).tolist()
+        return cls(low, cell, (rows, columns))
+
+    @property
+    def centres_m(self) -> FloatArray:
+        """Centres of the cells [n, 2]."""
+        return self.low_m + (np.indices(self.shape).reshape(2, -1).T + 0.5) * self.cell_m
+
+    def image(self, values: Mask) -> Mask:
+        """Values [n] of cells as a picture."""
+        return values.reshape(self.shape)
+
+    def covered(self, area: Any) -> Mask:
+        """Cells whose centres lie in an area."""
+        return self.image(shapely.contains_xy(area, self.centres_m))
+
+    def grown(self, area: Any, mask: Mask) -> Any:
+        """An area with the connected parts of a mask that meet it and are broad; others are noise along its edges."""
+        inside = self.covered(area)
+        parts, count = ndimage.label(mask | inside)
+        meets = np.isin(np.arange(count + 1), np.unique(parts[inside])) & (np.arange(count + 1) > 0)
+        beyond = ndimage.binary_opening(meets[parts] & ~inside, np.ones((2, 2)))
+        added = _boxes(large_parts(beyond, LEAST_ADDED_M2 / self.cell_m**2), self.low_m, self.cell_m)
+        if added.is_empty:
+            return area
+        # Cells of the area that the added ones touch would leave a seam.
+        cells = _boxes(mask | inside, self.low_m, self.cell_m)
+        seam = shapely.intersection(shapely.buffer(added, 2 * self.cell_m, join_style="mitre"), cells)
+        whole = shapely.union_all([area, added, seam], grid_size=GRID_M)
+        whole = shapely.union_all([whole, *(hole for hole in _holes(whole) if hole.area < SMALL_HOLE_M2)])
+        parts = [_rectangle(part, GROWN_SHARE) or part.simplify(1.2 * self.cell_m) for part in polygons(whole)]
+        return shapely.union_all(parts)
+
+
+def _holes(area: Any) -> list[Any]:
+    return [shapely.polygons(ring) for part in polygons(area) for ring in part.interiors]
+
+
+def fill_blind(plane: Plane, area: Any, walls: Sequence[Face], points_m: FloatArray, band_m: float) -> Any:
+    """The area of a floor with the holes filled below which nothing was seen, and about which no walls stand.
+
+    A scanner does not see the floor below it. Through a hole of the floor it would see what is under it.
+    """
+    below = plane.distance(points_m) * np.sign(plane.normal[2])
+    flat = plane.flat(points_m[(below < -band_m) & (below > -STOREY_M)])
+    lines = [shapely.transform(wall.area, lambda uv, wall=wall: plane.flat(wall.plane.lift(uv))) for wall in walls]
+    about = shapely.buffer(shapely.union_all([shapely.boundary(line) for line in lines]), 2 * band_m)
+    filled = [area]
+    for ring in _holes(area):
+        walled = shapely.intersection(ring.exterior, about).length > HIDDEN_SHARE * ring.exterior.length
+        if ring.area <= LARGEST_BLIND_M2 and not walled and not shapely.contains_xy(ring, flat).any():
+            filled.append(ring)
+    return shapely.union_all(filled, grid_size=GRID_M)
 
 
 def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:
@@ -214,10 +290,10 @@ def _covered(count: NDArray[Any], cell: float) -> Mask:
     return mask & ~np.concatenate([[False], stray])[label]
 
 
-def _rectangle(part: Any) -> Any | None:
+def _rectangle(part: Any, share: float = RECTANGLE_SHARE) -> Any | None:
     """The rectangle of a polygon that is rectangular but for noise, or None; its sides are medians of the polygon's."""
     for tight in (shapely.envelope(part), part.minimum_rotated_rectangle):
-        if part.area < RECTANGLE_SHARE * tight.area:
+        if part.area < share * tight.area:
             continue
         (x, y), (x1, y1) = tight.exterior.coords[:2]
         angle, pivot = np.degrees(np.arctan2(y1 - y, x1 - x)), (x, y)

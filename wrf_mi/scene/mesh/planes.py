@@ -40,6 +40,7 @@ class Plane:
         centre_m: weighted mean of its points, shape [3].
         angle_error_rad: standard error of the normal's direction.
         u: unit vector in the plane, shape [3].
+        sparse: whether it was found by few points far from the scanner.
     """
 
     normal: FloatArray
@@ -48,6 +49,7 @@ class Plane:
     centre_m: FloatArray
     angle_error_rad: float
     u: FloatArray = field(default_factory=lambda: np.zeros(3))
+    sparse: bool = False
 
     @property
     def v(self) -> FloatArray:
@@ -70,10 +72,7 @@ class Plane:
         """The parallel plane at a distance along the normal, patches included."""
         shift = distance_m * self.normal
         return replace(
-            self,
-            offset_m=self.offset_m + distance_m,
-            patches_m=self.patches_m + shift,
-            centre_m=self.centre_m + shift,
+            self, offset_m=self.offset_m + distance_m, patches_m=self.patches_m + shift, centre_m=self.centre_m + shift
         )
 
     def rectangle(self, low_m: FloatArray, high_m: FloatArray) -> FloatArray:
@@ -182,14 +181,19 @@ def _is_high(face: Face, floors: Sequence[Face], middle_m: float) -> bool:
     return top > max(below, default=middle_m) + STOREY_M
 
 
-def _spans_room(face: Face, roles: Mapping[Face, Kind]) -> bool:
-    """Whether an upright face spans most of the height between floor and ceiling at its middle."""
+def storey(face: Face, roles: Mapping[Face, Kind]) -> tuple[float, float]:
+    """Heights of the floor below and the ceiling above the middle of a face; infinite where there is none."""
     x, y, z = face.plane.lift(np.array(face.area.centroid.coords[0]))
     levels = [
         (role, level.height_at(x, y)) for level, role in roles.items() if shapely.intersects(face.shadow, level.shadow)
     ]
     floor = max((height for role, height in levels if role == "floor" and height < z), default=-np.inf)
-    ceiling = min((height for role, height in levels if role == "ceiling" and height > z), default=np.inf)
+    return floor, min((height for role, height in levels if role == "ceiling" and height > z), default=np.inf)
+
+
+def _spans_room(face: Face, roles: Mapping[Face, Kind]) -> bool:
+    """Whether an upright face spans most of the height between floor and ceiling at its middle."""
+    floor, ceiling = storey(face, roles)
     least_m = WALL_SHARE * (ceiling - floor) if np.isfinite(ceiling - floor) else WALL_HEIGHT_M
     left, _, right, _ = face.area.bounds
     return bool(np.ptp(face.span_m) >= least_m and right - left >= NARROWEST_WALL_M)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import shapely
+from scipy import ndimage
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ..mesh.outline import fill_shadows, join, outline, triangulated
-from ..mesh.planes import Face, Plane, kinds, near, over, with_axes
-from ..mesh.surfaces import KINDS, Surface, number_names
-from .planes import BAND, find_planes, fit, layers
-from .points import thin
+from ...core.types import IntArray
+from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
+from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
+from ..mesh.surfaces import KINDS, Kind, Surface, number_names
+from .planes import BAND, Thinned, find_planes, fit, layers, thin
+from .sight import Sight, seen, sights_of, sparse_walls
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +30,12 @@ LEAST_CONTRAST = 2.0
 """Least density of points in a plane relative to the density beside it; chance alignments have less."""
 TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 """Bounds of the angle by which planes are turned: a levelled scanner and its registration leave the lower."""
+LEAST_PART, LEAST_FILLED = 0.4, 0.5
+"""Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
+wall of few points that it fills."""
+PASSES = 2
+MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
+UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
 ERRORS = 3.0  # angle by which planes are turned, in standard errors of their direction
 
 
@@ -39,14 +47,18 @@ class _Piece(Face):
     recesses: Sequence[Any] = ()
 
 
-def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
+def surfaces_from_points(
+    points_m: FloatArray, viewpoints_m: FloatArray | None = None, viewpoint: IntArray | None = None
+) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
     Things that are not flat (chairs, plants) are left out: a rough skin over them would reflect in directions that
-    nothing measured supports.
+    nothing measured supports. So are surfaces of other places that a scanner saw through a door or window.
 
     Args:
         points_m: shape [n, 3], metres, z upwards; any origin.
+        viewpoints_m: places of the scanners where they are known [k, 3].
+        viewpoint: number of each point's place [n], -1 for none.
 
     Returns:
         Surfaces by kind, the largest first; several polygons may make up one. Vertices in the frame of the points.
@@ -56,62 +68,167 @@ def surfaces_from_points(points_m: FloatArray) -> list[Surface]:
     """
     # Far from the origin (a national grid) single precision cannot hold millimetres.
     shift = np.floor(np.median(points_m, axis=0))
-    points = points_m - shift
+    # Copies of a point, which some scanners write, would make strays look like surfaces.
+    distinct = np.sort(np.unique((points_m - shift) @ UNLIKE, return_index=True)[1])
+    points = points_m[distinct] - shift
+    numbers = np.full(len(points), -1) if viewpoint is None else viewpoint[distinct]
+    places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
     cloud = thin(points)
     planes, noise = find_planes(cloud)
-    pieces = _pieces(planes, points.astype(np.float32), noise)
+    scan = _Scan(points.astype(np.float32), cloud, noise, sights_of(points, places, numbers, -shift))
+    pieces, roles = scan.room(planes)
     if not pieces:
         raise InputError("no plane was found; give a denser scan of a room")
-    planes, areas = [piece.plane for piece in pieces], [piece.area for piece in pieces]
-    roles = kinds(pieces, float(np.median(cloud.points_m[:, 2])))
-    reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
-    areas = join(planes, areas, reach)
-    # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
-    things = np.ones(len(cloud.points_m), bool)
-    for plane, area, kind in zip(planes, areas, roles, strict=True):
-        if kind != "other":
-            things &= ~over(plane, area, cloud.points_m, BAND * noise)
-    for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
-        areas[i] = fill_shadows(piece.plane, areas[i], kind, cloud.points_m[things], noise)
-        if piece.recesses:
-            areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
-    areas = [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
-    logger.info("%d planes in %d points, noise %.1f mm", len(planes), len(points), 1e3 * noise)
-    order = sorted(range(len(planes)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
+    areas = scan.closed(pieces, roles)
+    logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
+    order = sorted(range(len(pieces)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
     surfaces = []
     for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
         vertices, faces = triangulated(areas[i])
-        surfaces.append(Surface(name, roles[i], planes[i].lift(vertices) + shift, faces))
+        surfaces.append(Surface(name, roles[i], pieces[i].plane.lift(vertices) + shift, faces))
     return surfaces
 
 
-def _pieces(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[_Piece]:
-    """Planes and their parallel layers with the areas that points [n, 3] cover, those of most points first."""
-    pieces = list[_Piece]()
-    free = np.ones(len(points), bool)
-    for refined in _refined(planes, points, noise_m):
-        plane, parallel = layers(refined, points, free, noise_m)
-        recesses = []
-        for layer in parallel:
-            area, cell = outline(layer.plane, points[layer.rows])
-            if area.area >= SMALLEST_M2:
-                pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
-                free[layer.rows] = False
-                recesses += [] if layer.before else [area]
-        in_plane = near(plane, points, 2 * noise_m) & free
-        for layer in parallel:
-            in_plane[layer.rows] = layer.before  # a wall goes on behind a board
-        rows = np.flatnonzero(in_plane)
-        if len(rows) < FEWEST_POINTS:
-            continue
-        area, cell = outline(plane, points[rows])
-        # Densities per standard deviation of distance: within 2, and from 3 to 6, on both sides.
-        away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
-        inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
-        if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
-            pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
-            free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
-    return pieces
+def _walls(pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[_Piece]:
+    return [piece for piece, role in zip(pieces, roles, strict=True) if role == "wall"]
+
+
+class _Scan:
+    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, their noise, the scanners."""
+
+    def __init__(self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight]) -> None:
+        self.points_m, self.cloud, self.noise_m, self.sights = points_m, cloud, noise_m, sights
+        self.free = np.ones(len(points_m), bool)
+
+    def room(self, planes: Sequence[Plane]) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces of planes and their roles, with walls of few points, without what lies behind walls."""
+        pieces, roles = self.roles(self.pieces(planes))
+        walls = _walls(pieces, roles)
+        sparse = sparse_walls(self.cloud.all_m, [piece.plane for piece in walls], planes, self.noise_m)
+        for number in range(PASSES):
+            # Walls bound the room, and a wall that is found by few points bounds the others.
+            outside = self.outside(walls)
+            if not (outside & self.free).any() and not (sparse and number == 0):
+                break
+            self.free = ~outside
+            pieces, roles = self.roles(self.pieces([*planes, *sparse], walls))
+            walls = _walls(pieces, roles)
+        if not self.free.all():
+            logger.info("%d points behind openings of walls make no surfaces", np.count_nonzero(~self.free))
+        return pieces, roles
+
+    def closed(self, pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[Any]:
+        """Areas of pieces with their shadows filled, joined where they meet."""
+        planes, walls = [piece.plane for piece in pieces], _walls(pieces, roles)
+        reach = [max(p.reach_m, 0 if kind == "other" else REACH_M) for p, kind in zip(pieces, roles, strict=True)]
+        areas, band_m = join(planes, [piece.area for piece in pieces], reach), BAND * self.noise_m
+        # Shadows are those of things: points of floors, ceilings and walls are seen through a gap and hide nothing.
+        things, thinned = self.free.copy(), np.ones(len(self.cloud.points_m), bool)
+        for plane, area, kind in zip(planes, areas, roles, strict=True):
+            if kind != "other":
+                things &= ~over(plane, area, self.points_m, band_m)
+                thinned &= ~over(plane, area, self.cloud.points_m, band_m)
+        for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
+            if kind != "other":
+                areas[i] = self.without_shadows(piece.plane, areas[i], walls, things)
+            areas[i] = fill_shadows(piece.plane, areas[i], kind, self.cloud.points_m[thinned], self.noise_m)
+            if kind == "floor":
+                areas[i] = fill_blind(piece.plane, areas[i], walls, self.points_m, band_m)
+            if piece.recesses:
+                areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
+        return [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
+
+    def pieces(self, planes: Sequence[Plane], walls: Sequence[Face] = ()) -> list[_Piece]:
+        """Planes and their parallel layers with the areas that free points cover, those of most points first."""
+        pieces = list[_Piece]()
+        points, noise_m, free = self.points_m, self.noise_m, self.free.copy()
+        for refined in _refined(planes, points, noise_m):
+            plane, parallel = layers(refined, points, free, noise_m)
+            recesses = []
+            for layer in parallel:
+                area, cell = outline(layer.plane, points[layer.rows])
+                if area.area >= SMALLEST_M2:
+                    pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
+                    free[layer.rows] = False
+                    recesses += [] if layer.before else [area]
+            in_plane = near(plane, points, 2 * noise_m) & free
+            for layer in parallel:
+                in_plane[layer.rows] = layer.before  # a wall goes on behind a board
+            rows = np.flatnonzero(in_plane)
+            if len(rows) < FEWEST_POINTS:
+                continue
+            area, cell = outline(plane, points[rows])
+            area = self._completed(plane, area, walls, free)
+            # Densities per standard deviation of distance: within 2, and from 3 to 6, on both sides.
+            away = np.abs(plane.distance(points[over(plane, area, points, 6 * noise_m)]))
+            inside, beside = np.count_nonzero(away < 2 * noise_m) / 2, np.count_nonzero(away > 3 * noise_m) / 3
+            if area.area >= SMALLEST_M2 and inside >= LEAST_CONTRAST * max(beside, 1):
+                pieces.append(_Piece(plane, area, 3 * noise_m + cell, recesses))
+                free &= ~over(plane, area, points, BAND * noise_m)  # or a shelf would grow along the wall behind it
+        return pieces
+
+    def _completed(self, plane: Plane, area: Any, walls: Sequence[Face], free: Mask) -> Any:
+        """An area with the places about it that beams met, where points are too sparse to show it."""
+        band_m = BAND * self.noise_m
+        in_plane = np.flatnonzero(free & (np.abs(plane.distance(self.points_m)) < band_m))
+        if not self.sights or not len(in_plane):
+            return area
+        raster = Raster.around(plane.flat(self.points_m[in_plane]).astype(float))
+        row, _ = seen(self.sights, plane, plane.lift(raster.centres_m), walls, band_m, free)
+        on = raster.image((row >= 0) & free[row])
+        # Where another surface crosses the plane, a strip as wide as the band lies in it.
+        strip = int(np.ceil(2 * band_m / raster.cell_m)) + 1
+        return raster.grown(area, ndimage.binary_opening(on, np.ones((strip, strip))))
+
+    def roles(self, pieces: Sequence[_Piece]) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces with their roles, walls with their parts behind things; without sparse planes that are no walls."""
+        middle_m = float(np.median(self.cloud.points_m[:, 2]))
+        short: dict[Face, Kind] = dict(zip(pieces, kinds(pieces, middle_m), strict=True))
+        whole = [self._up_to_levels(piece, short) for piece in pieces]
+        chosen, roles = list[_Piece](), kinds(whole, middle_m)
+        for piece, longer, role in zip(pieces, whole, roles, strict=True):
+            filled = longer.area.area / shapely.envelope(longer.area).area
+            if not piece.plane.sparse or (role == "wall" and filled >= LEAST_FILLED):
+                chosen.append(longer if role == "wall" else piece)
+        return chosen, kinds(chosen, middle_m)
+
+    def _up_to_levels(self, piece: _Piece, roles: Mapping[Face, Kind]) -> _Piece:
+        """An upright piece with the places that things hide between the floor and the ceiling."""
+        if not self.sights or piece.slope > UPRIGHT or np.ptp(piece.span_m) < LEAST_PART * WALL_HEIGHT_M:
+            return piece
+        levels = {face: role for face, role in roles.items() if role in ("floor", "ceiling")}
+        off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
+        (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
+        for height in storey(piece, levels):
+            if np.isfinite(height):
+                at = piece.area.centroid.y + height - middle[2]
+                low, high = min(low, at), max(high, at)
+        area = self.without_shadows(piece.plane, piece.area, (), off, shapely.box(left, low, right, high))
+        return replace(piece, area=area)
+
+    def without_shadows(
+        self, plane: Plane, area: Any, walls: Sequence[Face], things: Mask, within: Any | None = None
+    ) -> Any:
+        """An area with the places that things hide from all scanners, within its bounds or other ones."""
+        if not self.sights or area.is_empty:
+            return area
+        within = shapely.envelope(area) if within is None else within
+        raster = Raster.around(shapely.get_coordinates(within))
+        _, hidden = seen(self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things)
+        return raster.grown(area, raster.image(hidden) & raster.covered(within) & ~raster.covered(area))
+
+    def outside(self, walls: Sequence[Face]) -> Mask:
+        """Points that scanners saw through openings of walls; none of a scanner that saw much there.
+
+        A door two metres away is 4 % of all directions: a scanner with a tenth of its returns behind walls stands in a
+        doorway, or a rectangle about pieces of a wall spans an open plan.
+        """
+        outside = np.zeros(len(self.points_m), bool)
+        for sight in self.sights:
+            behind = sight.behind(sight.points_m, walls, max(BAND * self.noise_m, REACH_M))
+            if behind.mean() < MOST_OUTSIDE:
+                outside[sight.rows[behind]] = True
+        return outside
 
 
 def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:

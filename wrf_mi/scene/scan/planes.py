@@ -16,13 +16,21 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.signal import find_peaks
+from scipy.spatial import cKDTree
 from skimage.filters import apply_hysteresis_threshold
 
+from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ..coordinates import extra_package
 from ..mesh.planes import THICKEST_M, Mask, Plane, near, with_axes
-from .points import Thinned, lidar_package
 
+VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
+MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
+NORMAL_RADIUS_M, NORMAL_NEIGHBOURS, FEWEST_NEIGHBOURS = 0.15, 50, 16
+"""Radius of the points that tell a normal, and the most and fewest of them; the fewest reach farther where need be."""
+STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
+"""A mean farther from its neighbours than usual by this many standard deviations is a stray."""
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
 """Spread of the normals in a patch, for each of successive searches among the points that belong to no plane yet. 60
 joins the walls of a sparse room around its corners, but finds narrow faces."""
@@ -51,6 +59,54 @@ TUKEY = 4.685  # constant of the biweight
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median absolute deviations
 
 
+@dataclass(frozen=True)
+class Thinned:
+    """A thinned point cloud.
+
+    Attributes:
+        points_m: mean of the points in each cell, without strays [m, 3].
+        count: their number [m].
+        normals: unit normals [m, 3].
+        all_m: all means [k, 3]: far from a scanner surfaces are as sparse as strays.
+    """
+
+    points_m: FloatArray
+    count: FloatArray
+    normals: FloatArray
+    all_m: FloatArray
+
+
+def thin(points_m: FloatArray) -> Thinned:
+    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
+    o3d = extra_package("open3d")
+    voxel = VOXEL_M
+    mean, count = _cells(points_m, voxel)
+    while len(mean) > MOST_VOXELS:
+        voxel *= 1.25
+        mean, count = _cells(points_m, voxel)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
+    cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
+    if len(rows) < STRAY_NEIGHBOURS:
+        raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
+    radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.asarray(cloud.points)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, NORMAL_NEIGHBOURS))
+    normals = np.array(cloud.normals)
+    # Far from the scanner a radius holds a few points, whose noise tilts the normal.
+    few = cKDTree(points).query_ball_point(points, radius, return_length=True) < FEWEST_NEIGHBOURS
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FEWEST_NEIGHBOURS))
+    normals[few] = np.asarray(cloud.normals)[few]
+    return Thinned(points, count[rows], normals, mean)
+
+
+def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:
+    """Mean [m, 3] and number [m] of the points in each cell."""
+    cell = ((points_m - points_m.min(axis=0)) / voxel_m).astype(np.int64)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    _, inverse = np.unique(key, return_inverse=True)
+    count = np.bincount(inverse).astype(float)
+    return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
+
+
 def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
     """The planes of a thinned cloud, those of most points first, and the standard deviation of points from them,
     metres.
@@ -62,12 +118,12 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
         candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
-        candidates = [c for c in candidates if not any(_repeats(c, plane, REPEAT * noise) for plane in planes)]
+        candidates = [c for c in candidates if not any(repeats(c, plane, REPEAT * noise) for plane in planes)]
         if not candidates:
             break
         merged, planes = _merge(cloud, [*planes, *candidates], noise), []
         for plane in merged:
-            if not any(_repeats(plane, other, 2 * noise) for other in planes):
+            if not any(repeats(plane, other, 2 * noise) for other in planes):
                 planes.append(plane)
         for plane in planes:
             free &= ~near(plane, cloud.points_m, BAND * noise)
@@ -134,7 +190,7 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
     return bool(shapely.distance(flat, a.region(0)) < MERGE_GAP_M)
 
 
-def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
+def repeats(plane: Plane, other: Plane, least_m: float) -> bool:
     """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
     if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
         return False
@@ -147,7 +203,7 @@ def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:
     """Boxes around the flat patches of a part of a cloud."""
     if np.count_nonzero(free) < FEWEST_VOXELS:
         return []
-    o3d = lidar_package("open3d")
+    o3d = extra_package("open3d")
     part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_m[free]))
     part.normals = o3d.utility.Vector3dVector(cloud.normals[free])
     boxes = part.detect_planar_patches(

@@ -1,10 +1,12 @@
-"""Point clouds from files, in metres, and thinned to the means of small cells."""
+"""Scans from files: points in metres, and where the scanner of each stood, in the formats that scanners write."""
 
 from __future__ import annotations
 
+import logging
 import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,111 +15,135 @@ import trimesh
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ...core.array_files import stored_array, stored_arrays
+from ...core.array_files import stored_arrays
 from ...core.files import one_line
 from ...core.memory import require_memory
+from ...core.types import IntArray
 from ...parallel import run_module
-from ..coordinates import FORMATS, UNITS_M, Up, require_precise, source_file, turned, up_of
+from ..coordinates import FORMATS, UNITS_M, Up, extra_package, require_precise, source_file, turned, up_of
+from ..mesh.planes import Mask
 from ..mesh.polygon_files import read_obj, read_ply
 
-SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
-"""Libraries that Open3D is linked against and a small system lacks."""
-MOST_LAZ = 1000  # largest ratio of LAZ compression: points of a cloud reach 10, equal points a hundred
+logger = logging.getLogger(__name__)
+
+MOST_LAZ, MOST_LZF = 1000, 100
+"""Largest ratios of compression: points of a LAZ reach 10, equal points a hundred; LZF writes 264 bytes as 3."""
+LEAST_E57 = 8  # least points that a byte of an E57 may hold: a bit for a point, whatever its fields
+LEAST_ROW = 6  # least bytes of a point in a text: three digits and what separates them
 LAS_HEADER, LAS_MINOR, LAS_EXTENDED = 375, 25, 4
 """Bytes of the header of LAS 1.4, place of its minor version, and the version from which extended records exist."""
 LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
 """Places of the numbers (32 bits) of variable-length records in the header, and the least bytes of a record."""
-LAZ_BYTES, LAZ_S, LAZ_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
-"""Address space of the process that reads LAZ beside its points, and the time that it has."""
-VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
-MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
-NORMAL_RADIUS_M, NORMAL_NEIGHBOURS = 0.15, 50
-STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
-"""A mean farther from its neighbours than usual by this many standard deviations is a stray."""
+CHILD_BYTES, CHILD_S, CHILD_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
+"""Address space of the process that reads a file beside its points, and the time that it has."""
+PCD_HEADER = 1 << 16  # bytes in which the header of a PCD has to end
+PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
+
+Part = tuple[FloatArray, FloatArray | None]
+"""Points [n, 3] of a scan in the file's unit and frame, and the place [3] of its scanner, or None."""
 
 
-@dataclass(frozen=True)
-class Thinned:
-    """A thinned point cloud: mean of the points in each cell [m, 3], their number [m], and unit normals [m, 3]."""
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Points of one or several scans.
+
+    Attributes:
+        points_m: shape [n, 3], metres, z up.
+        viewpoints_m: places of the scanners that files state [k, 3], metres.
+        viewpoint: number of the viewpoint of each point [n], -1 where it is not stated.
+    """
 
     points_m: FloatArray
-    count: FloatArray
-    normals: FloatArray
+    viewpoints_m: FloatArray
+    viewpoint: IntArray
 
 
-def lidar_package(name: str) -> Any:
-    """A package of the extra ``lidar``; an `InputError` if it or a system library that it needs is not installed."""
-    try:
-        return import_module(name)
-    except ModuleNotFoundError:
-        raise InputError(f"scenes from scans need {name}: pip install 'wrf-mi[lidar]'") from None
-    except ImportError as error:
-        text = one_line(error)
-        raise InputError(f"{name} cannot be loaded ({text}); install that library, on Debian: {SYSTEM}") from None
+def read_points(path: str | Path, units: str | None = None, up: Up | None = None) -> FloatArray:
+    """Points [m, 3] in metres, z up, of a point cloud, or the vertices of a mesh, see `read_scan`."""
+    return read_scan([path], units, up).points_m
 
 
-def read_points(path: str | Path, units: str = "m", up: Up | None = None) -> FloatArray:
-    """Points [m, 3] in metres, z up, of a point cloud, or the vertices of a mesh.
+def read_scan(paths: Sequence[str | Path], units: str | None = None, up: Up | None = None) -> Scan:
+    """Points of scan files in one frame, with the places of their scanners where the files state them.
+
+    Scans of E57 and PTX are moved by their poses, and stand where these put their scanner; PCD states a viewpoint.
+    Directions without a return (invalid points of E57, NaN in PCD, 0 0 0 in PTX) are no points.
 
     Args:
-        path: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las`` or ``.laz``; ``.xyz`` or ``.txt`` with
-            three or more columns, separated by spaces or commas; or any format that trimesh reads (PLY, OBJ, STL).
-        units: unit of the file's coordinates, a key of `UNITS_M`.
-        up: axis that is up in it, see `wrf_mi.scene.mesh.files.mesh_parts`.
+        paths: ``.npz`` with an array ``points`` or ``xyz_m`` [m, 3]; ``.las``, ``.laz``, ``.e57``, ``.pcd``; ``.pts``
+            and ``.ptx``; ``.xyz`` or ``.txt`` with three or more columns, separated by spaces or commas; or any format
+            that trimesh reads (PLY, OBJ, STL).
+        units: unit of the files' coordinates, a key of `UNITS_M`; None: metres.
+        up: axis that is up in them, see `wrf_mi.scene.mesh.files.mesh_parts`.
 
     Raises:
-        InputError: missing file, unknown units, no points, a point that is not finite, or coordinates that were
-            rounded far from the origin.
+        InputError: missing file or package, unknown units, no points, a point that is not finite, or coordinates that
+            were rounded far from the origin.
     """
-    file = source_file(path, units, f"a point cloud ({FORMATS})")
-    if file.suffix.lower() in (".las", ".laz"):
-        lidar_package("laspy")  # a missing package is no fault of the file
+    unit_m = UNITS_M.get(units or "m", 1.0)
+    points, viewpoints, numbers = list[FloatArray](), list[FloatArray](), list[IntArray]()
+    for path in paths:
+        file = source_file(path, units, f"a point cloud ({FORMATS})")
+        for part, viewpoint in _parts(file):
+            require_precise(part, unit_m, file)
+            points.append(turned(part * unit_m, up_of(file, up)))
+            numbers.append(np.full(len(part), -1 if viewpoint is None else len(viewpoints)))
+            if viewpoint is not None:
+                viewpoints.append(turned(viewpoint * unit_m, up_of(file, up)))
+    return Scan(np.concatenate(points), np.array(viewpoints, float).reshape(-1, 3), np.concatenate(numbers))
+
+
+def _parts(file: Path) -> list[Part]:
+    """The scans of a file, each with points, all of them finite."""
     try:
-        points = np.asarray(_read(file), float)
+        parts = [
+            (np.asarray(points, float), viewpoint)
+            for points, viewpoint in READERS.get(file.suffix.lower(), _read_vertices)(file)
+        ]
     except InputError:
         raise
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
-    if points.size == 0:
+    parts = [(points, viewpoint) for points, viewpoint in parts if points.size]
+    if not parts:
         raise InputError(f"{file}: no points in it; give {FORMATS}")
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{file}: expected points of shape [m, 3], got {list(points.shape)}")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
-        raise InputError(f"{file}, point {bad[0] + 1}: not finite; remove that point")
-    require_precise(points, UNITS_M[units], file)
-    return turned(points if UNITS_M[units] == 1 else points * UNITS_M[units], up_of(file, up))
+    first = 0
+    for points, _ in parts:
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"{file}: expected points of shape [m, 3], got {list(points.shape)}")
+        if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
+            raise InputError(f"{file}, point {first + bad[0] + 1}: not finite; remove that point")
+        first += len(points)
+    return parts
 
 
-def thin(points_m: FloatArray) -> Thinned:
-    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
-    o3d = lidar_package("open3d")
-    voxel = VOXEL_M
-    mean, count = _cells(points_m, voxel)
-    while len(mean) > MOST_VOXELS:
-        voxel *= 1.25
-        mean, count = _cells(points_m, voxel)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mean))
-    cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
-    if len(rows) < STRAY_NEIGHBOURS:
-        raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS_M * voxel / VOXEL_M, NORMAL_NEIGHBOURS))
-    return Thinned(np.asarray(cloud.points), count[rows], np.asarray(cloud.normals))
+def _read_npz(file: Path) -> list[Part]:
+    arrays = stored_arrays(file, ("xyz_m", "points"))
+    if not arrays:
+        raise InputError(f"{file}: no array points or xyz_m in it; give one [m, 3]")
+    return [(arrays["xyz_m" if "xyz_m" in arrays else "points"], None)]
 
 
-def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray]:
-    """Mean [m, 3] and number [m] of the points in each cell."""
-    cell = ((points_m - points_m.min(axis=0)) / voxel_m).astype(np.int64)
-    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    _, inverse = np.unique(key, return_inverse=True)
-    count = np.bincount(inverse).astype(float)
-    return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
+def _read_text(file: Path) -> list[Part]:
+    with file.open(encoding="utf-8-sig") as text:
+        commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
+    delimiter = "," if commas else None
+    return [(np.loadtxt(file, usecols=(0, 1, 2), delimiter=delimiter, ndmin=2, encoding="utf-8-sig"), None)]
 
 
-def _read_las(file: Path) -> Any:
+def _read_vertices(file: Path) -> list[Part]:
+    suffix = file.suffix.lower()
+    if suffix in (".ply", ".obj"):
+        return [((read_ply if suffix == ".ply" else read_obj)(file).vertices, None)]
+    with file.open("rb") as stream:  # without a name no other file is looked for
+        points: Any = getattr(trimesh.load(stream, file_type=suffix.removeprefix(".")), "vertices", [])
+    return [(points, None)]
+
+
+def _read_las(file: Path) -> list[Part]:
     """Points of a LAS or LAZ file, whose header must not state more than the file can hold."""
     size = file.stat().st_size
-    laspy = lidar_package("laspy")
+    laspy = extra_package("laspy")
     with file.open("rb") as stream:
         head = stream.read(LAS_HEADER).ljust(LAS_HEADER, b"\0")
     for what, at, least in LAS_RECORDS:  # laspy reads as many as are stated, beyond the end of the file, too
@@ -127,38 +153,122 @@ def _read_las(file: Path) -> Any:
     with laspy.open(file) as source:
         header = source.header
         packed, needed = header.are_points_compressed, header.point_count * header.point_format.size
-        if needed > size * (MOST_LAZ if packed else 1):
-            raise ValueError(f"states {header.point_count} points, and has {size} bytes")
-        require_memory(4 * needed, f"{file}: {header.point_count} points", "thin the cloud first")
+        _check_count(file, header.point_count, needed, size * (MOST_LAZ if packed else 1))
         if not packed:
-            return source.read().xyz
+            return [(source.read().xyz, None)]
+    return _read_apart(file, needed)
+
+
+def _check_count(file: Path, count: int, needed: int, most: int) -> None:
+    """Refuse a file whose header states more points than it can hold, or than memory can."""
+    if needed > most:
+        raise ValueError(f"states {count} points, and has {file.stat().st_size} bytes")
+    require_memory(4 * needed, f"{file}: {count} points", "thin the cloud first")
+
+
+def _read_apart(file: Path, needed: int) -> list[Part]:
+    """Scans of a file of about ``needed`` bytes of points, read by `wrf_mi.scene.scan.read_child`."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "points.npy"
-        arguments = [str(file), str(out), str(LAZ_BYTES + 4 * needed)]
-        seconds = LAZ_S + size / LAZ_BYTES_PER_S
-        status, message = run_module("wrf_mi.scene.scan.read_laz", arguments, quiet=True, most_s=seconds)
+        out = Path(folder) / "points.npz"
+        arguments = [str(file), str(out), str(CHILD_BYTES + 4 * needed)]
+        seconds = CHILD_S + file.stat().st_size / CHILD_BYTES_PER_S
+        status, message = run_module("wrf_mi.scene.scan.read_child", arguments, quiet=True, most_s=seconds)
         if status != 0:
-            raise ValueError(message if status == 1 else "its compressed points are damaged")
-        return stored_array(out)
+            raise ValueError(message if status == 1 else "its points are damaged")
+        arrays = stored_arrays(out)
+    parts = np.split(arrays["points"], np.cumsum(arrays["sizes"])[:-1])
+    return [
+        (points, viewpoint if np.isfinite(viewpoint).all() else None)
+        for points, viewpoint in zip(parts, arrays["viewpoints"], strict=True)
+    ]
 
 
-def _read(file: Path) -> Any:
-    match file.suffix.lower():
-        case ".npz":
-            arrays = stored_arrays(file, ("xyz_m", "points"))
-            if not arrays:
-                raise InputError(f"{file}: no array points or xyz_m in it; give one [m, 3]")
-            return arrays["xyz_m" if "xyz_m" in arrays else "points"]
-        case ".las" | ".laz":
-            return _read_las(file)
-        case ".xyz" | ".txt":
-            with file.open(encoding="utf-8-sig") as text:
-                commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
-            columns, delimiter = (0, 1, 2), "," if commas else None
-            return np.loadtxt(file, usecols=columns, delimiter=delimiter, ndmin=2, encoding="utf-8-sig")
-        case ".ply":
-            return read_ply(file).vertices
-        case ".obj":
-            return read_obj(file).vertices
-    with file.open("rb") as stream:  # without a name no other file is looked for
-        return getattr(trimesh.load(stream, file_type=file.suffix.lower().removeprefix(".")), "vertices", [])
+def _read_e57(file: Path) -> list[Part]:
+    pye57 = extra_package("pye57")
+    source = pye57.E57(str(file))
+    try:
+        counts = [source.get_header(index).point_count for index in range(source.scan_count)]
+    finally:
+        source.close()
+    _check_count(file, sum(counts), sum(counts), LEAST_E57 * file.stat().st_size)
+    return _read_apart(file, 24 * sum(counts))
+
+
+def _read_pcd(file: Path) -> list[Part]:
+    """Points of a PCD file (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
+    extra_package("open3d")
+    header, lines = _pcd_header(file)
+    kind = header["DATA"][0]
+    count, fields = int(header["POINTS"][0]), header["FIELDS"]
+    lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
+    record = sum(int(size) * length for size, length in zip(header["SIZE"], lengths, strict=True))
+    most = file.stat().st_size * (MOST_LZF if kind == "binary_compressed" else 1)
+    _check_count(file, count, count * (LEAST_ROW if kind == "ascii" else record), most)
+    if kind == "ascii":  # Open3D fills what a file lacks with whatever is in memory
+        columns = [sum(lengths[: fields.index(axis)]) for axis in "xyz"]
+        with file.open(encoding="ascii") as text:
+            points = np.loadtxt(islice(text, lines, lines + count), usecols=columns, ndmin=2)
+    else:
+        ((points, _),) = _read_apart(file, count * max(record, 24))
+    if len(points) != count:
+        raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off or damaged")
+    place = np.array(header.get("VIEWPOINT", ["nan"] * 3)[:3], float)
+    return [(_returns(points, ~np.isnan(points), file), place if np.isfinite(place).all() else None)]
+
+
+def _pcd_header(file: Path) -> tuple[dict[str, list[str]], int]:
+    """Words of the lines of a PCD file's header by their first, and their number."""
+    with file.open("rb") as stream:
+        head, found, rest = stream.read(PCD_HEADER).partition(b"\nDATA ")
+    lines = [*head.decode("ascii", "replace").split("\n"), "DATA " + rest.split(b"\n")[0].decode("ascii", "replace")]
+    header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    if not found or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not {"POINTS", "SIZE"} <= set(header):
+        raise ValueError("no header of a PCD file with x, y, z, SIZE and POINTS")
+    return header, len(lines)
+
+
+def _read_blocks(file: Path) -> Iterator[Part]:
+    """Scans of a PTS or PTX file, each after its number of points, in PTX of columns and rows, and its pose there.
+
+    Source: Leica Geosystems, "HDS scan formats"; points of a row are x y z, intensity and colours.
+    """
+    require_memory(4 * file.stat().st_size, str(file), "thin the cloud first")
+    with file.open(encoding="utf-8-sig") as stream:
+        while line := next((line for line in stream if line.strip()), ""):
+            pose = None
+            count = int(line)
+            if file.suffix.lower() == ".ptx":
+                count *= int(next(stream, ""))
+                pose = _ptx_pose(stream)
+            if count < 0 or count * LEAST_ROW > file.stat().st_size:
+                raise ValueError(f"states {count} points, and has {file.stat().st_size} bytes")
+            points = np.loadtxt(islice(stream, count), usecols=(0, 1, 2), ndmin=2) if count else np.empty((0, 3))
+            if len(points) != count:
+                raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off")
+            if pose is None:
+                yield points, None
+            else:  # rows are multiplied from the left, and the scanner is at the origin of its scan
+                points = _returns(points, points != 0, file)
+                yield points @ pose[:3, :3] + pose[3, :3], pose[3, :3]
+
+
+def _ptx_pose(stream: Iterator[str]) -> FloatArray:
+    pose = np.array([[float(word) for word in next(stream, "").split()] for _ in range(PTX_LINES)][-4:])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError("a scan without the 4 x 4 matrix of its pose")
+    return pose
+
+
+def _returns(points: FloatArray, valid: Mask, file: Path) -> FloatArray:
+    """Points of directions with a return, which have a valid coordinate; those without are none of the format."""
+    returned = valid.any(axis=1)
+    if missing := len(points) - np.count_nonzero(returned):
+        logger.info("%s: %d of %d directions without a return", file, missing, len(points))
+    return points[returned]
+
+
+READERS: dict[str, Callable[[Path], Iterable[Part]]] = {
+    **{".npz": _read_npz, ".las": _read_las, ".laz": _read_las, ".e57": _read_e57, ".pcd": _read_pcd},
+    **{".pts": _read_blocks, ".ptx": _read_blocks, ".xyz": _read_text, ".txt": _read_text},
+}
+"""Readers of points by the ending of a file; others are read as the vertices of a mesh."""

@@ -1,0 +1,129 @@
+"""Polygons of COLLADA and USD files, with the unit and the axis up that these state, and the content of glTF files.
+
+trimesh reads COLLADA, too, but cuts concave polygons into fans, and drops unit and axis.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import parse
+from numpy.typing import ArrayLike
+
+from ...core import InputError
+from ...core.files import inside
+from ...core.types import IntArray
+from ..coordinates import Up, extra_package
+from .polygon_files import Polygons
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+UP = {"Z_UP": "z", "Y_UP": "y", "Z": "z", "Y": "y"}
+Content = tuple[list[Polygons], float, Up]
+"""Polygons of each part, the unit of their vertices in metres, and the axis that is up."""
+
+
+def read_collada(path: Path) -> Content:
+    """Geometry of a COLLADA scene, moved by its nodes; `ValueError` for a damaged file.
+
+    Source: Khronos Group, "COLLADA 1.5.0", 5-18 (asset). Coordinates have single precision in pycollada.
+    """
+    collada = extra_package("collada")
+    try:
+        parse(path, forbid_dtd=True)
+    except DefusedXmlException:
+        raise InputError(f"{path}: has a document type or entities; remove them") from None
+    with path.open("rb") as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # it computes with numpy.matrix
+        content = collada.Collada(stream, aux_file_loader=lambda name: inside(path.parent, name, path).read_bytes())
+        parts = []
+        for geometry in content.scene.objects("geometry") if content.scene else ():
+            for primitive in geometry.primitives():
+                if primitive.vertex is None or not hasattr(primitive, "normal_index"):
+                    continue  # lines
+                index = np.asarray(primitive.vertex_index)
+                sizes = np.diff(primitive.polyindex)[:, 0] if index.ndim == 1 else np.full(len(index), 3)
+                parts.append(_polygons(primitive.vertex, index, sizes, geometry.original.id))
+    up = str(content.assetInfo.upaxis or "Y_UP")
+    return parts, float(content.assetInfo.unitmeter or 1.0), _up(path, up)
+
+
+def read_usd(path: Path) -> Content:
+    """Meshes of a USD stage, moved by their transforms, without those that are guides or invisible.
+
+    Subdivision surfaces are their cages. `InputError` for a stage with layers outside its folder, or with shapes that
+    are no meshes, which would be missing.
+    """
+    extra_package("pxr")
+    from pxr import Tf, Usd, UsdGeom
+
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise ValueError(str(error).strip().splitlines()[-1]) from None
+    for layer in stage.GetUsedLayers():
+        if not layer.anonymous and not Path(layer.realPath).resolve().is_relative_to(path.parent.resolve()):
+            raise InputError(f"{path}: has a layer outside its folder, {layer.realPath}; export one file")
+    moves, parts = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()), []
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        if not _is_surface(prim, UsdGeom):
+            continue
+        if not prim.IsA(UsdGeom.Mesh):
+            raise InputError(f"{path}: {prim.GetPath()} is a {prim.GetTypeName()}; export it as a mesh")
+        mesh, time = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
+        attributes = (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr())
+        vertices, corners, sizes = (np.array(attribute.Get(time) or ()) for attribute in attributes)
+        matrix = np.array(moves.GetLocalToWorldTransform(prim))  # of rows, multiplied from the left
+        moved = vertices.reshape(-1, 3).astype(float) @ matrix[:3, :3] + matrix[3, :3]
+        parts.append(_polygons(moved, corners, sizes, str(prim.GetPath())))
+    return parts, float(UsdGeom.GetStageMetersPerUnit(stage)), _up(path, str(UsdGeom.GetStageUpAxis(stage)))
+
+
+def _is_surface(prim: Any, geometry: Any) -> bool:
+    """Whether a visible part of a USD stage has surfaces, by the package's module ``UsdGeom``."""
+    shape = geometry.Gprim(prim)
+    if not shape:
+        return bool(prim.IsA(geometry.PointInstancer))
+    drawn = shape.ComputePurpose() != "guide" and shape.ComputeVisibility() != "invisible"
+    return drawn and not prim.IsA(geometry.Curves) and not prim.IsA(geometry.Points)
+
+
+def _polygons(vertices: ArrayLike, corners: IntArray, sizes: IntArray, name: str) -> Polygons:
+    sizes = np.asarray(sizes, np.int64)
+    if sizes.sum() != corners.size:
+        raise ValueError(f"{name} states {sizes.sum()} corners of faces and has {corners.size}")
+    parts, index = np.zeros(len(sizes), np.int64), np.asarray(corners, np.int64).reshape(-1)
+    return Polygons(np.asarray(vertices, float), index, sizes, parts, lambda polygon: f"face {polygon + 1} of {name}")
+
+
+def _up(path: Path, stated: str) -> Up:
+    if stated not in UP:
+        raise InputError(f"{path}: states {stated} as its axis up; export it with y or z up")
+    return "y" if UP[stated] == "y" else "z"
+
+
+def bare_gltf(content: bytes) -> bytes:
+    """A glTF file without materials and textures, of which no file is read."""
+    facts = json.loads(content)
+    for key in ("materials", "textures", "images", "samplers"):
+        facts.pop(key, None)
+    for mesh in facts.get("meshes", ()):
+        for primitive in mesh["primitives"]:
+            primitive.pop("material", None)
+    return json.dumps(facts).encode()
+
+
+class Beside:
+    """Files in the folder of another one, as trimesh asks for them."""
+
+    def __init__(self, path: Path) -> None:
+        """The file beside which they are."""
+        self._path = path
+
+    def __getitem__(self, name: str) -> bytes:
+        """Content of a file; `InputError` for one outside the folder."""
+        return inside(self._path.parent, name, self._path).read_bytes()
