@@ -92,7 +92,8 @@ def training_request(a: Arguments) -> RunRequest:
     if a.preset is not None:
         settings = [*_preset(a, model), *settings]
     names = ("scene", "material", "receiver", "evaluation", "n_train", "deterministic", "intervals")
-    stated = {name: getattr(a, name) for name in names} | {"split": a.split or "official", "seed": a.seed or 0}
+    split = "official" if a.split is None else a.split  # an empty one is an error
+    stated = {name: getattr(a, name) for name in names} | {"split": split, "seed": a.seed or 0}
     antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
     return RunRequest(model, settings=settings, antennas=antennas, **stated)
 
