@@ -27,7 +27,7 @@ def _add_map(commands: Any) -> None:
     add("--height", type=float, metavar="M", help=text)
     text = "mesh whose faces' centres are the positions, in place of the grid (PLY, STL, OBJ, GLB; metres)"
     add("--surface", metavar="MESH", help=text)
-    text = "spacing of the grid, metres (default: 0.1), or longest edge of the mesh's faces, which are halved"
+    text = "spacing of the grid (default: 0.1 m, more above a hectare), or longest edge of a mesh's faces, to be halved"
     add("--step", type=float, metavar="M", help=text)
     text = "name of a receiver, repeatable (default: all)"
     add("--receiver", action="append", metavar="NAME", help=text)

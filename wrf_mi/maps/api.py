@@ -54,7 +54,6 @@ from .dataset import map_dataset, maps_package
 if TYPE_CHECKING:
     import xarray
 
-STEP_M = 0.1  # default spacing of a grid
 THRESHOLD_DBM = -90.0
 CHUNK_SIZE = 10_000
 """Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
@@ -81,8 +80,8 @@ def radio_map(
         run: run, or its folder, with one fitted model.
         height_m: z of a horizontal grid over the scene, or over the data where there is none; None: the median height
             of the transmitters in the data.
-        step_m: spacing of the grid, or longest edge of a mesh's triangles, which are halved; None: 0.1 m, or the
-            triangles as they are.
+        step_m: spacing of the grid, or longest edge of a mesh's triangles, which are halved; None: 0.1 m, more for
+            areas above a hectare, or the triangles as they are.
         surface: mesh whose triangles' centres are the positions, in place of the grid.
         receivers: names, or numbers from 0; None: all.
         threshold_dbm: received power above which a position counts as covered; None: -90 dBm, and no coverage for
@@ -147,7 +146,8 @@ def _places(
         return mesh
     height = grid.usual_height(run, known) if height_m is None else height_m
     grid.check_height(run, height, known)
-    return grid.grid_over(*grid.area_of(run, known), STEP_M if step_m is None else step_m, height)
+    area = grid.area_of(run, known)
+    return grid.grid_over(*area, grid.usual_step(*area) if step_m is None else step_m, height)
 
 
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:

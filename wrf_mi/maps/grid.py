@@ -31,6 +31,8 @@ MOUNTED_M = 0.02  # distance from a surface up to which a receiver is taken to l
 HEADINGS = 8
 """Headings over which predictions, or likelihoods, are averaged where none is given, evenly over the circle."""
 
+STEP_M, USUAL_POSITIONS = 0.1, 1_000_000
+"""Default spacing of a map, and number of positions of the rectangle that it does not exceed."""
 CANDIDATE_STEP_M = 0.25  # least distance of neighbouring candidates by default
 USUAL_CANDIDATES, MOST_CANDIDATES = 4000, 10_000
 """Number of candidates of the rectangle that the default step does not exceed, and most candidates: distances between
@@ -85,6 +87,11 @@ def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: fl
         for start, extent, count in zip(low, size, counts, strict=True)
     )
     return Grid(x, y, float(height_m))
+
+
+def usual_step(low_m: FloatArray, high_m: FloatArray) -> float:
+    """Default spacing of a map over a rectangle between two corners: `STEP_M`, more for large areas."""
+    return max(STEP_M, float(np.sqrt(np.prod((high_m - low_m)[:2]) / USUAL_POSITIONS)))
 
 
 def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:

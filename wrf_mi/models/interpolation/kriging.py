@@ -28,7 +28,7 @@ from .kriging_equations import KrigingSystem, component_root, correlation
 
 NEAREST_M = 0.01  # least distance of two antennas in a law: below 1 cm none is a point
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
-LENGTH_M = (0.01, 100.0)
+LENGTH_M = (0.01, 100.0)  # or half of the rows' extent
 HEADING_LENGTH = (0.1, 100.0)
 NOISE = (1e-4, 10.0)
 """Limits of the likelihood's maximum: metres, chords of the unit circle (2 is the opposite heading), shares of the
@@ -226,9 +226,10 @@ class Kriging(CovarianceSettings):
             rows = np.sort(np.random.default_rng(self.seed).permutation(rows)[: self.likelihood_rows])
         positions_m, circle, columns = positions_m[rows], None if circle is None else circle[rows], columns[rows]
         extent = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
+        longest = LENGTH_M[0], max(LENGTH_M[1], extent / 2)
         # Stated value or None, limits, and first value of the search.
         table = [
-            (self.length_m, LENGTH_M, float(np.clip(extent / 10, *LENGTH_M))),
+            (self.length_m, longest, float(np.clip(extent / 10, *longest))),
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
