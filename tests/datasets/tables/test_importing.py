@@ -184,10 +184,9 @@ def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
 
 
 def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
-    anchors = pandas.DataFrame(
-        {"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "azimuth_deg": [90, 0, np.nan]}
-    )
-    anchors = anchors.assign(pattern=["tr38901", "", ""], frequency_hz=[3.56e9, 3.6e9, 3.69e9], mast="a")
+    anchors = pandas.DataFrame({"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "mast": "a"})
+    anchors = anchors.assign(azimuth_deg=[90, 0, np.nan], pattern=["tr38901", "", ""])
+    anchors = anchors.assign(frequency_hz=[3.56e9, 3.6e9, 3.69e9])
     anchors.to_csv(tmp_path / "anchors.csv", index=False)
     record = imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")
     by_name = {receiver.name: receiver for receiver in record.receivers}
@@ -195,7 +194,7 @@ def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_name["anchor7"].to_world, np.eye(3))
     assert (by_name["hall"].antenna.pattern, by_name["kitchen"].antenna.pattern) == ("tr38901", "iso")
     assert [by_name[name].frequency_hz for name in ("hall", "kitchen", "anchor7")] == [3.56e9, 3.6e9, 3.69e9]
-    assert "1 columns that are not used: mast" in (tmp_path / "data" / "import.yml").read_text()
+    assert "columns that are not used (1): mast" in (tmp_path / "data" / "import.yml").read_text()
     anchors.assign(id="hall").to_csv(tmp_path / "anchors.csv", index=False)
     with pytest.raises(InputError, match=r"anchors\.csv: row 2: receiver hall is in an earlier row, too"):
         imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")

@@ -275,13 +275,12 @@ class _Import:
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors)
         receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
-        carriers = [
-            self.carrier_of.get(name, rx.frequency_hz) for name, rx in zip(readings.ids, receivers, strict=True)
-        ]
-        if None in carriers or options.frequency_hz:
+        pairs = list(zip(readings.ids, receivers, strict=True))
+        carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
+        if None in carriers or options.frequency_hz:  # one carrier for all
             carriers = [None] * len(carriers)
-        pairs = zip(receivers, carriers, strict=True)
-        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in pairs), notes
+        stated = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in stated), notes
 
     def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
         averaged = bool((means.count > 1).any())
