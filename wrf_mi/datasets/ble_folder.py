@@ -21,20 +21,8 @@ from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line, write_csv
+from . import folder_files as files
 from .faults import attempt, refuse, stop_at_faults
-from .folder_files import (
-    RUN,
-    CsvTable,
-    carriers_of,
-    data_folder,
-    folder_record,
-    read_csv,
-    refuse_runs,
-    refuse_unstated,
-    runs_of,
-    shown,
-    write_extra,
-)
 from .receivers_file import (
     WHOLE,
     plain_id,
@@ -80,15 +68,20 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
-    folder = data_folder(path, f"{RECEIVERS[0]}, {TRAINING[0]} and {TEST[0]}, or {RECEIVERS[0]} and {MEASUREMENTS[0]}")
-    anchors, *tables = (attempt(read_csv, file) for file in _files(folder))
+    folder = files.data_folder(
+        path, f"{RECEIVERS[0]}, {TRAINING[0]} and {TEST[0]}, or {RECEIVERS[0]} and {MEASUREMENTS[0]}"
+    )
+    anchors, *tables = (attempt(files.read_csv, file) for file in _files(folder))
     ids = attempt(read_ids, anchors, complete=True)
     anchors_m = attempt(read_positions, anchors, "xyz", True)
-    orientations, receivers_hz = attempt(read_orientations, anchors), attempt(_receiver_carriers, anchors, tables)
+    orientations, receivers_hz = (
+        attempt(read_orientations, anchors),
+        attempt(_receiver_carriers, anchors, tables),
+    )
     rx_antennas = attempt(read_antennas, anchors, "", orientations)
     tx_antenna = attempt(read_transmitter, anchors)
     plane = [attempt(read_positions, table, "xy") for table in tables]
-    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, RUN)}
+    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, files.RUN)}
     split = attempt(_read_split, tables)
     strengths = [attempt(_signal_strength, table, ids, anchors) for table in tables]
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
@@ -100,7 +93,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         height = np.full(len(plane_m), TAG_HEIGHT_M)
     upright = np.array(UPRIGHT)
     columns = ids.value, anchors_m.value, orientations.value, rx_antennas.value
-    record = folder_record(
+    record = files.folder_record(
         folder,
         name,
         "rssi",
@@ -115,7 +108,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         tx_antenna=tx_antenna,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=noise[STD],
-        runs=stated[RUN],
+        runs=stated[files.RUN],
         **split.value,
     )
     if receivers_hz.value is not None:
@@ -137,7 +130,7 @@ def _files(folder: Path) -> list[Path]:
     return [folder / (present[names] or [names[historic]])[0] for names in (RECEIVERS, *rows)]
 
 
-def _read_split(tables: list[CsvTable]) -> dict[str, Any]:
+def _read_split(tables: list[files.CsvTable]) -> dict[str, Any]:
     """The attributes ``official`` or ``folds`` of the record."""
     if len(tables) > 1:
         n_train, n_test = (len(table.rows) for table in tables)
@@ -151,7 +144,7 @@ def _read_split(tables: list[CsvTable]) -> dict[str, Any]:
     if all(map(WHOLE.fullmatch, words)):
         return {"folds": np.unique(words.astype(float), return_inverse=True)[1].reshape(-1).astype(np.int64)}
     for row in np.flatnonzero(~np.isin(words, PARTS)):
-        text = f"{SPLIT} is {shown(texts[row])}; give train or test, or in all rows a fold's number"
+        text = f"{SPLIT} is {files.shown(texts[row])}; give train or test, or in all rows a fold's number"
         refuse(DataFault(table.path, text, row=int(row) + 1))
     official = np.flatnonzero(words == PARTS[0]), np.flatnonzero(words == PARTS[1])
     if not (len(official[0]) and len(official[1])):
@@ -180,11 +173,11 @@ def write_ble_folder(
         columns = receiver_columns(record, ids)
         write_csv(part / RECEIVERS[0], columns, zip(*columns.values(), strict=True))
         of_rows = {**_columns(record, ids), **(further or {})}
-        files = (MEASUREMENTS,) if record.official is None else (TRAINING, TEST)
+        file_names = (MEASUREMENTS,) if record.official is None else (TRAINING, TEST)
         parts = (np.arange(len(record)),) if record.official is None else record.official
-        for names, rows in zip(files, parts, strict=True):
+        for names, rows in zip(file_names, parts, strict=True):
             write_csv(part / names[0], of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
-        write_extra(part, extra)
+        files.write_extra(part, extra)
     return Path(path)
 
 
@@ -194,7 +187,7 @@ def _columns(record: Record, ids: list[str]) -> dict[str, NDArray[Any]]:
     if hz is not None and hz[0] != CARRIER_HZ and record.receiver_carriers_hz is None:
         carriers_hz = np.full(len(record), hz[0])
     columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
-    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, RUN: record.runs, SPLIT: record.folds}
+    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, files.RUN: record.runs, SPLIT: record.folds}
     counts = None if record.n_readings is None else record.n_readings.astype(object)
     if counts is not None:
         counts[counts == 0] = None  # an empty field where nothing was received, as of strength and noise
@@ -209,14 +202,14 @@ def _writable(path: str | Path, record: Record) -> list[str]:
     text, rows = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}", np.arange(len(record))
     if record.task != "rssi":
         raise InputError(f"{text}: it needs signal strengths")
-    refuse_unstated(path, record, "truth", "uplink")
+    files.refuse_unstated(path, record, "truth", "uplink")
     if record.official is not None:
-        refuse_unstated(path, record, "folds")
+        files.refuse_unstated(path, record, "folds")
         if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
             raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
     if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
-    refuse_runs(path, record)
+    files.refuse_runs(path, record)
     numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
     if not all(np.isfinite(values).all() for values in numbers) or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
@@ -229,12 +222,12 @@ def _writable(path: str | Path, record: Record) -> list[str]:
         if not wrong and receiver_name(plain_id(anchor)) != rx.name:
             wrong = "would be read as another"
         if wrong:
-            raise InputError(f"{text}: the name of receiver {shown(rx.name)} {wrong}; rename it")
+            raise InputError(f"{text}: the name of receiver {files.shown(rx.name)} {wrong}; rename it")
         ids.append(anchor)
     return ids
 
 
-def _receiver_carriers(anchors: CsvTable, tables: list[CsvTable]) -> FloatArray | None:
+def _receiver_carriers(anchors: files.CsvTable, tables: list[files.CsvTable]) -> FloatArray | None:
     """Carrier of each receiver [n_rx], Hz; None without the column."""
     if FREQUENCY not in anchors.header:
         return None
@@ -242,24 +235,24 @@ def _receiver_carriers(anchors: CsvTable, tables: list[CsvTable]) -> FloatArray 
         if FREQUENCY in table.header:
             text = f"{FREQUENCY} is a column of {anchors.path.name}, too; remove one of them"
             raise DataFault(table.path, text, line=1)
-    return carriers_of(anchors.path, anchors.numbers(FREQUENCY))
+    return files.carriers_of(anchors.path, anchors.numbers(FREQUENCY))
 
 
-def _in_both(column: str, tables: list[CsvTable]) -> Any:
+def _in_both(column: str, tables: list[files.CsvTable]) -> Any:
     """An optional column of all tables, which all or none must have, concatenated; None where no table has it."""
     having = [table for table in tables if column in table.header]
     for table in tables:
         if having and table not in having:
             text = f"no column {column}, but {having[0].path.name} has one; give it in both files or in neither"
             refuse(DataFault(table.path, text, line=1))
-    columns: list[Any] = [runs_of(table) if column == RUN else table.numbers(column) for table in having]
+    columns: list[Any] = [files.runs_of(table) if column == files.RUN else table.numbers(column) for table in having]
     if column == FREQUENCY:
         for table, values in zip(having, columns, strict=True):
-            carriers_of(table.path, values)
+            files.carriers_of(table.path, values)
     return np.concatenate(columns) if columns else None
 
 
-def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
+def _by_anchor(prefix: str, table: files.CsvTable) -> dict[str, str]:
     """Columns of a table that begin with a prefix, by the anchor that they name."""
     columns: dict[str, str] = {}
     for column in table.header:
@@ -272,7 +265,7 @@ def _by_anchor(prefix: str, table: CsvTable) -> dict[str, str]:
 
 
 def _of_anchors(
-    prefix: str, tables: list[CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
+    prefix: str, tables: list[files.CsvTable], ids: list[str], strengths: list[NDArray[np.float32]]
 ) -> FloatArray | None:
     """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
     columns_by_anchor = [_by_anchor(prefix, table) for table in tables]
@@ -291,7 +284,7 @@ def _of_anchors(
 
 
 def _noise(
-    prefix: str, table: CsvTable, columns: dict[str, str], ids: list[str], strength: NDArray[np.float32]
+    prefix: str, table: files.CsvTable, columns: dict[str, str], ids: list[str], strength: NDArray[np.float32]
 ) -> FloatArray:
     """Numbers of readings or standard deviations [anchors, rows] of one table."""
     counts = prefix == COUNT
@@ -301,7 +294,7 @@ def _noise(
     good = values > 0 if not counts else (values > 0) & (values == np.floor(values)) & (values <= MOST_READINGS)
     read = ~(np.isinf(values) | np.isinf(strength))  # the others are refused already
     for row, anchor in np.argwhere((np.where(np.isnan(strength), ~np.isnan(values), ~good) & read).T):
-        what = f"{columns[ids[anchor]]} is {shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
+        what = f"{columns[ids[anchor]]} is {files.shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
         if np.isnan(strength[anchor, row]):
             remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
         else:
@@ -311,7 +304,7 @@ def _noise(
     return values
 
 
-def _signal_strength(table: CsvTable, ids: list[str], anchors: CsvTable) -> NDArray[np.float32]:
+def _signal_strength(table: files.CsvTable, ids: list[str], anchors: files.CsvTable) -> NDArray[np.float32]:
     columns = _by_anchor(RSSI, table)
     unknown = sorted(column for anchor, column in columns.items() if anchor not in ids)
     lacking = [anchor for anchor in ids if anchor not in columns]

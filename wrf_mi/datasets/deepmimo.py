@@ -34,7 +34,6 @@ from ..core.antenna import ANTENNA, DEVICE_TO_ARRAY
 from ..core.array_files import stored_array, stored_arrays
 from ..core.files import readable, text_lines
 from ..core.settings import CheckedSettings, Positive, settings_from
-from ..core.types import IntArray
 from ..core.yaml_files import read_yaml
 from ..parallel import run_module
 from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
@@ -194,6 +193,10 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     if len(received) < 2:
         text = f"{len(received)} of {len(users)} users have a path to the base stations {numbers}"
         raise InputError(f"{folder}: {text}; two at least are needed, to train on and to score")
+    official = read_official(folder, len(users), first=0, source=folder.name)
+    if official is None:
+        order, n_test = np.random.default_rng(SPLIT_SEED).permutation(received), round(TEST_FRACTION * len(received))
+        official = np.sort(order[max(1, n_test) :]), np.sort(order[: max(1, n_test)])
     array_m = (chosen.elements @ DEVICE_TO_ARRAY.T) * (speed_of_light / scenario.carrier_hz)
     several = len(array_m) > 1
     receivers = (
@@ -206,17 +209,11 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
         tx_pos_m=users,
         receivers=tuple(receivers),
         observation=observation if several else observation[:, :, 0],
-        official=read_official(folder, len(users), first=0, source=folder.name) or _draw_split(received),
+        official=official,
         frequencies_hz=scenario.carrier_hz + chosen.offsets_hz,
         tx_antenna=ue_antenna,
         source=str(folder),
     )
-
-
-def _draw_split(rows: IntArray) -> tuple[IntArray, IntArray]:
-    order = np.random.default_rng(SPLIT_SEED).permutation(rows)
-    n_test = max(1, round(TEST_FRACTION * len(rows)))
-    return np.sort(order[n_test:]), np.sort(order[:n_test])
 
 
 def _read_scenario(folder: Path) -> _Scenario:
@@ -272,14 +269,11 @@ def _number(file: Path, entry: Mapping[Any, Any], key: str) -> int:
 def _choose(scenario: _Scenario, chosen: _ChannelParams) -> list[int]:
     """Numbers of the chosen base stations."""
     count, file = len(scenario.stations), scenario.folder / CHANNEL_PARAMS
-    every = list(range(count))
-    if chosen.base_stations is None:
-        if count > 1:
-            text = f"{scenario.folder}: {count} base stations, 0 to {count - 1}"
-            raise InputError(f"{text}; choose in {CHANNEL_PARAMS}, base_stations: [0] or base_stations: all")
-        return every
-    if isinstance(chosen.base_stations, str):
-        return every
+    if chosen.base_stations is None and count > 1:
+        text = f"{scenario.folder}: {count} base stations, 0 to {count - 1}"
+        raise InputError(f"{text}; choose in {CHANNEL_PARAMS}, base_stations: [0] or base_stations: all")
+    if chosen.base_stations is None or isinstance(chosen.base_stations, str):
+        return list(range(count))
     if beyond := [number for number in chosen.base_stations if number >= count]:
         raise InputError(f"{file}: base station {beyond[0]} is out of range; the scenario has 0 to {count - 1}")
     return list(chosen.base_stations)
@@ -370,7 +364,11 @@ def _channels(
         exist = ~np.isnan(paths["power"][rows])
         # Matrices are padded with NaN to the most paths of a user; as zeros these places add nothing to the sums.
         power, phase, delay, *angles = (np.where(exist, paths[k][rows], 0.0).astype(float) for k in PATH_MATRICES)
-        _check_delays(scenario, pair, delay, chosen)
+        symbol_s = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
+        if delay.max(initial=0.0) >= symbol_s:  # the package would leave such a path out
+            text = f"{pair} has a delay of {delay.max():.3g} s, and a symbol of subcarriers / bandwidth lasts"
+            remedy = f"give more subcarriers in {CHANNEL_PARAMS}"
+            raise InputError(f"{scenario.folder}: {text} {symbol_s:.3g} s; {remedy}")
         departure, arrival = (
             unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
             for azimuth, zenith in (angles[:2], angles[2:])
@@ -390,13 +388,3 @@ def _channels(
             raise InputError(f"{scenario.folder}: {text}; correct or remove the path")
         channel[rows][~exist.any(axis=1)] = np.nan
     return channel
-
-
-def _check_delays(scenario: _Scenario, pair: str, delay: FloatArray, chosen: _ChannelParams) -> None:
-    symbol = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
-    if delay.size and delay.max() >= symbol:
-        # The package would leave such a path out.
-        text = (
-            f"{pair} has a delay of {delay.max():.3g} s, and a symbol of subcarriers / bandwidth lasts {symbol:.3g} s"
-        )
-        raise InputError(f"{scenario.folder}: {text}; give more subcarriers in {CHANNEL_PARAMS}")

@@ -18,17 +18,8 @@ from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.yaml_files import read_yaml
+from . import folder_files as files
 from .faults import attempt, recoverable, refuse
-from .folder_files import (
-    POSITIONS,
-    CsvTable,
-    data_folder,
-    finite_numbers,
-    folder_record,
-    read_csv,
-    read_official,
-    shown,
-)
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
 NOT_RECEIVED_DBM = -100.0
@@ -50,19 +41,19 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
         InputError: anything missing, unreadable or inconsistent, or a single transmission; one line with the file and
             the row.
     """
-    folder = data_folder(path, f"{GATEWAYS}, {POSITIONS} and {POWERS}")
+    folder = files.data_folder(path, f"{GATEWAYS}, {files.POSITIONS} and {POWERS}")
     info = attempt(read_yaml, folder / GATEWAYS)
     receivers = attempt(_read_gateways, folder / GATEWAYS, info)
-    table = attempt(_headed, folder / POSITIONS)
+    table = attempt(_headed, folder / files.POSITIONS)
     positions = attempt(_read_positions, table)
     power = attempt(_read_powers, folder / POWERS, info)
     rows = attempt(_count_rows, table)
     with recoverable():
         if power.value.shape[1] != rows.value:
-            text = f"{power.value.shape[1]} rows, but {POSITIONS} has {rows.value}"
+            text = f"{power.value.shape[1]} rows, but {files.POSITIONS} has {rows.value}"
             raise DataFault(folder / POWERS, f"{text}; give one row of each per transmission")
-    official = attempt(read_official, folder, rows, 0)
-    return folder_record(
+    official = attempt(files.read_official, folder, rows, 0)
+    return files.folder_record(
         folder,
         name,
         "rssi",
@@ -79,13 +70,13 @@ def _read_gateways(path: Path, info: dict[Any, Any]) -> tuple[Receiver, ...]:
         raise DataFault(path, "no gateway in it; give one line NAME: [x, y, z] for each, metres")
     for key in info:
         if not str(key).isprintable():
-            text = f"gateway {shown(key)} does not go into one line; call it gateway1, gateway2, ..."
+            text = f"gateway {files.shown(key)} does not go into one line; call it gateway1, gateway2, ..."
             refuse(DataFault(path, text))
-    places = {str(key): attempt(finite_numbers, path, f"{key}: position", at, 3) for key, at in info.items()}
+    places = {str(key): attempt(files.finite_numbers, path, f"{key}: position", at, 3) for key, at in info.items()}
     return tuple(Receiver(key, place.value, np.array(UPRIGHT)) for key, place in places.items())
 
 
-def _read_positions(table: CsvTable) -> FloatArray:
+def _read_positions(table: files.CsvTable) -> FloatArray:
     if len(table.header) != 3:
         text = f"header {','.join(table.header)[:40]!r} has {len(table.header)} columns; give x,y,z in metres"
         raise DataFault(table.path, text, line=1)
@@ -94,7 +85,7 @@ def _read_positions(table: CsvTable) -> FloatArray:
     return np.stack([table.numbers(table.header[axis], index=axis) for axis in axes], axis=-1)
 
 
-def _count_rows(table: CsvTable) -> int:
+def _count_rows(table: files.CsvTable) -> int:
     rows = len(table.rows)
     if rows < FEWEST:
         refuse(DataFault(table.path, f"{rows} row; give {FEWEST} at least, to train on and to score"))
@@ -123,9 +114,9 @@ def _read_powers(path: Path, info: dict[Any, Any]) -> NDArray[np.float32]:
     return power.astype(np.float32)
 
 
-def _headed(path: Path) -> CsvTable:
+def _headed(path: Path) -> files.CsvTable:
     """A table with a header: NeRF2's loader reads any first line as the header, so a row there is refused."""
-    table = read_csv(path, skip_blank=True)
+    table = files.read_csv(path, skip_blank=True)
     try:
         [float(column) for column in table.header]
     except ValueError:
@@ -136,6 +127,6 @@ def _headed(path: Path) -> CsvTable:
     raise DataFault(path, text, line=1)
 
 
-def _numbered(table: CsvTable) -> bool:
+def _numbered(table: files.CsvTable) -> bool:
     """Whether the header is 0, 1, ..., as pandas writes it for columns without names."""
     return table.header == [str(place) for place in range(len(table.header))]

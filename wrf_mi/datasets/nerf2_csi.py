@@ -22,27 +22,8 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_array
 from ..core.files import atomic_folder, readable
 from ..core.yaml_files import read_yaml
+from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
-from .folder_files import (
-    AXES,
-    POSITIONS,
-    Positions,
-    antenna_entry,
-    data_folder,
-    fits_single,
-    folder_record,
-    numbers_of,
-    read_antenna,
-    read_columns,
-    read_official,
-    read_tx_antenna,
-    refuse_unstated,
-    shown,
-    unit_quaternion,
-    write_extra,
-    write_official,
-    write_positions,
-)
 
 CHANNELS, STATION, TRUTH = "csidata.npy", "base-station.yml", "downlink_truth.npy"
 FEWEST = 2
@@ -63,7 +44,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the sample.
     """
-    folder = data_folder(path, f"{CHANNELS} and {STATION}")
+    folder = files.data_folder(path, f"{CHANNELS} and {STATION}")
     station = folder / STATION
     channel = attempt(_read_channels, folder / CHANNELS)
     n = attempt(_count_samples, folder / CHANNELS, channel)
@@ -75,17 +56,21 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
             text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
             raise DataFault(station, f"{text}; give one for each")
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
-    stated = attempt(read_columns, folder / POSITIONS, AXES) if (folder / POSITIONS).exists() else None
+    stated = (
+        attempt(files.read_columns, folder / files.POSITIONS, files.AXES)
+        if (folder / files.POSITIONS).exists()
+        else None
+    )
     with recoverable():
         if stated is not None and len(stated.value) != n.value:
             text = f"{len(stated.value)} rows, but {CHANNELS} has {n.value} samples; give one for each"
-            raise DataFault(folder / POSITIONS, text)
+            raise DataFault(folder / files.POSITIONS, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
-    official = attempt(read_official, folder, n, 0, CHANNELS)
-    tx_antenna = attempt(read_tx_antenna, station, info)
+    official = attempt(files.read_official, folder, n, 0, CHANNELS)
+    tx_antenna = attempt(files.read_tx_antenna, station, info)
     stop_at_faults()
     half, hz = channel.value.shape[2] // 2, frequencies.value
-    return folder_record(
+    return files.folder_record(
         folder,
         name,
         "csi",
@@ -116,7 +101,7 @@ def write_nerf2_csi(
     if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
         need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
         raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
-    refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz", "runs")
+    files.refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz", "runs")
     receiver = record.receivers[0]
     info: dict[str, Any] = {
         "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),
@@ -124,18 +109,18 @@ def write_nerf2_csi(
     }
     if record.uplink_hz is not None and record.frequencies_hz is not None:
         info["frequencies_hz"] = [*record.uplink_hz.tolist(), *record.frequencies_hz.tolist()]
-    antennas = {"antenna": antenna_entry(receiver.antenna), "tx_antenna": antenna_entry(record.tx_antenna)}
+    antennas = {"antenna": files.antenna_entry(receiver.antenna), "tx_antenna": files.antenna_entry(record.tx_antenna)}
     info |= {key: value for key, value in antennas.items() if value}
     with atomic_folder(Path(path), replace) as part:
         np.save(part / CHANNELS, np.concatenate([up, down[0]], axis=-1).astype(np.complex64))
         text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
-            write_positions(part / POSITIONS, Positions(record.tx_pos_m))
+            files.write_positions(part / files.POSITIONS, files.Positions(record.tx_pos_m))
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
-        write_official(part, record.official, first=0)
-        write_extra(part, extra)
+        files.write_official(part, record.official, first=0)
+        files.write_extra(part, extra)
     return Path(path)
 
 
@@ -179,9 +164,13 @@ def _frequencies(
     stated = info.get("frequencies_hz") if of_call is None else of_call
     if stated is None:
         return None
-    frequencies, subcarriers = numbers_of(stated), channel.shape[2]
-    if frequencies.ndim != 1 or not len(frequencies) or not (fits_single(frequencies) and (frequencies > 0).all()):
-        raise DataFault(path, f"frequencies_hz is {shown(stated)}; give a list of frequencies in Hz")
+    frequencies, subcarriers = files.numbers_of(stated), channel.shape[2]
+    if (
+        frequencies.ndim != 1
+        or not len(frequencies)
+        or not (files.fits_single(frequencies) and (frequencies > 0).all())
+    ):
+        raise DataFault(path, f"frequencies_hz is {files.shown(stated)}; give a list of frequencies in Hz")
     if len(frequencies) != subcarriers:
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
         raise DataFault(path, f"{text}; give one for each, the uplink's first")
@@ -201,10 +190,10 @@ def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.comple
 
 def _read_station(path: Path, info: dict[Any, Any]) -> Receiver:
     places = info.get("base_station")
-    elements = numbers_of(places)
-    orientation = attempt(unit_quaternion, path, "base_station", info.get("orientation", list(UPRIGHT)))
-    antenna = attempt(read_antenna, path, "antenna", info.get("antenna"))
-    if elements.ndim != 2 or elements.shape[1] != 3 or not fits_single(elements):
-        raise DataFault(path, f"base_station is {shown(places)}; give x, y, z in metres of each antenna")
+    elements = files.numbers_of(places)
+    orientation = attempt(files.unit_quaternion, path, "base_station", info.get("orientation", list(UPRIGHT)))
+    antenna = attempt(files.read_antenna, path, "antenna", info.get("antenna"))
+    if elements.ndim != 2 or elements.shape[1] != 3 or not files.fits_single(elements):
+        raise DataFault(path, f"base_station is {files.shown(places)}; give x, y, z in metres of each antenna")
     receiver = Receiver("base-station", elements.mean(axis=0), orientation.value, antenna.value)
     return dataclasses.replace(receiver, array_m=(elements - receiver.position_m) @ receiver.to_world)

@@ -24,34 +24,13 @@ from ..core.memory import require_memory
 from ..core.pictures import PICTURE_ERRORS, open_picture
 from ..core.types import IntArray
 from ..core.yaml_files import read_yaml
+from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
-from .folder_files import (
-    POSITIONS,
-    TX_ANTENNA,
-    Positions,
-    antenna_entry,
-    data_folder,
-    finite_numbers,
-    folder_record,
-    read_antenna,
-    read_official,
-    read_positions,
-    read_tx_antenna,
-    refuse_runs,
-    refuse_unstated,
-    shown,
-    unit_quaternion,
-    whole_number,
-    write_extra,
-    write_lines,
-    write_official,
-    write_positions,
-)
 
 CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
 """Keys under which a file may state carriers."""
 GATEWAYS, FOLDS, IMAGES = "gateway_info.yml", "blocked_folds.txt", "spectrum"
-RESERVED = ("array", TX_ANTENNA)
+RESERVED = ("array", files.TX_ANTENNA)
 """Mappings of the file that are no receivers; receivers cannot have these names."""
 MOST_PIXELS = 1 << 22
 """Most pixels of a spectrum: 2,048 elevations and as many azimuths."""
@@ -73,25 +52,25 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
     """
-    folder = data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
+    folder = files.data_folder(path, f"{GATEWAYS}, tx_pos.csv and spectrum/")
     gateways = folder / GATEWAYS
     info = attempt(read_yaml, gateways)
     poses = attempt(_poses, gateways, info, complete=True)
     array = attempt(_array, gateways, info, "array")
     receivers = attempt(_receivers, gateways, poses, array)
-    table = attempt(read_positions, folder / POSITIONS)
+    table = attempt(files.read_positions, folder / files.POSITIONS)
     stated = attempt(_frequency, gateways, info)
     with recoverable():
         if stated.value is not None and table.value.carriers_hz is not None:
             text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
-            raise DataFault(folder / POSITIONS, text, line=1)
+            raise DataFault(folder / files.POSITIONS, text, line=1)
     rows = attempt(lambda read: len(read.positions_m), table)
     observation = attempt(_read_images, folder / IMAGES, poses, rows)
-    official = attempt(read_official, folder, rows, 1)
+    official = attempt(files.read_official, folder, rows, 1)
     folds = attempt(parse_folds, folder / FOLDS, rows) if (folder / FOLDS).exists() else None
-    tx_antenna = attempt(read_tx_antenna, gateways, info)
+    tx_antenna = attempt(files.read_tx_antenna, gateways, info)
     stop_at_faults()
-    record = folder_record(
+    record = files.folder_record(
         folder,
         name,
         "spectrum",
@@ -136,11 +115,11 @@ def write_spectrum_folder(
                 Image.fromarray(image).save(images / f"{row:05d}.png")
         info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        write_positions(part / POSITIONS, Positions(record.tx_pos_m, record.carriers_hz, record.runs))
-        write_official(part, record.official, first=1, digits=5)
+        files.write_positions(part / files.POSITIONS, files.Positions(record.tx_pos_m, record.carriers_hz, record.runs))
+        files.write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
-            write_lines(part / FOLDS, [str(fold) for fold in record.folds])
-        write_extra(part, extra)
+            files.write_lines(part / FOLDS, [str(fold) for fold in record.folds])
+        files.write_extra(part, extra)
     return Path(path)
 
 
@@ -156,8 +135,8 @@ def _check_writable(path: str | Path, record: Record) -> None:
     if record.frequencies_hz is not None and len(record.frequencies_hz) != 1:
         text = f"{record.name} has {len(record.frequencies_hz)} carriers for all rows, and {GATEWAYS} states one"
         raise InputError(f"{path}: {text}; give that of each row in Record.carriers_hz")
-    refuse_runs(path, record)
-    refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
+    files.refuse_runs(path, record)
+    files.refuse_unstated(path, record, "truth", "tx_heading_rad", "uplink", "n_readings", "std")
 
 
 def _gateway_info(record: Record) -> dict[str, Any]:
@@ -165,12 +144,12 @@ def _gateway_info(record: Record) -> dict[str, Any]:
     content: dict[str, Any] = {"dataset_name": record.name}
     for rx in record.receivers:
         content[rx.name] = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
-        if antenna := antenna_entry(rx.antenna):
+        if antenna := files.antenna_entry(rx.antenna):
             content[rx.name]["antenna"] = antenna
         if rx.array_m is not None:
             content[rx.name]["array"] = {"elements_m": rx.array_m.tolist()}
-    if antenna := antenna_entry(record.tx_antenna):
-        content[TX_ANTENNA] = antenna
+    if antenna := files.antenna_entry(record.tx_antenna):
+        content[files.TX_ANTENNA] = antenna
     if record.frequencies_hz is not None:
         content["frequency_hz"] = float(record.frequencies_hz[0])
     return content
@@ -186,7 +165,7 @@ def parse_folds(path: Path, rows: int) -> IntArray:
     folds = np.full(len(lines), -1)
     for line, text in enumerate(lines, start=1):
         with recoverable():
-            folds[line - 1] = whole_number(path, line, text)
+            folds[line - 1] = files.whole_number(path, line, text)
     if len(folds) != rows:
         refuse(DataFault(path, f"{len(folds)} folds for {rows} rows; give one line per row of tx_pos.csv"))
     present = np.unique(folds[folds >= 0])
@@ -213,13 +192,13 @@ def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
             if 0 < frequency_hz < np.inf:
                 carriers[frequency_hz] = where
             else:
-                text = f"{one_line(where)} is {shown(value)}; give the carrier in Hz, such as 920e6"
+                text = f"{one_line(where)} is {files.shown(value)}; give the carrier in Hz, such as 920e6"
                 refuse(DataFault(path, text))
                 break
     if len(carriers) > 1:
         (a, first), (b, second) = list(carriers.items())[:2]
         text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
-        remedy = f"give those of rows in {POSITIONS}, column frequency_hz, or make a folder for each"
+        remedy = f"give those of rows in {files.POSITIONS}, column frequency_hz, or make a folder for each"
         raise DataFault(path, f"{text}; {remedy}")
     return np.array(list(carriers)) if carriers else None
 
@@ -243,7 +222,7 @@ def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
         elements = np.empty(0)
     if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
-        text = f"{one_line(name)} is {shown(array if isinstance(array, dict) else str(array))}"
+        text = f"{one_line(name)} is {files.shown(array if isinstance(array, dict) else str(array))}"
         raise DataFault(path, f"{text}; {remedy}")
     return elements
 
@@ -263,9 +242,9 @@ def _receivers(path: Path, poses: dict[str, dict[Any, Any]], array_m: FloatArray
     """Receivers of the entries; ``array_m`` is the array of those that state none."""
     receivers = []
     for name, pose in poses.items():
-        position = attempt(finite_numbers, path, f"{name}: position", pose.get("position"), 3)
-        orientation = attempt(unit_quaternion, path, name, pose.get("orientation"))
-        antenna = attempt(read_antenna, path, f"{name}: antenna", pose.get("antenna"))
+        position = attempt(files.finite_numbers, path, f"{name}: position", pose.get("position"), 3)
+        orientation = attempt(files.unit_quaternion, path, name, pose.get("orientation"))
+        antenna = attempt(files.read_antenna, path, f"{name}: antenna", pose.get("antenna"))
         array = attempt(_array, path, pose, f"{name}: array")
         with recoverable():
             elements_m = array.value if "array" in pose else array_m
@@ -283,7 +262,7 @@ def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> N
             refuse(DataFault(place, text))
             continue
         present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
-        count = f"{len(present)} images for {rows} rows of {POSITIONS}"
+        count = f"{len(present)} images for {rows} rows of {files.POSITIONS}"
         for row, image in enumerate(names, start=1):
             if image not in present:
                 text = f"missing ({count}); add the image or remove the row"

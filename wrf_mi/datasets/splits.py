@@ -44,7 +44,7 @@ def make_splits(
     """Split a record's rows by one of nine rules.
 
     - ``official``: the split of the data.
-    - ``random``: seeded, 80 % train and 20 % test.
+    - ``random``: seeded, 80 % train and 20 % test; ``trajectory``: the same in the order of the file.
     - ``blocked``: a split per spatial fold, which is its test set; the folds are ``record.folds`` or else five k-means
       clusters of the positions.
     - ``frequency``: a split per carrier, whose rows at held-out positions are its test set; rows of the other carriers
@@ -54,9 +54,7 @@ def make_splits(
       what these receive in the test rows; the other receivers' training rows train. Rows are those of the official
       split, or else of the random one. ``receiver+20``: 20 training rows of each held-out receiver train, too, a seeded
       draw, nested for equal seeds.
-    - ``other-run``: a split per run of the measurement, in the order of first appearance, whose test set are its rows;
-      the rows of all other runs train.
-    - ``trajectory``: the first 80 % of the rows in file order train, the last 20 % test.
+    - ``other-run``: a split per run of the measurement, its test set, in the order of first appearance.
     - ``none``: the spatial folds of ``blocked``, and last all rows, which train, with none to test. Where positions are
       not known or fewer than five are distinct, folds are a seeded draw.
 
@@ -286,9 +284,8 @@ def _run_numbers(record: Record) -> IntArray:
     if len(first) < 2:
         what = "state none" if record.runs is None else "have one"
         remedy = "give a column run (docs/data.md) with two at least, or choose another split"
-        raise InputError(
-            f"{record.name}: split other-run holds out runs of the measurement, and these data {what}; {remedy}"
-        )
+        text = f"split other-run holds out runs of the measurement, and these data {what}"
+        raise InputError(f"{record.name}: {text}; {remedy}")
     return np.argsort(np.argsort(first))[number.reshape(-1)].astype(np.int64)
 
 
