@@ -172,6 +172,14 @@ def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
         import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "3"})
 
 
+def test_headings_that_are_incomplete_are_kept_and_not_used(tmp_path: Path) -> None:
+    record = imported(tmp_path, wide().assign(heading=[np.nan] + [0.5] * 29, run=["a"] * 29 + [None]))
+    assert (record.tx_heading_rad, record.runs) == (None, None)
+    assert "heading is empty in 1 rows: kept" in (tmp_path / "data" / "import.yml").read_text()
+    header = (tmp_path / "data" / "measurements.csv").read_text().splitlines()[0].split(",")
+    assert {"source_heading", "source_run"} <= set(header)
+
+
 def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     mhz = {"kitchen": 2412, "hall": 5180, "7": 2412}
     record = imported(tmp_path, long().assign(frequency=long().bssid.map(mhz)))
