@@ -116,7 +116,7 @@ def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
         values, positions = values.assign(point=range(30)), positions.assign(point=range(30))[::-1]
     if match == "time":
         values = values.assign(time=np.arange(30) + 0.5)  # the last row is after all positions
-        positions = positions.assign(time=np.arange(30))
+        positions = positions.assign(time=np.arange(30))[::-1]
     positions.to_csv(tmp_path / "positions.csv", index=False, header=header)
     values.to_csv(tmp_path / "values.csv", index=False, header=header)
     import_measurements(tmp_path / "values.csv", tmp_path / "data", positions=[tmp_path / "positions.csv"])
