@@ -111,8 +111,8 @@ def import_command(a: Arguments) -> int:
     from ..checking import check_data
     from ..datasets import ImportOptions, import_measurements
 
-    given = {attribute.name: getattr(a, attribute.name) for attribute in fields(ImportOptions)}
-    options = {name: value for name, value in given.items() if value is not None}
+    arguments = {attribute.name: getattr(a, attribute.name) for attribute in fields(ImportOptions)}
+    options = {name: value for name, value in arguments.items() if value is not None}
     if "not_heard" in options:
         options["not_heard"] = _not_heard(options["not_heard"])
     if "where" in options:

@@ -116,7 +116,7 @@ def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
         values, positions = values.assign(point=range(30)), positions.assign(point=range(30))[::-1]
     if match == "time":
         values = values.assign(time=np.arange(30) + 0.5)  # the last row is after all positions
-        positions = positions.assign(time=np.arange(30))
+        positions = positions.assign(time=np.arange(30))[::-1]
     positions.to_csv(tmp_path / "positions.csv", index=False, header=header)
     values.to_csv(tmp_path / "values.csv", index=False, header=header)
     import_measurements(tmp_path / "values.csv", tmp_path / "data", positions=[tmp_path / "positions.csv"])
@@ -172,6 +172,14 @@ def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
         import_measurements(tmp_path / "table.csv", tmp_path / "other", where={"device": "3"})
 
 
+def test_headings_that_are_incomplete_are_kept_and_not_used(tmp_path: Path) -> None:
+    record = imported(tmp_path, wide().assign(heading=[np.nan] + [0.5] * 29, run=["a"] * 29 + [None]))
+    assert (record.tx_heading_rad, record.runs) == (None, None)
+    assert "heading is empty in 1 rows: kept" in (tmp_path / "data" / "import.yml").read_text()
+    header = (tmp_path / "data" / "measurements.csv").read_text().splitlines()[0].split(",")
+    assert {"source_heading", "source_run"} <= set(header)
+
+
 def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     mhz = {"kitchen": 2412, "hall": 5180, "7": 2412}
     record = imported(tmp_path, long().assign(frequency=long().bssid.map(mhz)))
@@ -184,10 +192,9 @@ def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
 
 
 def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
-    anchors = pandas.DataFrame(
-        {"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "azimuth_deg": [90, 0, np.nan]}
-    )
-    anchors = anchors.assign(pattern=["tr38901", "", ""], frequency_hz=[3.56e9, 3.6e9, 3.69e9], mast="a")
+    anchors = pandas.DataFrame({"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "mast": "a"})
+    anchors = anchors.assign(azimuth_deg=[90, 0, np.nan], pattern=["tr38901", "", ""])
+    anchors = anchors.assign(frequency_hz=[3.56e9, 3.6e9, 3.69e9])
     anchors.to_csv(tmp_path / "anchors.csv", index=False)
     record = imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")
     by_name = {receiver.name: receiver for receiver in record.receivers}
@@ -195,7 +202,7 @@ def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_name["anchor7"].to_world, np.eye(3))
     assert (by_name["hall"].antenna.pattern, by_name["kitchen"].antenna.pattern) == ("tr38901", "iso")
     assert [by_name[name].frequency_hz for name in ("hall", "kitchen", "anchor7")] == [3.56e9, 3.6e9, 3.69e9]
-    assert "1 columns that are not used: mast" in (tmp_path / "data" / "import.yml").read_text()
+    assert "columns that are not used (1): mast" in (tmp_path / "data" / "import.yml").read_text()
     anchors.assign(id="hall").to_csv(tmp_path / "anchors.csv", index=False)
     with pytest.raises(InputError, match=r"anchors\.csv: row 2: receiver hall is in an earlier row, too"):
         imported(tmp_path, wide(), anchors=tmp_path / "anchors.csv")

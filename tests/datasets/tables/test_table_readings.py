@@ -79,6 +79,16 @@ def test_clipped_strengths_are_kept_and_named() -> None:
     assert len(without_not_heard(readings(dbm), [-87.0])[0].dbm) == np.count_nonzero(dbm > -87)
 
 
+def test_strengths_of_one_receiver_that_pile_up_at_a_customary_number_are_kept() -> None:
+    rng = np.random.default_rng(6)
+    weak = np.concatenate([np.full(50, -100.0), np.repeat(np.arange(-99.0, -89), 9)])
+    dbm = np.concatenate([weak, np.round(rng.normal(-70, 5, 3000))])
+    both = Readings(("weak", "strong"), np.arange(len(dbm)), np.repeat([0, 1], [len(weak), 3000]), dbm)
+    alone = Readings(("weak",), np.arange(len(weak)), np.zeros(len(weak), int), weak)
+    assert without_not_heard(alone, None)[2] == [-100]
+    assert without_not_heard(both, None)[2] == []
+
+
 def test_measured_strengths_have_no_such_number() -> None:
     rng = np.random.default_rng(4)
     for _ in range(20):

@@ -62,8 +62,8 @@ def _free(name: str) -> str:
 def _without_mark(values: FloatArray) -> tuple[FloatArray, list[float]]:
     """Ranges without a number that stands for none: equal in several rows and further away than all others spread."""
     distinct, counts = np.unique(values[~np.isnan(values)], return_counts=True)
-    for end, rest in ((-1, slice(None, -1)), (0, slice(1, None))):
-        others = distinct[rest]
+    for end, inner in ((-1, slice(None, -1)), (0, slice(1, None))):
+        others = distinct[inner]
         if len(others) > 1 and counts[end] >= FEWEST_EQUAL and abs(distinct[end] - others[end]) > np.ptp(others):
             return np.where(values == distinct[end], np.nan, values), [float(distinct[end])]
     return values, []

@@ -215,17 +215,16 @@ class _Import:
         of, table, conditions = self.columns.of, self.table, {}
         if "split" in of:
             self.is_test = self.is_test | _test_rows(table, of["split"])
+        for meaning in sorted({"heading", "run"} & set(of)):
+            if empty := int(table.frame[of[meaning]].isna().sum()):
+                self.notes.append(f"{of[meaning]} is empty in {empty} rows: kept, and not used as {meaning}")
+                self.columns.kept.append(of.pop(meaning))
         if "heading" in of:
-            values = table.numbers(of["heading"])
-            if np.isfinite(values).all():
-                heading_rad, self.units["heading"] = headings_rad(values, of["heading"], self.options.heading)
-                conditions["heading"] = heading_rad
-            else:
-                self.notes.append(f"{of['heading']} is empty in {np.isnan(values).sum()} rows: no headings are used")
+            headings = finite_columns(table, [of["heading"]])[:, 0]
+            conditions["heading"], unit = headings_rad(headings, of["heading"], self.options.heading)
+            self.units["heading"] = unit
         if "run" in of:
-            runs = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
-            if not table.frame[of["run"]].isna().any() and (runs != "").all():
-                conditions["run"] = runs
+            conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
         if "frequency" in of and not self.options.frequency_hz:
             self.units["frequency"] = "-> Hz"
             conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
@@ -243,9 +242,7 @@ class _Import:
         """Readings of the receivers that remain, and their means at each place."""
         options = self.options
         if places * len(readings.ids) > MOST_CELLS:
-            text = (
-                f"{places} places of {len(readings.ids)} receivers are more than the {MOST_CELLS} that fit into memory"
-            )
+            text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
             raise InputError(f"{self.out}: {text}; average by --place-m, or leave receivers out by --receivers")
         means = mean_strengths(readings, place, places, options.average)
         groups = virtual_networks(readings.ids, means.dbm)
@@ -264,9 +261,8 @@ class _Import:
             text = f"{len(out)} of {len(heard)} receivers were heard in fewer than {max(1, options.min_heard)} training"
             self.notes.append(f"{text} rows and are left out (--min-heard): {names}")
         if not len(remaining):
-            raise InputError(
-                f"{self.out}: no receiver was heard in {options.min_heard} training rows; lower --min-heard"
-            )
+            text = f"no receiver was heard in {options.min_heard} training rows; lower --min-heard"
+            raise InputError(f"{self.out}: {text}")
         readings = chosen(readings, remaining)
         return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
 
@@ -275,22 +271,19 @@ class _Import:
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors)
         receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
-        carriers = [
-            self.carrier_of.get(name, rx.frequency_hz) for name, rx in zip(readings.ids, receivers, strict=True)
-        ]
-        if None in carriers or options.frequency_hz:
+        pairs = list(zip(readings.ids, receivers, strict=True))
+        carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
+        if None in carriers or options.frequency_hz:  # one carrier for all
             carriers = [None] * len(carriers)
-        pairs = zip(receivers, carriers, strict=True)
-        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in pairs), notes
+        stated = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in stated), notes
 
     def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
         averaged = bool((means.count > 1).any())
         if averaged:
             most, what = int(means.count.max()), {"db": "dB", "mw": "mW"}[self.options.average]
-            readings = (
-                f"{means.count.sum()} readings at {len(position_m)} places are averaged in {what}, up to {most} each"
-            )
-            self.notes.append(f"{readings}; count_ and std_ are their number and the noise of the mean")
+            text = f"{means.count.sum()} readings at {len(position_m)} places are averaged in {what}, up to {most} each"
+            self.notes.append(f"{text}; count_ and std_ are their number and the noise of the mean")
         carrier_hz = self.options.frequency_hz or CARRIER_HZ
         stated = "frequency" in self.columns.of or receivers[0].frequency_hz
         if not self.options.frequency_hz and not stated:
@@ -316,9 +309,7 @@ class _Import:
     def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
         """The record with its official split, if test rows are stated."""
         if not is_test.any() or is_test.all():
-            self.notes.append(
-                "no test rows are stated: train scores folds in space, then fits all rows (--split none, the default)"
-            )
+            self.notes.append("no test rows are stated: train scores folds in space, then fits all rows (--split none)")
             return record
         official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
         self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")

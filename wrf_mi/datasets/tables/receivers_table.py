@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,21 +44,28 @@ def read_receivers(
         return tuple(unknown.values()), [text]
     table = _with_ids(table)
     stated = _stated(table, frame, units, height_m)
-    receivers = {name: stated.get(name, receiver) for name, receiver in unknown.items()}
+    receivers = unknown | {name: receiver for name, receiver in stated.items() if name in unknown}
+    return tuple(receivers.values()), [*_notes(table, receivers, stated), *_height_note(table, height_m)]
+
+
+def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str, Receiver]) -> list[str]:
+    """What the table lacks, and what of it is not used."""
+    of = named_columns(list(table.frame.columns), {})
+    used = ["id", *(of.get(meaning) for meaning in ("x", "y", "z", "lat", "lon")), *POSES]
     lacking = [name for name, receiver in receivers.items() if np.isnan(receiver.position_m).any()]
     groups = {
-        "columns that are not used": [name for name in table.frame.columns if name not in (*_used(table), *POSES)],
+        "columns that are not used": [name for name in table.frame.columns if name not in used],
         "receivers without position": lacking,
         "receivers that are not in the measurements": [name for name in stated if name not in receivers],
     }
-    notes = [f"{len(names)} {what}: {listed(names)}" for what, names in groups.items() if names]
-    notes += [] if "z" in table.frame else [f"no column z: receivers are {height_m:g} m above the floor"]
-    return tuple(receivers.values()), [f"{table.files[0][0].name}: {note}" for note in notes]
+    file = table.files[0][0].name
+    return [f"{file}: {what} ({len(names)}): {listed(names)}" for what, names in groups.items() if names]
 
 
-def _used(table: Table) -> list[str]:
-    of = named_columns(list(table.frame.columns), {})
-    return ["id", *(of[meaning] for meaning in ("x", "y", "z", "lat", "lon") if meaning in of)]
+def _height_note(table: Table, height_m: float) -> list[str]:
+    if "z" in named_columns(list(table.frame.columns), {}):
+        return []
+    return [f"{table.files[0][0].name}: no column z, so receivers are {height_m:g} m above the floor"]
 
 
 def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dict[str, Receiver]:
@@ -76,10 +83,11 @@ def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dic
     for row, text in enumerate(table.frame["id"].astype(str)):
         if (name := normal_id(text)) in receivers:
             raise table.fault(f"receiver {name} is in an earlier row, too; remove one of them", row)
-        stated_orientation = orientations[row]
-        orientation = np.array(UPRIGHT) if stated_orientation is None else stated_orientation
+        orientation = orientations[row]
         hz = None if np.isnan(carriers[row]) else float(carriers[row])
-        receivers[name] = Receiver(receiver_name(name), places[row], orientation, antennas[row], frequency_hz=hz)
+        upright = np.array(UPRIGHT)
+        pose = places[row], upright if orientation is None else orientation
+        receivers[name] = Receiver(receiver_name(name), *pose, antennas[row], frequency_hz=hz)
     return receivers
 
 
