@@ -41,19 +41,21 @@ class Part:
         material: id of its BSDF; empty without one.
         file: file of its triangles.
         corners_m: corners [f, 3, 3] in the scene's frame, metres.
+        shape: element of the shape; None for a part of a mesh. Ids may come twice.
     """
 
     name: str
     material: str
     file: Path
     corners_m: FloatArray
+    shape: Element | None = None
 
 
 def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
     """Each shape of a scene as a part, and findings about its file, its polygons and its transform."""
     for name, shape in scene.shapes:
         materials = [identifier for identifier, _ in scene.materials(shape)]
-        part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)))
+        part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
         plugin = shape.get("type", "")
         matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
