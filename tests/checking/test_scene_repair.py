@@ -212,6 +212,27 @@ def test_winding_follows_the_first_face_of_each_body() -> None:
         assert volume == pytest.approx(solid.volume * (-1 if flipped[first] else 1))
 
 
+def test_shapes_of_one_id_keep_their_materials_and_none_is_lost(tmp_path: Path) -> None:
+    for name, at in (("a", 0), ("b", 5)):
+        trimesh.creation.box((1, 1, 1)).apply_translation([at, 0, 0]).export(tmp_path / f"{name}.ply")
+    body = "".join(
+        f'<bsdf type="itu-radio-material" id="mat-{name}"><string name="type" value="{kind}"/></bsdf>'
+        f'<shape type="ply" id="same"><string name="filename" value="{name}.ply"/><ref id="mat-{name}"/></shape>'
+        for name, kind in (("a", "wood"), ("b", "metal"))
+    )
+    path = tmp_path / "scene.xml"
+    path.write_text(f'<scene version="3.0.0">{body}</scene>', encoding="utf-8")
+    assert repair_scene(path, tmp_path / "out").folder is not None
+    objects = open_scene(tmp_path / "out", CARRIER_HZ).objects
+    types = {round(float(o.mi_mesh.bbox().min.x)): o.radio_material.itu_type for o in objects.values()}
+    assert types == {0: "wood", 4: "metal"} or types == {-1: "wood", 4: "metal"}
+    (tmp_path / "c.serialized").write_bytes(b"")
+    more = '<shape type="serialized" id="c"><string name="filename" value="c.serialized"/><ref id="mat-a"/></shape>'
+    path.write_text(f'<scene version="3.0.0">{body}{more}</scene>', encoding="utf-8")
+    repair = repair_scene(path, tmp_path / "none")
+    assert [f.shape for f in repair.unrepaired] == ["c"]
+
+
 def test_names() -> None:
     assert [ascii_name(name) for name in ("Wänd", "mesh-é.001", "壁")] == ["Wand", "mesh-e.001", ""]
     words = {"mat-Concrete.001": "concrete", "ceiling board": "ceiling_board", "Window": "glass", "Material": None}
@@ -231,6 +252,7 @@ def test_command_repairs_a_copy(tmp_path: Path, capsys: pytest.CaptureFixture[st
     refused(["check", xml, "--repair", out, "--material", "brick"], "exists", capsys)
     assert call(["check", xml, "--repair", out, "--material", "brick", "--replace", "--json"], capsys)[0] == 0
     refused(["check", xml, "--repair", out, "--replace", "--material", "jelly"], "unknown", capsys)
+    refused(["check", xml, "--repair", out, "--strict"], "belong to a check", capsys)
     points = tmp_path / "scan.xyz"
     np.savetxt(points, np.random.default_rng(0).uniform(0, 4, (2000, 3)))
     with pytest.raises(InputError, match="make a scene of it by wrf-mi mesh"):

@@ -48,9 +48,9 @@ class MaterialRepair:
     bsdfs: dict[str, Element] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
 
-    def of(self, part: Part, shape: Element | None) -> Element | None:
+    def of(self, part: Part) -> Element | None:
         """BSDF that a part is to have; None where nothing says which material it is."""
-        stated = {} if self.scene is None or shape is None else dict(self.scene.materials(shape))
+        stated = {} if self.scene is None or part.shape is None else dict(self.scene.materials(part.shape))
         for identifier, bsdf in stated.items():
             radio = None if bsdf is None else self._radio(bsdf)
             if radio is not None:

@@ -11,9 +11,9 @@ Level = Literal["fault", "warning", "note"]
 
 KINDS: Mapping[str, tuple[Level, str]] = {
     "xml": ("fault", "scene file that is no well-formed XML in UTF-8, has a document type, or is nested too deeply"),
-    "root": ("fault", "scene file that does not begin with <scene> and a version"),
+    "root": ("fault", "scene file that does not begin with the element scene and its version"),
     "element": ("fault", "element or plugin that a scene file may not have"),
-    "parameter": ("fault", "parameter that is missing, stated twice, or left to the caller ($)"),
+    "parameter": ("fault", "parameter that is missing, stated twice, or left to the caller"),
     "unknown-parameter": ("fault", "parameter that the shape does not have, such as toWorld for to_world"),
     "missing-file": ("fault", "mesh or texture that is not where the scene file names it"),
     "outside-folder": ("fault", "mesh or texture outside the folder of the scene file"),

@@ -41,19 +41,21 @@ class Part:
         material: id of its BSDF; empty without one.
         file: file of its triangles.
         corners_m: corners [f, 3, 3] in the scene's frame, metres.
+        shape: element of the shape; None for a part of a mesh. Ids may come twice.
     """
 
     name: str
     material: str
     file: Path
     corners_m: FloatArray
+    shape: Element | None = None
 
 
 def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
     """Each shape of a scene as a part, and findings about its file, its polygons and its transform."""
     for name, shape in scene.shapes:
         materials = [identifier for identifier, _ in scene.materials(shape)]
-        part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)))
+        part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
         plugin = shape.get("type", "")
         matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
@@ -177,7 +179,8 @@ def read_triangles(part: Part, plugin: str) -> Iterator[Part | Finding]:
         require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
         polygons = POLYGON_READERS[file.suffix.lower()](file)
     except Exception as error:  # NumPy raises a dozen kinds on damaged files
-        yield Finding("mesh", file, name, f"cannot be read: {one_line(error).removeprefix(f'{file}: ')}", RESTORE)
+        text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
+        yield Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
         return
     if not len(polygons.sizes):
         yield Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
@@ -200,8 +203,7 @@ def read_triangles(part: Part, plugin: str) -> Iterator[Part | Finding]:
         by_mitsuba = triangles_by_mitsuba(file, plugin)
         if not same_triangles(np.asarray(corners, np.float32), by_mitsuba):
             many = int((polygons.sizes > 3).sum())
-            read = "other triangles" if len(by_mitsuba) else "no triangles"
-            text = f"Sionna RT reads {read} in it than these {len(corners)}"
+            text = "Sionna RT reads other triangles in it" if len(by_mitsuba) else "Sionna RT refuses the file"
             text += f", {many} faces have more than three corners" if many else ""
             yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
     yield replace(part, corners_m=corners)

@@ -127,9 +127,8 @@ def repair_scene(
         raise InputError(f"{source}: a scan; make a scene of it by wrf-mi mesh")
     parts, origin_m, done = repaired_triangles(before.parts)
     materials = MaterialRepair(before.scene, before.source.thickness_m, default, frequency_hz)
-    shapes = {} if before.scene is None else dict(before.scene.shapes)
-    bsdfs = [materials.of(part, shapes.get(part.name)) for part in parts]
-    names = _names(parts, shapes, bsdfs)
+    bsdfs = [materials.of(part) for part in parts]
+    names = _names(parts, bsdfs)
     done = [*_shift(origin_m), *_routine(before), *done, *materials.done, *_renamed(names)]
     unrepaired = [*_unrepaired(before), *_left(parts, bsdfs, before.source.path)]
     if unrepaired:
@@ -173,11 +172,18 @@ def _routine(before: Checked) -> list[str]:
 
 
 def _unrepaired(before: Checked) -> list[Finding]:
-    """Faults that need the user."""
-    shapes = set() if before.scene is None else {name for name, _ in before.scene.shapes}
-    lost = shapes - {part.name for part in before.parts}
-    faults = before.report.of_level("fault")
-    return [each for each in faults if each.kind in UNREPAIRED or (each.kind in LOST and each.shape in lost)]
+    """Faults that need the user, and shapes whose triangles are not known for another reason."""
+    lost, faults = _without_triangles(before), before.report.of_level("fault")
+    unrepaired = [each for each in faults if each.kind in UNREPAIRED or (each.kind in LOST and each.shape in lost)]
+    named = {each.shape for each in faults if each.kind in (*UNREPAIRED, *LOST, "empty-mesh")}
+    text, remedy = "its triangles are not read", "write it as a PLY mesh"
+    others = [name for name in lost if name not in named]
+    return unrepaired + [Finding("unsupported-shape", before.source.path, name, text, remedy) for name in others]
+
+
+def _without_triangles(before: Checked) -> list[str]:
+    read = {id(part.shape) for part in before.parts}
+    return [] if before.scene is None else [name for name, shape in before.scene.shapes if id(shape) not in read]
 
 
 def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) -> list[Finding]:
@@ -193,12 +199,12 @@ def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) ->
     return left if parts else [Finding("no-shapes", path, "", "nothing has an area", "give a scene with surfaces")]
 
 
-def _names(parts: Sequence[Part], shapes: Mapping[str, Element], bsdfs: Sequence[Element | None]) -> dict[Part, str]:
+def _names(parts: Sequence[Part], bsdfs: Sequence[Element | None]) -> dict[Part, str]:
     """Safe names of parts that neither another one, nor a material, has: both are items of a scene of Sionna RT."""
     names = dict[Part, str]()
     materials = [short_name(bsdf.get("id", "")) for bsdf in bsdfs if bsdf is not None]
     for number, part in enumerate(parts, start=1):
-        identifier = shapes[part.name].get("id", "") if part.name in shapes else part.name
+        identifier = part.name if part.shape is None else part.shape.get("id", "")
         wanted = short_name(ascii_name(identifier)) or ("" if part.file.suffix == ".xml" else part.file.stem)
         used = {*names.values(), *materials, MERGED}
         names[part] = plain_name(ascii_name(wanted) or f"shape_{number}", ODD, used)

@@ -119,7 +119,9 @@ def read_xml(path: Path) -> SceneXml | Finding:
     except DefusedXmlException:
         return Finding("xml", path, "", "has a document type or entities", "remove them")
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
-        return Finding("xml", path, "", f"no XML in UTF-8: {one_line(error)}", "correct the file, or export it anew")
+        return Finding(
+            "xml", path, "", f"cannot be read as XML in UTF-8: {one_line(error)}", "correct the file, or export it anew"
+        )
     level = [root]
     for _ in range(DEEPEST + 1):
         level = [child for element in level for child in element]
@@ -360,10 +362,13 @@ def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     for identifier, bsdf in materials:
         if bsdf is None:
             yield Finding("unknown-reference", path, name, f"no <bsdf> has the id {identifier[:60]!r}", GIVE)
-            continue
-        plugin, is_named = bsdf.get("type", ""), is_itu(identifier) or identifier.removeprefix(DASH) in ITU
-        if plugin not in RADIO and not is_named:
+        elif not _is_radio(identifier, bsdf):
             within = any(inner.get("type") in RADIO for inner in bsdf.iter("bsdf"))
-            text = f"its material {identifier!r} is {plugin!r}{', around a radio material' if within else ''}"
+            text = f"its material {identifier!r} is {bsdf.get('type')!r}{', around a radio material' if within else ''}"
             remedy = "name it mat-itu_concrete or the like, or give constants; --repair does with --material NAME"
             yield Finding("not-radio", path, name, text, remedy)
+
+
+def _is_radio(identifier: str, bsdf: Element) -> bool:
+    """Whether a BSDF is a radio material in Sionna RT, or is meant to be one and named wrongly."""
+    return bsdf.get("type") in RADIO or is_itu(identifier) or identifier.removeprefix(DASH) in ITU

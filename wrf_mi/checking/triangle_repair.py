@@ -21,6 +21,8 @@ NEAR_ZERO_M = 1000.0
 
 def repaired_triangles(parts: Sequence[Part]) -> tuple[list[Part], FloatArray, list[str]]:
     """Repaired parts, the origin [3] that was subtracted in metres, and what was done to which part."""
+    if not parts:
+        return [], np.zeros(3), []
     origin_m, done = _origin(parts), list[str]()
     stage = [replace(part, corners_m=part.corners_m - origin_m) for part in parts]
     for repair, text in STAGES:
@@ -45,8 +47,6 @@ def _origin(parts: Sequence[Part]) -> FloatArray:
 
 def _one_plane(parts: list[Part]) -> list[Part]:
     """Parts whose flat bodies are put into the planes of faces of the same material within millimetres."""
-    if not parts:
-        return parts
     corners = [part.corners_m.copy() for part in parts]
     owner = np.repeat(np.arange(len(parts)), [len(each) for each in corners])
     row = np.concatenate([np.arange(len(each)) for each in corners])
@@ -61,8 +61,10 @@ def _one_plane(parts: list[Part]) -> list[Part]:
         faces = sheet[mover[0]] == mover[1]
         corners[mover[0]][faces] = _in_plane(corners[mover[0]][faces], corners[still[0]][row[fixed]])
         moved.add(mover)
-    changed = {k for k, _ in moved}
-    return [replace(part, corners_m=corners[k]) if k in changed else part for k, part in enumerate(parts)]
+    changed = list(parts)
+    for k, _ in moved:
+        changed[k] = replace(parts[k], corners_m=corners[k])
+    return changed
 
 
 def _in_plane(corners_m: FloatArray, triangle_m: FloatArray) -> FloatArray:
@@ -87,8 +89,6 @@ def _with_area(parts: list[Part]) -> list[Part]:
 
 def _without_copies(parts: list[Part]) -> list[Part]:
     """Parts without triangles that an earlier part, or the part itself, has."""
-    if not parts:
-        return parts
     doubled = copies(np.concatenate([part.corners_m for part in parts]))
     ends = np.cumsum([len(part.corners_m) for part in parts])[:-1]
     return [_only(part, row) for part, row in zip(parts, np.split(~doubled, ends), strict=True)]

@@ -35,6 +35,8 @@ def check_command(a: Arguments) -> int:
         report = check_scene(a.scene, data=a.data, frequency_hz=a.frequency, units=a.units, up=a.up)
         show(a.json, report.as_dict(), "\n".join(report.lines()))
         return 1 if report.ok and a.strict and report.of_level("warning") else 0 if report.ok else 2
+    if a.data or a.strict:
+        raise InputError("check --repair: --data and --strict belong to a check; omit them, then check the new folder")
     form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
     repair = repair_scene(a.scene, a.repair, material=a.material, overwrite=a.replace, **form)
     show(a.json, repair.as_dict(), "\n".join(repair.lines()))
