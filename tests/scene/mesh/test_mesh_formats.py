@@ -217,3 +217,21 @@ def test_shapes_of_usd_that_are_no_meshes_are_named(tmp_path: Path) -> None:
     stage.Save()
     with pytest.raises(InputError, match=r"/Column is a Cube; export it as a mesh"):
         read_mesh(tmp_path / "room.usda")
+
+
+def test_copies_of_copies_in_usd_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten copies of ten copies; a file of a few lines could hold more than memory does."""
+    monkeypatch.setattr("wrf_mi.scene.mesh.scene_files.MOST_PARTS", 99)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "room.usda"))
+    mesh = UsdGeom.Mesh.Define(stage, "/Leaf/Mesh")
+    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    mesh.CreateFaceVertexCountsAttr([3])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+    for parent, child in (("/Branch", "/Leaf"), ("/Tree", "/Branch")):
+        for k in range(10):
+            prim = stage.DefinePrim(f"{parent}/copy_{k}")
+            prim.GetReferences().AddInternalReference(child)
+            prim.SetInstanceable(True)
+    stage.Save()
+    with pytest.raises(InputError, match="has more than 99 parts with its copies written out"):
+        read_mesh(tmp_path / "room.usda")

@@ -138,7 +138,7 @@ def fill_blind(plane: Plane, area: Any, walls: Sequence[Face], points_m: FloatAr
         walled = shapely.intersection(ring.exterior, about).length > HIDDEN_SHARE * ring.exterior.length
         if ring.area <= LARGEST_BLIND_M2 and not walled and not shapely.contains_xy(ring, flat).any():
             filled.append(ring)
-    return shapely.union_all(filled, grid_size=GRID_M)
+    return area if len(filled) == 1 else shapely.union_all(filled, grid_size=GRID_M)
 
 
 def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, noise_m: float) -> Any:

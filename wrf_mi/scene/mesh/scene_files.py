@@ -22,6 +22,7 @@ from ..coordinates import Up, extra_package
 from .polygon_files import Polygons
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+MOST_PARTS = 100_000  # most parts of a file: nested copies of a small file would be without end
 UP = {"Z_UP": "z", "Y_UP": "y", "Z": "z", "Y": "y"}
 Content = tuple[list[Polygons], float, Up]
 """Polygons of each part, the unit of their vertices in metres, and the axis that is up."""
@@ -48,6 +49,7 @@ def read_collada(path: Path) -> Content:
                 index = np.asarray(primitive.vertex_index)
                 sizes = np.diff(primitive.polyindex)[:, 0] if index.ndim == 1 else np.full(len(index), 3)
                 parts.append(_polygons(primitive.vertex, index, sizes, geometry.original.id))
+                _check_number(parts)
     up = str(content.assetInfo.upaxis or "Y_UP")
     return parts, float(content.assetInfo.unitmeter or 1.0), _up(path, up)
 
@@ -80,7 +82,13 @@ def read_usd(path: Path) -> Content:
         matrix = np.array(moves.GetLocalToWorldTransform(prim))  # of rows, multiplied from the left
         moved = vertices.reshape(-1, 3).astype(float) @ matrix[:3, :3] + matrix[3, :3]
         parts.append(_polygons(moved, corners, sizes, str(prim.GetPath())))
+        _check_number(parts)
     return parts, float(UsdGeom.GetStageMetersPerUnit(stage)), _up(path, str(UsdGeom.GetStageUpAxis(stage)))
+
+
+def _check_number(parts: list[Polygons]) -> None:
+    if len(parts) > MOST_PARTS:
+        raise ValueError(f"has more than {MOST_PARTS:,} parts with its copies written out")
 
 
 def _is_surface(prim: Any, geometry: Any) -> bool:

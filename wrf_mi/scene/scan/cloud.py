@@ -108,11 +108,15 @@ class _Scan:
         for number in range(PASSES):
             # Walls bound the room, and a wall that is found by few points bounds the others.
             outside = self.outside(walls)
-            if not (outside & self.free).any() and not (sparse and number == 0):
+            fresh = bool((outside & self.free).any())
+            if not fresh and not (sparse and number == 0):
                 break
             self.free = ~outside
-            pieces, roles = self.roles(self.pieces([*planes, *sparse], walls))
-            walls = _walls(pieces, roles)
+            second = self.roles(self.pieces([*planes, *sparse], walls))
+            sparse = [piece.plane for piece in second[0] if piece.plane.sparse]
+            if not fresh and not sparse:
+                break  # chance alignments alone, which must not move the others
+            (pieces, roles), walls = second, _walls(*second)
         if not self.free.all():
             logger.info("%d points behind openings of walls make no surfaces", np.count_nonzero(~self.free))
         return pieces, roles

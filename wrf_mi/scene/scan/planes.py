@@ -29,6 +29,7 @@ VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
 MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
 NORMAL_RADIUS_M, NORMAL_NEIGHBOURS, FEWEST_NEIGHBOURS = 0.15, 50, 16
 """Radius of the points that tell a normal, and the most and fewest of them; the fewest reach farther where need be."""
+FEW_SHARE = 0.1  # least share of means with fewer neighbours of a scan that becomes sparse far from its scanner
 STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
 """A mean farther from its neighbours than usual by this many standard deviations is a stray."""
 NORMAL_SPREADS_DEG = (30, 60, 60, 60, 60)
@@ -91,10 +92,11 @@ def thin(points_m: FloatArray) -> Thinned:
     radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.asarray(cloud.points)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, NORMAL_NEIGHBOURS))
     normals = np.array(cloud.normals)
-    # Far from the scanner a radius holds a few points, whose noise tilts the normal.
+    # Far from the scanner a radius holds a few points, whose noise tilts the normal; in a dense scan they are clutter.
     few = cKDTree(points).query_ball_point(points, radius, return_length=True) < FEWEST_NEIGHBOURS
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FEWEST_NEIGHBOURS))
-    normals[few] = np.asarray(cloud.normals)[few]
+    if few.mean() > FEW_SHARE:
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(FEWEST_NEIGHBOURS))
+        normals[few] = np.asarray(cloud.normals)[few]
     return Thinned(points, count[rows], normals, mean)
 
 
