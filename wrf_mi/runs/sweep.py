@@ -37,7 +37,7 @@ from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 
 OPTIONS = (
-    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "seed"),
+    *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "min-rows", "seed"),
     *("preset", "receiver", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )

@@ -55,8 +55,8 @@ AREA_M = 40.0
 """Extent of the training rows from which their spacing and likelihood state lengths: beyond that of a flat or floor, to
 whose rooms the default hyperparameters belong."""
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
-LIKELIHOOD_STOPS, LIKELIHOOD_STEPS = 400, 80
-"""Largest number of stops in the likelihood, and of its evaluations."""
+LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
+"""Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
 COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
@@ -223,24 +223,29 @@ def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tup
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
     factor e.
     """
-    stops = stops.thinned(LIKELIHOOD_STOPS)
+    stops, few = stops.thinned(LIKELIHOOD_STOPS), prior
+    if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
+        counts = np.isfinite(stops.value_dbm).sum(axis=1)
+        most = np.sort(np.argsort(-counts, kind="stable")[:LIKELIHOOD_RECEIVERS])
+        few = replace(prior, receivers_m=prior.receivers_m[most])
+        stops = replace(stops, value_dbm=stops.value_dbm[most], count=stops.count[most])
     spacing_m, extent_m = scales(stops.poses.position_m)
     middle = np.log([AREA_SHADOW_DB, np.sqrt(spacing_m * extent_m / 2), AREA_NOISE_DB, prior.rx_sd_db])
     deviation = np.array([0.5, 1.0, 0.5, 1.0])
-    ratio = np.ones(len(prior.receivers_m))
+    ratio = np.ones(len(few.receivers_m))
 
-    def at(logarithms: FloatArray) -> tuple[PriorMean, Hyperparameters]:
+    def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
         field = replace(start, shadow_db=shadow_db, shadow_m=shadow_m, drift_db=noise_db, noise_db=noise_db)
         return replace(prior, rx_sd_db=rx_sd_db), field
 
     def cost(logarithms: FloatArray) -> float:
-        fit = Field(*at(logarithms), ratio, stops)
+        fit = Field(*at(logarithms, few), ratio, stops)
         return fit.cost + float(np.square((logarithms - middle) / deviation).sum())
 
     simplex = np.vstack([middle, middle + np.diag(deviation)])
     options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
-    return at(minimize(cost, middle, method="Nelder-Mead", options=options).x)
+    return at(minimize(cost, middle, method="Nelder-Mead", options=options).x, prior)
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
