@@ -197,6 +197,16 @@ def test_materials_below_their_range_get_constants(tmp_path: Path) -> None:
     assert float(material.thickness[0]) == pytest.approx(0.25)  # of scene.yml
 
 
+def test_stated_materials_of_shapes_replace_their_own(tmp_path: Path) -> None:
+    xml = write_scene(tmp_path / "room", random_room(5).parts, "room")
+    repair_scene(xml, tmp_path / "out", shape_materials={"mesh-floor": "metal"})
+    scene = open_scene(tmp_path / "out", CARRIER_HZ)
+    assert scene.objects["floor"].radio_material.itu_type == "metal"
+    assert scene.objects["ceiling"].radio_material.itu_type != "metal"
+    with pytest.raises(InputError, match="no shape 'mesh-flor'"):
+        repair_scene(xml, tmp_path / "other", shape_materials={"mesh-flor": "metal"})
+
+
 def test_winding_follows_the_first_face_of_each_body() -> None:
     rng = np.random.default_rng(0)
     solids = [trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box((1, 1, 1)).apply_translation([5, 0, 0])]

@@ -37,6 +37,7 @@ class MaterialRepair:
         thickness_m: slab thickness of materials by name, of the scene's folder.
         default: material of ITU-R P.2040, without ``itu_``, of parts whose names mean none; None: there is none.
         frequency_hz: carrier, for which materials below their range get constants.
+        of_shapes: materials of ITU-R P.2040, without ``itu_``, by shape, whatever their names mean.
         bsdfs: BSDFs of the repaired scene, by the ids of the source.
         done: what was done to which part or material.
     """
@@ -45,11 +46,14 @@ class MaterialRepair:
     thickness_m: Mapping[str, float]
     default: str | None
     frequency_hz: float | None
+    of_shapes: Mapping[str, str] = field(default_factory=dict)
     bsdfs: dict[str, Element] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
 
     def of(self, part: Part) -> Element | None:
         """BSDF that a part is to have; None where nothing says which material it is."""
+        if part.name in self.of_shapes:
+            return self._of_itu(part, self.of_shapes[part.name], "")
         stated = {} if self.scene is None or part.shape is None else dict(self.scene.materials(part.shape))
         for identifier, bsdf in stated.items():
             radio = None if bsdf is None else self._radio(bsdf)
@@ -61,9 +65,11 @@ class MaterialRepair:
         """Material that one of some names means, or the default."""
         guessed = next(filter(None, map(meant, names)), None)
         material = guessed or self.default
-        if material is None:
-            return None
-        self.done.append(f"{label(part)}: material {material}{' by its name' if guessed else ''}")
+        return None if material is None else self._of_itu(part, material, " by its name" if guessed else "")
+
+    def _of_itu(self, part: Part, material: str, reason: str) -> Element:
+        """Material of ITU-R P.2040 for a part; the same one for all parts of that material."""
+        self.done.append(f"{label(part)}: material {material}{reason}")
         same = next((name for name in (f"mat-itu_{material}", f"itu_{material}") if name in self.bsdfs), None)
         bsdf = itu_bsdf(material, THICKNESS_M[f"itu_{material}"], self.frequency_hz)
         return self._add(same or f"itu_{material}", bsdf)

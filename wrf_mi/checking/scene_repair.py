@@ -92,6 +92,7 @@ def repair_scene(
     out: str | Path,
     *,
     material: str | None = None,
+    shape_materials: Mapping[str, str] | None = None,
     frequency_hz: float | None = None,
     units: str = "m",
     up: Up | None = None,
@@ -108,6 +109,7 @@ def repair_scene(
         source: name, folder, XML or mesh, as of `check_scene`.
         out: folder to make: ``scene.xml``, ``meshes/*.ply``, and ``scene.yml`` with what was done.
         material: material of ITU-R P.2040 of shapes without one whose names say none, ``concrete`` or ``itu_concrete``.
+        shape_materials: materials by the names of shapes, in place of their own; None: none.
         frequency_hz: carrier, for which materials below their range get constants.
         units: unit of the source's coordinates.
         up: axis that is up in the source.
@@ -117,16 +119,17 @@ def repair_scene(
         What was done. Where a fault needs the user, nothing is written.
 
     Raises:
-        InputError: no such source, an unknown material, a scan, or a folder that exists.
+        InputError: no such source or shape, an unknown material, a scan, or a folder that exists.
     """
-    default = None if material is None else material.removeprefix("itu_")
-    if default is not None and default not in ITU:
-        raise InputError(f"material {material!r}: unknown; give one of ITU-R P.2040: {', '.join(ITU)}")
+    default = None if material is None else _known_material(material)
+    of_shapes = {shape: _known_material(name) for shape, name in (shape_materials or {}).items()}
     before = checked(source, frequency_hz=frequency_hz, units=units, up=up)
     if before.report.points:
         raise InputError(f"{source}: a scan; make a scene of it by wrf-mi mesh")
     parts, origin_m, done = repaired_triangles(before.parts)
-    materials = MaterialRepair(before.scene, before.source.thickness_m, default, frequency_hz)
+    if unknown := sorted(set(of_shapes) - {part.name for part in parts}):
+        raise InputError(f"{source}: no shape {unknown[0]!r}; there are {', '.join(part.name for part in parts[:20])}")
+    materials = MaterialRepair(before.scene, before.source.thickness_m, default, frequency_hz, of_shapes)
     bsdfs = [materials.of(part) for part in parts]
     names = _names(parts, bsdfs)
     done = [*_shift(origin_m), *_routine(before), *done, *materials.done, *_renamed(names)]
@@ -184,6 +187,13 @@ def _unrepaired(before: Checked) -> list[Finding]:
 def _without_triangles(before: Checked) -> list[str]:
     read = {id(part.shape) for part in before.parts}
     return [] if before.scene is None else [name for name, shape in before.scene.shapes if id(shape) not in read]
+
+
+def _known_material(name: str) -> str:
+    """Name of a material of ITU-R P.2040 without ``itu_``."""
+    if (material := name.removeprefix("itu_")) not in ITU:
+        raise InputError(f"material {name!r}: unknown; give one of ITU-R P.2040: {', '.join(ITU)}")
+    return material
 
 
 def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) -> list[Finding]:

@@ -19,7 +19,10 @@ def add_parser(commands: Any) -> None:
     add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
     add("--up", choices=("y", "z"), help="axis that is up (default: y in GLB, else z)")
     add("--repair", metavar="OUT", help="scene folder to make, which plain Sionna RT opens; the source is not changed")
-    add("--material", metavar="NAME", help="for --repair: material of shapes whose names mean none, e.g. concrete")
+    text = (
+        "for --repair: material of shapes whose names mean none, e.g. concrete, or SHAPE=NAME of one shape; repeatable"
+    )
+    add("--material", action="append", default=[], metavar="NAME", help=text)
     add("--replace", action="store_true", help="for --repair: replace an existing folder")
     add("--strict", action="store_true", help="exit status 1 if there are warnings")
 
@@ -38,6 +41,13 @@ def check_command(a: Arguments) -> int:
     if a.data or a.strict:
         raise InputError("check --repair: --data and --strict belong to a check; omit them, then check the new folder")
     form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
-    repair = repair_scene(a.scene, a.repair, material=a.material, overwrite=a.replace, **form)
+    of_shapes = dict(text.rsplit("=", 1) for text in a.material if "=" in text)
+    others = [text for text in a.material if "=" not in text]
+    if len(others) > 1:
+        raise InputError(
+            f"check: --material {' and '.join(others)}; give one of them, and SHAPE=NAME for single shapes"
+        )
+    material = others[0] if others else None
+    repair = repair_scene(a.scene, a.repair, material=material, shape_materials=of_shapes, overwrite=a.replace, **form)
     show(a.json, repair.as_dict(), "\n".join(repair.lines()))
     return 2 if repair.unrepaired else 0
