@@ -105,7 +105,7 @@ def _imported(folder: Path) -> None:
 
 READERS: Mapping[str, Reader] = {
     **_whole("spectra", "gateway_info.yml", "tx_pos.csv", "train_index.txt", "spectrum/00001.png"),
-    **_whole("ble", "anchors.csv", "calibration_df.csv"),
+    **_whole("ble", "receivers.csv", "train.csv"),
     **_whole("nerf2-ble", "gateway_position.yml", "gateway_rssi.csv"),
     **_whole("nerf2-csi", "base-station.yml", "csidata.npy"),
     **_each("newrf", read_newrf, "room.npz"),

@@ -31,6 +31,7 @@ from wrf_mi.parallel import Scheduler
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = (
+    "damaged-scenes",
     "traced-and-splatted",
     "scaling",
     "operator",

@@ -20,7 +20,8 @@ STATED = {
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
     *(("changelog.md", "0.1.0"), ("model.md", "constant"), ("model.md", "setting"), ("numerics.md", "")),
     *(("plugins.md", "parameter"), ("speed.md", "omitted"), ("tables.md", "question")),
-    *(("mesh.md", "you have"), ("receiver.md", "what")),
+    *(("mesh.md", "you have"), ("receiver.md", "what"), ("check.md", "kind"), ("own-data.md", "your table")),
+    *(("data.md", "columns of receivers"), ("data.md", "columns of rows")),
 }
 """Page and first cell of tables of definitions, settings and bounds, which nobody measures."""
 

@@ -137,7 +137,7 @@ def test_paths_of_a_scene_need_stated_places(tmp_path: Path) -> None:
 
 def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     office = write_ble_folder(tmp_path / "office", building())
-    (office / "anchors.csv").write_text("id,x,y,z\nhall,,,\nstairs,11.5,0.5,\nlab,,,2.5\n")
+    (office / "receivers.csv").write_text("id,x,y,z\nhall,,,\nstairs,11.5,0.5,\nlab,,,2.5\n")
     heights = [receiver.position_m[2] for receiver in load(office).receivers]
     np.testing.assert_array_equal(heights, [np.nan, np.nan, 2.5])
     tx, heard, run = tmp_path / "tx.csv", tmp_path / "heard.csv", tmp_path / "run"

@@ -161,7 +161,7 @@ def test_instruments_need_positions_carrier_and_arrays() -> None:
 
 
 def test_layout_is_recognised_by_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"an empty folder; a data set is a folder with anchors\.csv"):
+    with pytest.raises(InputError, match=r"an empty folder; a data set is a folder with receivers\.csv"):
         layouts.layout_of(tmp_path)
     for layout in layouts.BUILT_IN:
         folder = tmp_path / layout.name

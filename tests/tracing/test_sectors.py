@@ -14,7 +14,7 @@ from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import read_ble_folder
 from wrf_mi.models.checks import check_parts
 from wrf_mi.models.model import Problem
-from wrf_mi.models.ray_tracing import TracingSettings, check
+from wrf_mi.models.ray_tracing import MODEL, TracingSettings
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
 from wrf_mi.tracing.paths.result import recompute, save_trace
@@ -129,4 +129,4 @@ def test_carriers_of_receivers_are_checked(xml: Path, record: Record):
             check_parts(wrong)
     low = replace(record, receivers=(replace(first, frequency_hz=0.1e9), *others))
     with pytest.raises(InputError, match=r"not known at 0\.1 GHz"):
-        check(Problem(low, TracingSettings(), 0, str(xml)), [])
+        MODEL.check(Problem(low, TracingSettings(), 0, str(xml)), [])

@@ -46,14 +46,9 @@ def read_ids(table: CsvTable) -> list[str]:
 
 
 def read_positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
-    """Coordinates [rows, axes] in metres; NaN in rows where all are empty and may be so."""
+    """Coordinates [rows, axes] in metres; empty fields are NaN if they are allowed."""
     columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
-    positions = np.stack([column.value for column in columns], axis=-1)
-    empty = np.isnan(positions)
-    for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1)):
-        text = f"{axes[int(np.argmax(empty[row]))]} is empty; give {','.join(axes)}, or none of an unknown position"
-        refuse(DataFault(table.path, text, row=int(row) + 1))
-    return positions
+    return np.stack([column.value for column in columns], axis=-1)
 
 
 def read_transmitter(anchors: CsvTable) -> Antenna:

@@ -71,7 +71,6 @@ def _height_note(table: Table, height_m: float) -> list[str]:
 def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dict[str, Receiver]:
     """The receivers of a table by id."""
     places = _stated_positions(table, frame, units, height_m).round(POSITION_DIGITS)
-    places[np.isnan(places).any(axis=1)] = np.nan
     names = [name for name in POSES if name in table.frame]
     fields = table.frame[names].astype(object).where(table.frame[names].notna(), "").astype(str)
     poses = CsvTable(table.files[0][0], names, fields.to_numpy().tolist())
