@@ -11,7 +11,7 @@ import wrf_mi
 
 WITHOUT = {
     "wrf_mi.core.errors",
-    "wrf_mi.datasets.fetch",  # needs a network
+    "wrf_mi.datasets.download",  # needs a network
     "wrf_mi.maps.dataset",  # in the example of wrf_mi.maps.api
     "wrf_mi.runs.compare",  # in that of wrf_mi.runs.api
     "wrf_mi.runs.run",  # in that of wrf_mi.runs.api

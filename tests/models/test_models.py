@@ -20,9 +20,9 @@ from wrf_mi import models
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
-from wrf_mi.models import Interrupted
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.training.session import Interrupted
 
 PACKAGE = '''
 """A package with a model: the mean of the nearest training rows."""

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from .angles import FloatArray, rotation_matrix
 from .errors import InputError
@@ -34,6 +33,8 @@ def boresight_orientation(azimuth_rad: float, downtilt_rad: float = 0.0) -> Floa
     >>> rotation_matrix(boresight_orientation(np.pi / 2))[:, 2].round(6) + 0.0
     array([0., 1., 0.])
     """
+    from scipy.spatial.transform import Rotation  # half of the time that the command takes to show its help
+
     device = Rotation.from_euler("ZY", [azimuth_rad, downtilt_rad])
     return np.asarray((device * Rotation.from_matrix(DEVICE_TO_ARRAY.T)).as_quat())
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import lazy_loader
 
 from ..core import InputError
 from ..core.registry import Registry
-from ..training.session import Interrupted
-from .model import Fitted, Inputs, Model, Problem, Session
+
+if TYPE_CHECKING:
+    from .model import Fitted, Inputs, Model, Problem, Session
 
 ENTRY_POINTS = "wrf_mi.models"  # Group of the entry points by which other packages add models
 
@@ -50,12 +54,15 @@ def known_model(name: str) -> Model:
     return MODELS[name]
 
 
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__, submod_attrs={"model": ["Fitted", "Inputs", "Model", "Problem", "Session"]}
+)
+
 __all__ = [
     "ENTRY_POINTS",
     "MODELS",
     "Fitted",
     "Inputs",
-    "Interrupted",
     "Model",
     "Problem",
     "Session",

@@ -11,13 +11,32 @@ Imports run upwards in this list:
 
 from __future__ import annotations
 
-from .deepmimo import write_deepmimo
-from .options import TraceOptions
-from .paths.result import TraceResult, load_trace, recompute, save_trace
-from .paths.solve import trace_paths
-from .sionna.materials import set_frequency
-from .sionna.scenes import open_scene
-from .tracer import RayTracer
+from typing import TYPE_CHECKING
+
+import lazy_loader
+
+if TYPE_CHECKING:
+    from .deepmimo import write_deepmimo
+    from .options import TraceOptions
+    from .paths.result import TraceResult, load_trace, recompute, save_trace
+    from .paths.solve import trace_paths
+    from .sionna.materials import set_frequency
+    from .sionna.scenes import open_scene
+    from .tracer import RayTracer
+
+# Imported when first used: the command shows its help, and readers open files, without Sionna RT and trimesh.
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "deepmimo": ["write_deepmimo"],
+        "options": ["TraceOptions"],
+        "paths.result": ["TraceResult", "load_trace", "recompute", "save_trace"],
+        "paths.solve": ["trace_paths"],
+        "sionna.materials": ["set_frequency"],
+        "sionna.scenes": ["open_scene"],
+        "tracer": ["RayTracer"],
+    },
+)
 
 __all__ = [
     "RayTracer",

@@ -16,11 +16,11 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
-from wrf_mi.models import Interrupted
 from wrf_mi.models.hybrid import scene_side
 from wrf_mi.models.hybrid.scene_side import STAGES
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.training.session import Interrupted
 
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}

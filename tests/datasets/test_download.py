@@ -16,7 +16,7 @@ from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
-from wrf_mi.datasets.fetch import download
+from wrf_mi.datasets.download import download
 from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DATA_VARIABLE, DataSet, RemoteFile, known, remote_files
 
