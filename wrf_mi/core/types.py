@@ -223,14 +223,18 @@ class Record:
         receivers = tuple(replace(receiver, frequency_hz=None) for receiver in self.receivers)
         return replace(self, receivers=receivers, frequencies_hz=np.array([float(carrier_hz)]), carriers_hz=None)
 
-    def at_carriers(self, carriers_hz: FloatArray) -> Record:
-        """The record with the carrier in Hz of each row, [n]."""
+    def at_carriers(self, carriers_hz: FloatArray | None) -> Record:
+        """The record with the carrier in Hz of each row, [n]; None: the record as it is."""
+        if carriers_hz is None:
+            return self
         if len(np.unique(carriers_hz)) == 1:
             return self.at_carrier(carriers_hz[0])
         return replace(self, frequencies_hz=None, carriers_hz=carriers_hz)
 
-    def at_receiver_carriers(self, carriers_hz: FloatArray) -> Record:
-        """The record with the carrier in Hz of each receiver, [n_rx]."""
+    def at_receiver_carriers(self, carriers_hz: FloatArray | None) -> Record:
+        """The record with the carrier in Hz of each receiver, [n_rx]; None: the record as it is."""
+        if carriers_hz is None:
+            return self
         distinct = np.unique(carriers_hz)
         record = self.at_carrier(distinct[len(distinct) // 2])
         if len(distinct) == 1:

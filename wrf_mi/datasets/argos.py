@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import DataFault, InputError, Receiver, Record
+from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.array_files import MOST_DEFLATED
 from ..core.files import one_line
@@ -31,8 +32,7 @@ from .folder_files import shown, single_file
 SUFFIXES = (".hdf5", ".h5")
 PILOTS = "Pilot_Samples"
 FFT = 64
-HALF = 26
-"""Subcarriers of the long training symbol on each side of zero."""
+HALF = 26  # subcarriers of the long training symbol on each side of zero
 SUBCARRIERS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)])
 # IEEE Std 802.11-2020, equation (17-8): the long training symbol at subcarriers -26..-1 and 1..26.
 _SIGNS = "++--++-+-++++++--++-+-++++" + "+--++-+-+-----++--+-+-++++"
@@ -40,10 +40,8 @@ TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
 ARGOS_START, ARGOS_SYMBOLS = 47, 2
 """First sample of the first pilot symbol in a user's slot, and number of symbols (RENEWLab, ``samps2csi``)."""
 FULL_SCALE = 2.0**15
-RECORD_BYTES = 2 * HALF * 8
-"""Bytes of a record for each frame, user and antenna."""
-CHUNK_SIZE = 1 << 26
-"""Bytes of samples in a chunk."""
+RECORD_BYTES = 2 * HALF * 8  # bytes of a record for each frame, user and antenna
+CHUNK_SIZE = 1 << 26  # bytes of samples in a chunk
 
 
 @dataclass(frozen=True)
@@ -101,21 +99,27 @@ def read_argos(
         text = f"{len(channel) - np.count_nonzero(silent)} of {len(channel)} samples hold a signal"
         raise DataFault(file, f"{text}; two at least are needed, to train on and to score")
     channel[silent] = np.nan
-    carrier_hz, rate_hz = _number(attributes, "FREQ"), _number(attributes, "RATE")
-    frequencies = None
-    if carrier_hz is not None and rate_hz is not None:
-        frequencies = carrier_hz + SUBCARRIERS * rate_hz / FFT
+    uplink_hz, downlink_hz = _frequencies_hz(attributes)
     return Record(
         name=name or file.stem,
         task="csi",
         tx_pos_m=np.full((len(channel), 3), np.nan),
         receivers=(Receiver("base-station", np.full(3, np.nan), np.array(UPRIGHT)),),
         observation=channel[None, :, :, HALF:],
-        frequencies_hz=None if frequencies is None else frequencies[HALF:],
+        frequencies_hz=downlink_hz,
         uplink=channel[:, :, :HALF],
-        uplink_hz=None if frequencies is None else frequencies[:HALF],
+        uplink_hz=uplink_hz,
         source=str(file),
     )
+
+
+def _frequencies_hz(attributes: dict[str, Any]) -> tuple[FloatArray | None, FloatArray | None]:
+    """Frequencies of the uplink's and the downlink's subcarriers, None where they are not stated."""
+    carrier_hz, rate_hz = _number(attributes, "FREQ"), _number(attributes, "RATE")
+    if carrier_hz is None or rate_hz is None:
+        return None, None
+    frequencies_hz = carrier_hz + SUBCARRIERS * rate_hz / FFT
+    return frequencies_hz[:HALF], frequencies_hz[HALF:]
 
 
 def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
@@ -142,7 +146,6 @@ def _local(file: Path, group: Any, name: str) -> Any:
 def _open(
     file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
 ) -> tuple[_Layout, Iterator[NDArray[Any]]]:
-    """The layout, and chunks of samples (`_chunks`)."""
     shape = _check_samples(file, pilots)
     asked = range(shape[0])[frames or slice(None)]
     if not len(asked) or asked.step < 0:
@@ -153,12 +156,17 @@ def _open(
         raise DataFault(file, f"{text}; give start")
     needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
     require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
-    if len(shape) == 5:
-        if cell is None and shape[1] > 1:
-            raise DataFault(file, f"{shape[1]} cells; give cell, 0 to {shape[1] - 1}")
-        if not 0 <= (cell or 0) < shape[1]:
-            raise DataFault(file, f"no cell {cell}; it has 0 to {shape[1] - 1}")
-    return layout, _chunks(pilots, layout, asked, cell or 0)
+    return layout, _chunks(pilots, layout, asked, _cell_number(file, shape, cell))
+
+
+def _cell_number(file: Path, shape: tuple[int, ...], cell: int | None) -> int:
+    """Number of the base station; 0 in a layout without a choice."""
+    cells = shape[1] if len(shape) == 5 else 1
+    if cells > 1 and cell is None:
+        raise DataFault(file, f"{cells} cells; give cell, 0 to {cells - 1}")
+    if len(shape) == 5 and not 0 <= (cell or 0) < cells:
+        raise DataFault(file, f"no cell {cell}; it has 0 to {cells - 1}")
+    return cell or 0
 
 
 def _chunks(pilots: Any, layout: _Layout, frames: range, cell: int) -> Iterator[NDArray[Any]]:

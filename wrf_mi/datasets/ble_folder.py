@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
-from ..core.antenna import UPRIGHT
 from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line, write_csv
+from ..core.types import IntArray
 from . import folder_files as files
 from .faults import attempt, refuse, stop_at_faults
 from .receivers_file import (
@@ -33,6 +33,7 @@ from .receivers_file import (
     read_transmitter,
     receiver_columns,
     receiver_name,
+    receiver_of,
     wrong_id,
 )
 from .unknown import Table, long_columns, table_text
@@ -51,19 +52,16 @@ CARRIER_HZ = 2.44e9
 RSSI, COUNT, STD, SPLIT = "rssi_", "count_", "std_", "split"
 PARTS = ("train", "test")
 """Words of the column ``split``, which otherwise has numbers of spatial folds."""
-MOST_READINGS = 10**6
-"""Largest number of readings of a row's mean."""
+MOST_READINGS = 10**6  # largest number of readings of a row's mean
 
 
 def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of the BLE data (see ``docs/data.md``).
 
-    The record has the folder's name unless another is given.
-
     Returns:
-        A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received. The rows of
-        ``train.csv``, then those of ``test.csv``, are the official split; in ``measurements.csv`` the column ``split``
-        states that split or spatial folds.
+        A record, by default named after the folder, with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where
+        nothing was received. The rows of ``train.csv``, then those of ``test.csv``, are the official split; in
+        ``measurements.csv`` the column ``split`` states that split or spatial folds.
 
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
@@ -77,29 +75,25 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     orientations, receivers_hz = attempt(read_orientations, anchors), attempt(_receiver_carriers, anchors, tables)
     rx_antennas = attempt(read_antennas, anchors, "", orientations)
     tx_antenna = attempt(read_transmitter, anchors)
-    plane = [attempt(read_positions, table, "xy") for table in tables]
+    plane = attempt(np.concatenate, [attempt(read_positions, table, "xy") for table in tables])
     stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, files.RUN)}
     split = attempt(_read_split, tables)
     strengths = [attempt(_signal_strength, table, ids, anchors) for table in tables]
+    observation = attempt(np.concatenate, strengths, 1)
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
     stop_at_faults()
     height, counts = stated["z"].value, noise[COUNT].value
-    plane_m = np.concatenate([part.value for part in plane])
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
-        height = np.full(len(plane_m), TAG_HEIGHT_M)
-    upright = np.array(UPRIGHT)
+        height = np.full(len(plane.value), TAG_HEIGHT_M)
     columns = ids.value, anchors_m.value, orientations.value, rx_antennas.value
     record = files.folder_record(
         folder,
         name,
         "rssi",
-        tx_pos_m=np.column_stack([plane_m, height]),
-        receivers=tuple(
-            Receiver(receiver_name(anchor), position, upright if orientation is None else orientation, antenna)
-            for anchor, position, orientation, antenna in zip(*columns, strict=True)
-        ),
-        observation=np.concatenate([part.value for part in strengths], axis=1),
+        tx_pos_m=np.column_stack([plane.value, height]),
+        receivers=tuple(receiver_of(*fields) for fields in zip(*columns, strict=True)),
+        observation=observation,
         frequencies_hz=np.array([CARRIER_HZ]),
         tx_heading_rad=stated["heading"],
         tx_antenna=tx_antenna,
@@ -108,23 +102,22 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         runs=stated[files.RUN],
         **split.value,
     )
-    if receivers_hz.value is not None:
-        return record.at_receiver_carriers(receivers_hz.value)
-    carriers_hz = stated[FREQUENCY].value
-    return record if carriers_hz is None else record.at_carriers(carriers_hz)
+    return record.at_carriers(stated[FREQUENCY].value).at_receiver_carriers(receivers_hz.value)
 
 
 def _files(folder: Path) -> list[Path]:
     """File of the receivers and those of the rows: one, or those of training and test rows."""
-    present = {names: [name for name in names if (folder / name).exists()] for names in FILES}
-    both = [name for names in (TRAINING, TEST) for name in present[names]]
-    for same in (*present.values(), [*present[MEASUREMENTS], *both] if present[MEASUREMENTS] else []):
-        if len(same) > 1:
+    rows = (MEASUREMENTS,) if _present(folder, MEASUREMENTS) else (TRAINING, TEST)
+    for groups in ((RECEIVERS,), (TRAINING,), (TEST,), (*rows, TRAINING, TEST) if len(rows) == 1 else ()):
+        if len(same := _present(folder, *groups)) > 1:
             raise DataFault(folder, f"{same[0]} and {same[1]} state the same; remove one of them")
     # A missing file is reported by the name that goes with those of the others.
-    historic = any(names.index(name) for names, named in present.items() for name in named)
-    rows = (MEASUREMENTS,) if present[MEASUREMENTS] else (TRAINING, TEST)
-    return [folder / (present[names] or [names[historic]])[0] for names in (RECEIVERS, *rows)]
+    historic = bool(_present(folder, *(names[1:] for names in FILES)))
+    return [folder / (_present(folder, names) or [names[historic]])[0] for names in (RECEIVERS, *rows)]
+
+
+def _present(folder: Path, *groups: tuple[str, ...]) -> list[str]:
+    return [name for names in groups for name in names if (folder / name).exists()]
 
 
 def _read_split(tables: list[files.CsvTable]) -> dict[str, Any]:
@@ -136,15 +129,15 @@ def _read_split(tables: list[files.CsvTable]) -> dict[str, Any]:
     if SPLIT not in table.header:
         return {}
     texts = table.texts(SPLIT)
-    # Rows that are damaged have been refused already; any word serves there.
-    words = np.array([PARTS[0] if row in table.damaged else text.strip().lower() for row, text in enumerate(texts)])
+    words = np.array([text.strip().lower() for text in texts], object)
+    words[list(table.damaged)] = PARTS[0]  # refused already; any word serves there
     if all(map(WHOLE.fullmatch, words)):
         return {"folds": np.unique(words.astype(float), return_inverse=True)[1].reshape(-1).astype(np.int64)}
     for row in np.flatnonzero(~np.isin(words, PARTS)):
         text = f"{SPLIT} is {files.shown(texts[row])}; give train or test, or in all rows a fold's number"
         refuse(DataFault(table.path, text, row=int(row) + 1))
     official = np.flatnonzero(words == PARTS[0]), np.flatnonzero(words == PARTS[1])
-    if not (len(official[0]) and len(official[1])):
+    if not all(map(len, official)):
         raise DataFault(table.path, f"all rows have {words[0]} in the column {SPLIT}; mark others, or omit the column")
     return {"official": official}
 
@@ -179,49 +172,65 @@ def write_ble_folder(
 
 
 def _columns(record: Record, ids: list[str]) -> dict[str, NDArray[Any]]:
-    """Columns of the tables of rows."""
-    carriers_hz, hz = record.carriers_hz, record.frequencies_hz
-    if hz is not None and hz[0] != CARRIER_HZ and record.receiver_carriers_hz is None:
-        carriers_hz = np.full(len(record), hz[0])
-    columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
-    columns |= {"heading": record.tx_heading_rad, FREQUENCY: carriers_hz, files.RUN: record.runs, SPLIT: record.folds}
     counts = None if record.n_readings is None else record.n_readings.astype(object)
     if counts is not None:
         counts[counts == 0] = None  # an empty field where nothing was received, as of strength and noise
+    columns: dict[str, NDArray[Any] | None] = dict(zip("xyz", record.tx_pos_m.T, strict=True))
+    columns |= {"heading": record.tx_heading_rad, FREQUENCY: _carriers_hz(record)}
+    columns |= {files.RUN: record.runs, SPLIT: record.folds}
     for prefix, values in ((RSSI, record.observation), (COUNT, counts), (STD, record.std)):
         if values is not None:
             columns |= {prefix + anchor: received for anchor, received in zip(ids, values, strict=True)}
     return {name: values for name, values in columns.items() if values is not None}
 
 
+def _carriers_hz(record: Record) -> FloatArray | None:
+    """Carrier of each row where it is not `CARRIER_HZ`; None where the receivers state theirs."""
+    hz = record.frequencies_hz
+    if hz is None or hz[0] == CARRIER_HZ or record.receiver_carriers_hz is not None:
+        return record.carriers_hz
+    return np.full(len(record), hz[0])
+
+
 def _writable(path: str | Path, record: Record) -> list[str]:
     """The receivers' ids of a record, checked to fit the layout."""
-    text, rows = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}", np.arange(len(record))
+    text = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}"
     if record.task != "rssi":
         raise InputError(f"{text}: it needs signal strengths")
     files.refuse_unstated(path, record, "truth", "uplink")
     if record.official is not None:
         files.refuse_unstated(path, record, "folds")
-        if not np.array_equal(np.sort(np.concatenate(record.official)), rows) or not all(map(len, record.official)):
-            raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
-    if record.carriers_hz is None and (record.frequencies_hz is None or len(record.frequencies_hz) != 1):
+        _check_official(text, record.official, len(record))
+    if record.carriers_hz is None and np.asarray(record.frequencies_hz).shape != (1,):
         raise InputError(f"{text}: its carrier is not known; set Record.frequencies_hz to it, [1], Hz")
     files.refuse_runs(path, record)
-    numbers = (record.tx_pos_m, np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad)
-    if not all(np.isfinite(values).all() for values in numbers) or np.isinf(record.observation).any():
+    heading_rad = np.zeros(0) if record.tx_heading_rad is None else record.tx_heading_rad
+    numbers = np.concatenate([record.tx_pos_m.ravel(), heading_rad])
+    if not np.isfinite(numbers).all() or np.isinf(record.observation).any():
         raise InputError(f"{text}: a position, heading or signal strength is not finite; correct or remove its row")
     ids: list[str] = []
-    for rx in record.receivers:
-        if rx.array_m is not None:
-            raise InputError(f"{text}: receiver {rx.name}: it states no array; set Receiver.array_m to None")
-        anchor = number if receiver_name(number := rx.name.removeprefix("anchor")) == rx.name else rx.name
-        wrong = wrong_id(anchor, ids)
-        if not wrong and receiver_name(plain_id(anchor)) != rx.name:
-            wrong = "would be read as another"
-        if wrong:
-            raise InputError(f"{text}: the name of receiver {files.shown(rx.name)} {wrong}; rename it")
-        ids.append(anchor)
+    for receiver in record.receivers:
+        ids.append(_id(text, receiver, ids))
     return ids
+
+
+def _check_official(text: str, official: tuple[IntArray, IntArray], n: int) -> None:
+    if not np.array_equal(np.sort(np.concatenate(official)), np.arange(n)) or not all(map(len, official)):
+        raise InputError(f"{text}: each row must be in one part of the official split, and each part have rows")
+
+
+def _id(text: str, receiver: Receiver, before: list[str]) -> str:
+    """Id of a receiver after those ``before``; ``text`` begins messages."""
+    if receiver.array_m is not None:
+        raise InputError(f"{text}: receiver {receiver.name}: it states no array; set Receiver.array_m to None")
+    number = receiver.name.removeprefix("anchor")
+    anchor = number if receiver_name(number) == receiver.name else receiver.name
+    wrong = wrong_id(anchor, before)
+    if not wrong and receiver_name(plain_id(anchor)) != receiver.name:
+        wrong = "would be read as another"
+    if wrong:
+        raise InputError(f"{text}: the name of receiver {files.shown(receiver.name)} {wrong}; rename it")
+    return anchor
 
 
 def _receiver_carriers(anchors: files.CsvTable, tables: list[files.CsvTable]) -> FloatArray | None:
@@ -242,11 +251,15 @@ def _in_both(column: str, tables: list[files.CsvTable]) -> Any:
         if having and table not in having:
             text = f"no column {column}, but {having[0].path.name} has one; give it in both files or in neither"
             refuse(DataFault(table.path, text, line=1))
-    columns: list[Any] = [files.runs_of(table) if column == files.RUN else table.numbers(column) for table in having]
-    if column == FREQUENCY:
-        for table, values in zip(having, columns, strict=True):
-            files.carriers_of(table.path, values)
+    columns = [_optional_column(column, table) for table in having]
     return np.concatenate(columns) if columns else None
+
+
+def _optional_column(column: str, table: files.CsvTable) -> NDArray[Any]:
+    if column == files.RUN:
+        return files.runs_of(table)
+    values = table.numbers(column)
+    return files.carriers_of(table.path, values) if column == FREQUENCY else values
 
 
 def _by_anchor(prefix: str, table: files.CsvTable) -> dict[str, str]:
@@ -256,8 +269,7 @@ def _by_anchor(prefix: str, table: files.CsvTable) -> dict[str, str]:
         if column.startswith(prefix):
             first = columns.setdefault(plain_id(column.removeprefix(prefix)), column)
             if first != column:
-                text = f"{first} and {column} name one anchor; remove one of them"
-                refuse(DataFault(table.path, text, line=1))
+                refuse(DataFault(table.path, f"{first} and {column} name one anchor; remove one of them", line=1))
     return columns
 
 
@@ -266,7 +278,7 @@ def _of_anchors(
 ) -> FloatArray | None:
     """Numbers of readings or standard deviations [anchors, rows], NaN where nothing was received; None: not stated."""
     columns_by_anchor = [_by_anchor(prefix, table) for table in tables]
-    if not any(anchor in columns for columns in columns_by_anchor for anchor in ids):
+    if not any(map(set(ids).intersection, columns_by_anchor)):
         return None
     parts = []
     for table, columns, strength in zip(tables, columns_by_anchor, strengths, strict=True):
@@ -290,22 +302,23 @@ def _noise(
         values[values == 0] = np.nan
     good = values > 0 if not counts else (values > 0) & (values == np.floor(values)) & (values <= MOST_READINGS)
     read = ~(np.isinf(values) | np.isinf(strength))  # the others are refused already
+    remedy = "give the number of readings, 1 to a million" if counts else "give the noise in dB, above 0"
     for row, anchor in np.argwhere((np.where(np.isnan(strength), ~np.isnan(values), ~good) & read).T):
-        what = f"{columns[ids[anchor]]} is {files.shown(table.rows[row][table.header.index(columns[ids[anchor]])])}"
+        column, strength_column = columns[ids[anchor]], f"{RSSI}{ids[anchor]}"
+        text = f"{column} is {files.shown(table.rows[row][table.header.index(column)])}, "
         if np.isnan(strength[anchor, row]):
-            remedy = f"but {RSSI}{ids[anchor]} is empty; leave it empty, too"
+            text += f"but {strength_column} is empty; leave it empty, too"
         else:
-            remedy = "give the number of readings, 1 to a million" if counts else "give the noise in dB, above 0"
-            remedy = f"where {RSSI}{ids[anchor]} is known; {remedy}"
-        refuse(DataFault(table.path, f"{what}, {remedy}", row=int(row) + 1))
+            text += f"where {strength_column} is known; {remedy}"
+        refuse(DataFault(table.path, text, row=int(row) + 1))
     return values
 
 
 def _signal_strength(table: files.CsvTable, ids: list[str], anchors: files.CsvTable) -> NDArray[np.float32]:
     columns = _by_anchor(RSSI, table)
-    unknown = sorted(column for anchor, column in columns.items() if anchor not in ids)
+    unknown = sorted(columns[anchor] for anchor in columns.keys() - ids)
     lacking = [anchor for anchor in ids if anchor not in columns]
-    if unknown or lacking:
+    if columns.keys() != set(ids):
         text = f"{len(columns)} columns {RSSI}*, but {anchors.path.name} has {len(ids)} anchors"
         which = f"{one_line(unknown[0])} belongs to none" if unknown else f"{RSSI}{lacking[0]} is missing"
         remedy = "give one column per anchor, named by its id"

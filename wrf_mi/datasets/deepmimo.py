@@ -39,28 +39,19 @@ from ..parallel import run_module
 from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
 from .read_mat import FAULT
 
-CHANNEL_PARAMS = "channel_params.yml"
-"""File of a scenario's folder that selects what is computed; optional."""
-MAX_NUMBER, MAX_ELEMENTS = 1 << 20, 1 << 10
-"""Most subcarriers, and most elements of an array along one axis."""
+CHANNEL_PARAMS = "channel_params.yml"  # file of a scenario's folder that selects what is computed; optional
+MAX_NUMBER, MAX_ELEMENTS = 1 << 20, 1 << 10  # most subcarriers, and most elements of an array along one axis
 PARAMS = "params.json"
-OLD_PARAMS = "params.mat"
-"""File of scenarios before version 4."""
+OLD_PARAMS = "params.mat"  # file of scenarios before version 4
 VERSION = "4.0.5"
 """Version of the package whose format is described here; scenarios of all versions 4 are read."""
-SUFFIXES = (".mat", ".npz", ".npy")
-"""Formats of a matrix, in the order in which the package tries them."""
+SUFFIXES = (".mat", ".npz", ".npy")  # formats of a matrix, in the order in which the package tries them
 PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 """Matrices [users, paths]: dBW, degrees, seconds; azimuths and zenith angles in degrees. NaN: no path."""
-TEST_FRACTION = 0.2
-"""Share of the users with a path in the official test rows."""
+TEST_FRACTION = 0.2  # share of the users with a path in the official test rows
 SPLIT_SEED = 0
-MAT_S, MAT_BYTES_PER_S = 30.0, 1 << 20
-"""Time that the process which reads MAT files has."""
-VALUES_PER_CHUNK = 1 << 20
-"""Complex values of the largest array in a chunk of users."""
-
-
+MAT_S, MAT_BYTES_PER_S = 30.0, 1 << 20  # time that the process which reads MAT files has
+VALUES_PER_CHUNK = 1 << 20  # complex values of the largest array in a chunk of users
 Pattern = Literal["isotropic", "halfwave-dipole"]
 """DeepMIMO's names of antenna patterns."""
 
@@ -106,10 +97,10 @@ class _ChannelParams(CheckedSettings):
         if isinstance(self.base_stations, tuple):
             lists["base_stations"] = self.base_stations, MAX_NUMBER
         for name, (numbers, high) in lists.items():
-            if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0 or max(numbers) > high:
+            if len(set(numbers)) < len(numbers) or not 0 <= min(numbers, default=-1) <= max(numbers) <= high:
                 text = f"setting {name}: {shown(list(numbers))}"
                 raise InputError(f"{text}; give a list of different whole numbers from 0 to {high}")
-        if min(self.bs_antenna.shape) < 1 or max(self.bs_antenna.shape) > MAX_ELEMENTS:
+        if not 1 <= min(self.bs_antenna.shape) <= max(self.bs_antenna.shape) <= MAX_ELEMENTS:
             text = f"setting bs_antenna.shape: {shown(list(self.bs_antenna.shape))}"
             raise InputError(f"{text}; give two whole numbers from 1 to {MAX_ELEMENTS}, elements along y and z")
         if not fits_single(np.array([*self.bs_antenna.rotation, self.bs_antenna.spacing, self.ofdm.bandwidth])):
@@ -134,13 +125,14 @@ class _ChannelParams(CheckedSettings):
 
 
 def _antennas(chosen: _ChannelParams) -> tuple[Antenna, ...]:
-    """Antenna of the base stations and of the users."""
     patterns = (chosen.bs_antenna.radiation_pattern, "array"), (chosen.ue_antenna.radiation_pattern, "world")
     # An isotropic antenna is vertical in the world, as everywhere; powers do not state another polarisation.
     return tuple(ANTENNA if name == "isotropic" else Antenna("hw_dipole", frame=frame) for name, frame in patterns)
 
 
-def _channel_params(file: Path, stated: Mapping[str, Any]) -> _ChannelParams:
+def _channel_params(file: Path, stated: Mapping[str, Any] | None) -> _ChannelParams:
+    if stated is None:
+        stated = read_yaml(file) if file.exists() else {}
     try:
         return settings_from(_ChannelParams, stated, str(file))
     except InputError as error:
@@ -174,21 +166,18 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
         InputError: anything missing, unreadable or inconsistent, or several base stations without a choice.
     """
     folder = data_folder(path, f"a scenario of DeepMIMO, {PARAMS} and its matrices")
-    scenario, file = _read_scenario(folder), folder / CHANNEL_PARAMS
-    if params is None:
-        params = read_yaml(file) if file.exists() else {}
-    chosen = _channel_params(file, params)
+    scenario, chosen = _read_scenario(folder), _channel_params(folder / CHANNEL_PARAMS, params)
     bs_antenna, ue_antenna = _antennas(chosen)
     orientation = Rotation.from_matrix(chosen.rotation @ DEVICE_TO_ARRAY.T).as_quat()
     numbers = _choose(scenario, chosen)
-    of_stations = [_of_station(scenario, scenario.stations[number], chosen) for number in numbers]
-    users = of_stations[0][1]
-    for number, (_, others, _) in zip(numbers, of_stations, strict=True):
-        if not np.array_equal(others, users):
+    of_stations = (_of_station(scenario, scenario.stations[number], chosen) for number in numbers)
+    positions_m, (users, *others), channels = zip(*of_stations, strict=True)
+    for number, other in zip(numbers[1:], others, strict=True):
+        if not np.array_equal(other, users):
             text = f"users of base station {number} are at other positions than those of {numbers[0]}"
             raise InputError(f"{folder}: {text}; choose one of them in {CHANNEL_PARAMS}")
-    observation = np.stack([channel for _, _, channel in of_stations])
-    finite = np.isfinite(observation).reshape(len(of_stations), len(users), -1)
+    observation = np.stack(channels)
+    finite = np.isfinite(observation).reshape(len(numbers), len(users), -1)
     received = np.flatnonzero(finite.all(axis=2).any(axis=0))
     if len(received) < 2:
         text = f"{len(received)} of {len(users)} users have a path to the base stations {numbers}"
@@ -197,18 +186,18 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
     if official is None:
         order, n_test = np.random.default_rng(SPLIT_SEED).permutation(received), round(TEST_FRACTION * len(received))
         official = np.sort(order[max(1, n_test) :]), np.sort(order[: max(1, n_test)])
-    array_m = (chosen.elements @ DEVICE_TO_ARRAY.T) * (speed_of_light / scenario.carrier_hz)
-    several = len(array_m) > 1
-    receivers = (
-        Receiver(f"bs{number}", position, orientation, bs_antenna, array_m if several else None)
-        for number, (position, _, _) in zip(numbers, of_stations, strict=True)
-    )
+    array_m: FloatArray | None = (chosen.elements @ DEVICE_TO_ARRAY.T) * (speed_of_light / scenario.carrier_hz)
+    if len(chosen.elements) == 1:
+        array_m, observation = None, observation[:, :, 0]
     return Record(
         name=name or folder.resolve().name,
         task="csi",
         tx_pos_m=users,
-        receivers=tuple(receivers),
-        observation=observation if several else observation[:, :, 0],
+        receivers=tuple(
+            Receiver(f"bs{number}", position, orientation, bs_antenna, array_m)
+            for number, position in zip(numbers, positions_m, strict=True)
+        ),
+        observation=observation,
         official=official,
         frequencies_hz=scenario.carrier_hz + chosen.offsets_hz,
         tx_antenna=ue_antenna,
@@ -217,6 +206,20 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
 
 
 def _read_scenario(folder: Path) -> _Scenario:
+    file = folder / PARAMS
+    stated = _read_params(folder)
+    scene, rt_params = (_mapping(file, stated, key) for key in ("scene", "rt_params"))
+    if (scenes := scene.get("num_scenes", 1)) != 1:
+        text = f"dynamic scenario of {shown(scenes)} scenes"
+        raise InputError(f"{file}: {text}; give the folder of one scene, with a {PARAMS} that states num_scenes 1")
+    carrier = numbers_of(rt_params.get("frequency"))
+    if carrier.size != 1 or not 0 < carrier.item() < np.inf:
+        raise InputError(f"{file}: rt_params: frequency is {shown(rt_params.get('frequency'))}; give the carrier in Hz")
+    return _Scenario(folder, float(carrier.item()), *_stations_and_users(file, _mapping(file, stated, "txrx_sets")))
+
+
+def _read_params(folder: Path) -> Mapping[str, Any]:
+    """Content of `PARAMS`, checked to be of a version 4."""
     file = folder / PARAMS
     if not file.exists() and (folder / OLD_PARAMS).exists():
         text = f"{folder / OLD_PARAMS}: a scenario before version 4 of DeepMIMO"
@@ -229,26 +232,22 @@ def _read_scenario(folder: Path) -> _Scenario:
     if not isinstance(version, str) or version.partition(".")[0] != "4":
         text = f"version {shown(version)} of DeepMIMO"
         raise InputError(f"{file}: {text}; give a scenario of version 4, such as {VERSION}")
-    scene, rt_params = (_mapping(file, stated, key) for key in ("scene", "rt_params"))
-    if (scenes := scene.get("num_scenes", 1)) != 1:
-        text = f"dynamic scenario of {shown(scenes)} scenes"
-        raise InputError(f"{file}: {text}; give the folder of one scene, with a {PARAMS} that states num_scenes 1")
-    carrier = numbers_of(rt_params.get("frequency"))
-    if carrier.size != 1 or not 0 < carrier.item() < np.inf:
-        raise InputError(f"{file}: rt_params: frequency is {shown(rt_params.get('frequency'))}; give the carrier in Hz")
-    known = _mapping(file, stated, "txrx_sets")
-    sets = [_mapping(file, known, key) for key in sorted(known, key=str) if str(key).startswith("txrx_set_")]
-    stations = [
-        (_number(file, entry, "id"), index)
-        for entry in sets
-        if entry.get("is_tx")
-        for index in range(_number(file, entry, "num_points"))
-    ]
-    users = [_number(file, entry, "id") for entry in sets if entry.get("is_rx") and not entry.get("is_tx")]
-    for what, found_sets in (("base station (is_tx)", stations), ("set of users (is_rx, not is_tx)", users)):
-        if not found_sets:
+    return stated
+
+
+def _stations_and_users(file: Path, stated: Mapping[Any, Any]) -> tuple[list[tuple[int, int]], list[int]]:
+    """Base stations as (set, number in the set), and sets of users."""
+    stations: list[tuple[int, int]] = []
+    users: list[int] = []
+    for entry in (_mapping(file, stated, key) for key in sorted(stated, key=str) if str(key).startswith("txrx_set_")):
+        if entry.get("is_tx"):
+            stations += [(_number(file, entry, "id"), k) for k in range(_number(file, entry, "num_points"))]
+        elif entry.get("is_rx"):
+            users.append(_number(file, entry, "id"))
+    for what, of_kind in (("base station (is_tx)", stations), ("set of users (is_rx, not is_tx)", users)):
+        if not of_kind:
             raise InputError(f"{file}: no {what} in txrx_sets; give a scenario that has one")
-    return _Scenario(folder, float(carrier.item()), stations, users)
+    return stations, users
 
 
 def _mapping(file: Path, stated: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
@@ -267,7 +266,6 @@ def _number(file: Path, entry: Mapping[Any, Any], key: str) -> int:
 
 
 def _choose(scenario: _Scenario, chosen: _ChannelParams) -> list[int]:
-    """Numbers of the chosen base stations."""
     count, file = len(scenario.stations), scenario.folder / CHANNEL_PARAMS
     if chosen.base_stations is None and count > 1:
         text = f"{scenario.folder}: {count} base stations, 0 to {count - 1}"
@@ -287,20 +285,9 @@ def _of_station(
     for user_set in scenario.user_sets:
         pair = f"t{station[0]:03}_tx{station[1]:03}_r{user_set:03}"
         paths = _matrices(scenario.folder, pair)
-        station_m, users_m = paths.pop("tx_pos"), paths.pop("rx_pos")
-        if station_m.size != 3 or not np.isfinite(station_m).all():
-            text = f"tx_pos_{pair} has shape {list(station_m.shape)} or is not finite"
-            raise InputError(f"{scenario.folder}: {text}; it must be x, y, z in metres")
-        if users_m.ndim != 2 or users_m.shape[1] != 3 or not np.isfinite(users_m).all():
-            text = f"rx_pos_{pair} has shape {list(users_m.shape)} or is not finite"
-            raise InputError(f"{scenario.folder}: {text}; it must be [users, 3] in metres")
-        expected = (len(users_m), *paths["power"].shape[1:2])
-        for key, values in paths.items():
-            if values.ndim != 2 or values.shape != expected:
-                text = f"{key}_{pair} has shape {list(values.shape)}, expected {list(expected)} as rx_pos and power"
-                raise InputError(f"{scenario.folder}: {text}; fetch the scenario again")
-        positions.append(station_m.reshape(3).astype(float))
-        users.append(users_m.astype(float))
+        _check_shapes(scenario.folder, pair, paths)
+        positions.append(paths.pop("tx_pos").reshape(3).astype(float))
+        users.append(paths.pop("rx_pos").astype(float))
         channels.append(_channels(scenario, pair, paths, chosen))
     if any(not np.array_equal(position, positions[0]) for position in positions):
         text = f"base station {station[1]} of set {station[0]} has several positions"
@@ -308,25 +295,36 @@ def _of_station(
     return positions[0], np.concatenate(users), np.concatenate(channels)
 
 
+def _check_shapes(folder: Path, pair: str, matrices: Mapping[str, NDArray[Any]]) -> None:
+    station, users = matrices["tx_pos"], matrices["rx_pos"]
+    for key, fits, wanted in (
+        ("tx_pos", station.size == 3, "x, y, z in metres"),
+        ("rx_pos", users.shape[1:] == (3,), "[users, 3] in metres"),
+    ):
+        if not (fits and np.isfinite(matrices[key]).all()):
+            text = f"{key}_{pair} has shape {list(matrices[key].shape)} or is not finite"
+            raise InputError(f"{folder}: {text}; it must be {wanted}")
+    expected = (len(users), *matrices["power"].shape[1:2])
+    for key in PATH_MATRICES:
+        if matrices[key].ndim != 2 or matrices[key].shape != expected:
+            shape = list(matrices[key].shape)
+            text = f"{key}_{pair} has shape {shape}, expected {list(expected)} as rx_pos and power"
+            raise InputError(f"{folder}: {text}; fetch the scenario again")
+
+
 def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
     """Matrices of a pair of a base station and a set of users, in whichever format each is stored."""
     files = {}
     for key in ("tx_pos", "rx_pos", *PATH_MATRICES):
-        stem = f"{key}_{pair}"
-        file = next((folder / f"{stem}{s}" for s in SUFFIXES if (folder / f"{stem}{s}").exists()), None)
-        if file is None:
-            raise InputError(f"{folder / stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
-        files[key] = file
-    of_mat = _mat_arrays({key: file for key, file in files.items() if file.suffix == ".mat"})
+        stem = folder / f"{key}_{pair}"
+        files[key] = next(filter(Path.exists, (Path(f"{stem}{suffix}") for suffix in SUFFIXES)), stem)
+        if files[key] == stem:
+            raise InputError(f"{stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
+    of_mat = _mat_arrays(files)
     matrices = {}
     for key, file in files.items():
         with readable(file, "", "fetch the scenario again"):
-            if file.suffix == ".mat":
-                values = of_mat.get(key)
-                if fault := of_mat.get(f"{FAULT}{key}"):
-                    raise ValueError(str(fault))
-            else:
-                values = stored_array(file) if file.suffix == ".npy" else stored_arrays(file).get(key)
+            values = _matrix(file, key, of_mat)
         if values is None or values.dtype.kind not in "fiu":
             what = f"no array {key}" if values is None else f"{key} holds {values.dtype}"
             raise InputError(f"{file}: {what}; give real numbers by the name {key}")
@@ -334,8 +332,17 @@ def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
     return matrices
 
 
+def _matrix(file: Path, key: str, of_mat: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
+    if file.suffix != ".mat":
+        return stored_array(file) if file.suffix == ".npy" else stored_arrays(file).get(key)
+    if fault := of_mat.get(f"{FAULT}{key}"):
+        raise ValueError(str(fault))
+    return of_mat.get(key)
+
+
 def _mat_arrays(files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
-    """Arrays of MAT files by their keys, and messages of those that cannot be read."""
+    """Arrays of those files that are MAT files by their keys, and messages of those that cannot be read."""
+    files = {key: file for key, file in files.items() if file.suffix == ".mat"}
     if not files:
         return {}
     with tempfile.TemporaryDirectory() as place:
@@ -367,8 +374,7 @@ def _channels(
         symbol_s = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
         if delay.max(initial=0.0) >= symbol_s:  # the package would leave such a path out
             text = f"{pair} has a delay of {delay.max():.3g} s, and a symbol of subcarriers / bandwidth lasts"
-            remedy = f"give more subcarriers in {CHANNEL_PARAMS}"
-            raise InputError(f"{scenario.folder}: {text} {symbol_s:.3g} s; {remedy}")
+            raise InputError(f"{scenario.folder}: {text} {symbol_s:.3g} s; give more subcarriers in {CHANNEL_PARAMS}")
         departure, arrival = (
             unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
             for azimuth, zenith in (angles[:2], angles[2:])

@@ -27,12 +27,9 @@ from ..core.files import atomic_folder, one_line
 from .newrf import KEYS, arrays_sha256, convert_newrf, read_arrays
 from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, known, locate, remote_files
 
-THREADS = 8
-"""Number of simultaneous downloads."""
-RETRIES = 2
-"""Number of further attempts after a failure."""
-TIMEOUT_S = 30
-"""Seconds without an answer after which a download fails."""
+THREADS = 8  # number of simultaneous downloads
+RETRIES = 2  # number of further attempts after a failure
+TIMEOUT_S = 30  # seconds without an answer after which a download fails
 MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
 """Largest download of a file that is kept (those known have less than 1 MB), and of one that is converted."""
 
@@ -62,18 +59,13 @@ def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> P
 def download(dataset: DataSet, entries: list[RemoteFile], target: Path, base_url: str, progress: bool = False) -> Path:
     """Download ``entries`` from below ``base_url`` into ``target``, with the data set's folds, as `fetch` does."""
     if target.exists():
-        damaged = [entry.path for entry in entries if not _is_intact(target / entry.path, entry)]
-        if damaged:
-            text = f"is not the published file ({len(damaged)} of {len(entries)} are not)"
-            raise InputError(f"{target / damaged[0]}: missing or {text}; remove {target} and fetch it again")
+        _check_copy(target, entries)
         return target
     with atomic_folder(target) as part:
         urls = {entry.path: f"{base_url.rstrip('/')}/{entry.remote}" for entry in entries}
-        hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
         for entry in entries:  # pooch makes folders too, but not if two threads do at once
             (part / entry.path).parent.mkdir(parents=True, exist_ok=True)
-        store = pooch.create(path=part, base_url="", registry=hashes, urls=urls, retry_if_failed=RETRIES)
-        _fetch_all(store, dataset.name, progress, {entry.path for entry in entries if entry.converted})
+        _fetch_all(part, dataset.name, entries, urls, progress)
         for entry in entries:
             if entry.converted:
                 _convert(part / entry.path, entry, f"data set {dataset.name}: {urls[entry.path]}")
@@ -84,8 +76,14 @@ def download(dataset: DataSet, entries: list[RemoteFile], target: Path, base_url
     return target
 
 
+def _check_copy(folder: Path, entries: list[RemoteFile]) -> None:
+    damaged = [entry.path for entry in entries if not _is_intact(folder / entry.path, entry)]
+    if damaged:
+        text = f"is not the published file ({len(damaged)} of {len(entries)} are not)"
+        raise InputError(f"{folder / damaged[0]}: missing or {text}; remove {folder} and fetch it again")
+
+
 def _convert(path: Path, entry: RemoteFile, source: str) -> None:
-    """Replace an original file by the converted file."""
     remedy = f"nothing was kept; set {DATA_VARIABLE} to a folder that holds {path.name} in this form"
     try:
         arrays = convert_newrf(path)
@@ -101,8 +99,6 @@ class _TooLarge(Exception):
 
 
 class _Bounded(io.FileIO):
-    """A file that takes a number of bytes at most."""
-
     def __init__(self, path: str, most: int) -> None:
         super().__init__(path, "w")
         self.left = most
@@ -114,7 +110,9 @@ class _Bounded(io.FileIO):
         return super().write(data)
 
 
-def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str]) -> None:
+def _fetch_all(folder: Path, name: str, entries: list[RemoteFile], urls: dict[str, str], progress: bool) -> None:
+    hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
+    store = pooch.create(path=folder, base_url="", registry=hashes, urls=urls, retry_if_failed=RETRIES)
     unbounded = pooch.HTTPDownloader(timeout=TIMEOUT_S)
 
     def bounded(url: str, path: str, store: pooch.Pooch, most: int) -> None:
@@ -131,14 +129,13 @@ def _fetch_all(store: pooch.Pooch, name: str, progress: bool, converted: set[str
         task = bar.add_task(f"fetching {name}", total=len(store.registry))
         logger.setLevel(logging.WARNING)  # one line per file otherwise
         jobs = {}
-        for path in store.registry:
-            most = MOST_CONVERTED if path in converted else MOST_BYTES
-            jobs[pool.submit(store.fetch, path, downloader=partial(bounded, most=most))] = path
+        for entry in entries:
+            most = MOST_CONVERTED if entry.converted else MOST_BYTES
+            jobs[pool.submit(store.fetch, entry.path, downloader=partial(bounded, most=most))] = entry.path
         try:
             for job in as_completed(jobs):
                 if (error := job.exception()) is not None:
-                    text = _failure(error, store.get_url(jobs[job]), name)
-                    raise InputError(f"data set {name}: {text}") from None
+                    raise InputError(f"data set {name}: {_failure(error, store.get_url(jobs[job]), name)}") from None
                 bar.advance(task)
         finally:
             pool.shutdown(cancel_futures=True)

@@ -20,19 +20,15 @@ from ..core.types import IntArray
 from .faults import Attempt, attempt, recoverable, refuse, stop_at_faults
 
 POSITIONS = "tx_pos.csv"
-AXES = "x,y,z"
-"""Columns of positions, metres."""
-RUN = "run"
-"""Column with the run of the measurement in which each row was taken: a text without line ends."""
+AXES = "x,y,z"  # columns of positions, metres
+RUN = "run"  # column with the run of the measurement in which each row was taken: a text without line ends
 INDEX_FILES = ("train_index.txt", "test_index.txt")
 TX_ANTENNA = "tx_antenna"
 ANTENNA_WORDS = ("pattern", "polarization", "frame")
 TX_ANTENNA_WORDS = ANTENNA_WORDS[:2]
 """Keys of a transmitter's antenna, whose frame is always the world, turned with the heading."""
-SINGLE_MAX = float(np.finfo(np.float32).max)
-"""Largest number in single precision, in which everything is computed."""
-DIGITS = 18
-"""Most digits of a whole number; more may not fit into 64 bits."""
+SINGLE_MAX = float(np.finfo(np.float32).max)  # largest number in single precision, in which everything is computed
+DIGITS = 18  # most digits of a whole number; more may not fit into 64 bits
 
 
 def data_folder(path: str | Path, content: str) -> Path:
@@ -97,8 +93,7 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
     orientation = finite_numbers(path, f"{name}: orientation", value, 4)
     norm = float(np.linalg.norm(orientation))
     if abs(norm - 1) > UNIT_QUATERNION_TOLERANCE:
-        text = f"{one_line(name)}: quaternion of norm {norm:.4g}"
-        raise DataFault(path, f"{text}; orientation must be a unit x, y, z, w")
+        raise DataFault(path, f"{one_line(name)}: quaternion of norm {norm:.4g}; orientation must be a unit x, y, z, w")
     return orientation
 
 
@@ -158,13 +153,10 @@ class CsvTable:
             text = fields[index].strip()
             if may_be_empty and text.lower() in ("", "nan"):
                 continue
-            try:
-                values[row] = float(text)
-            except ValueError:
-                values[row] = np.nan
+            values[row] = _number(text)
             if not abs(values[row]) <= SINGLE_MAX:
-                remedy = "give a finite number" + (" of single precision" if np.isfinite(values[row]) else "")
-                remedy += ", or leave it empty" if may_be_empty else ""
+                remedy = "give a finite number" + " of single precision" * bool(np.isfinite(values[row]))
+                remedy += ", or leave it empty" * may_be_empty
                 refuse(DataFault(self.path, f"{one_line(column)} is {text[:40]!r}; {remedy}", row=row + 1))
                 values[row] = np.inf
         return values
@@ -184,6 +176,13 @@ class CsvTable:
         return self.header.index(column)
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
 def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     """Read a CSV file whose first line is its header.
 
@@ -192,7 +191,9 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
     Raises:
         InputError: missing, not text, without rows, or with a row that has more or fewer fields than the header.
     """
-    lines = [line for line in text_lines(path) if line.strip() or not skip_blank]
+    lines = text_lines(path)
+    if skip_blank:
+        lines = list(filter(str.strip, lines))
     if not lines:
         raise DataFault(path, "empty; give a header and one row per measurement")
     try:
@@ -201,13 +202,11 @@ def read_csv(path: Path, skip_blank: bool = False) -> CsvTable:
         raise DataFault(path, f"not a CSV file ({one_line(error)}); correct it") from None
     if not rows:
         raise DataFault(path, "no rows below the header; give one per measurement")
-    damaged = set()
-    for row, fields in enumerate(rows, start=1):
-        if len(fields) != len(header):
-            text = f"{len(fields)} {'field' if len(fields) == 1 else 'fields'}, but the header has {len(header)}"
-            refuse(DataFault(path, f"{text}; correct or remove the row", row=row))
-            damaged.add(row - 1)
-    return CsvTable(path, [name.strip() for name in header], rows, frozenset(damaged))
+    damaged = [row for row, fields in enumerate(rows) if len(fields) != len(header)]
+    for row in damaged:
+        text = f"{len(rows[row])} field{'s' * (len(rows[row]) != 1)}, but the header has {len(header)}"
+        refuse(DataFault(path, f"{text}; correct or remove the row", row=row + 1))
+    return CsvTable(path, list(map(str.strip, header)), rows, frozenset(damaged))
 
 
 def read_columns(path: Path, *headers: str) -> FloatArray:
@@ -293,8 +292,7 @@ def read_official(folder: Path, rows: int, first: int, source: str = POSITIONS) 
         return None
     train, test = (attempt(_read_index, path, rows, first, source) for path in files)
     for row in np.intersect1d(train.value, test.value):
-        text = f"row {row + first} is in {files[0].name} as well; remove it from one of them"
-        refuse(DataFault(files[1], text))
+        refuse(DataFault(files[1], f"row {row + first} is in {files[0].name} as well; remove it from one of them"))
     return train.value, test.value
 
 

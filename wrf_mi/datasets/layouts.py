@@ -73,8 +73,6 @@ BUILT_IN = (
     Layout("newrf", "csi", read_newrf, suffixes=(".npz",)),
     Layout("argos", "csi", read_argos, suffixes=SUFFIXES),
 )
-
-
 LAYOUTS = Registry[Layout]("layout", ENTRY_POINTS, {layout.name: layout for layout in BUILT_IN})
 """All layouts by name."""
 
@@ -91,17 +89,16 @@ def layout_of(path: Path) -> Layout:
         InputError: it has none; the message says what it holds and what is wanted.
     """
     present = [path] if path.is_file() else sorted(path.iterdir())
-    candidates = [] if path.is_file() else _by_files(path)
-    candidates += [layout for layout in layouts() if any(map(layout.reads, present))]
-    candidates += [layout for layout in layouts() if any((path / file).exists() for file in layout.parts)]
+    by_suffix = [layout for layout in layouts() if any(map(layout.reads, present))]
+    candidates = [*_by_names(path, "files"), *by_suffix, *_by_names(path, "parts")]
     if not candidates:
-        raise unknown_data(path, [folder for folder in present if folder.is_dir() and _by_files(folder)])
+        raise unknown_data(path, [folder for folder in present if folder.is_dir() and _by_names(folder, "files")])
     return candidates[0]
 
 
-def _by_files(folder: Path) -> list[Layout]:
-    """Layouts of which a folder has a file."""
-    return [layout for layout in layouts() if any((folder / file).exists() for file in layout.files)]
+def _by_names(folder: Path, attribute: str) -> list[Layout]:
+    """Layouts with an attribute, ``files`` or ``parts``, that names a file in a folder."""
+    return [layout for layout in layouts() if any((folder / file).exists() for file in getattr(layout, attribute))]
 
 
 def is_data(path: Path) -> bool:

@@ -23,19 +23,16 @@ from .faults import attempt, recoverable, refuse
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
 NOT_RECEIVED_DBM = -100.0
-CARRIER_HZ = 2.44e9
-"""The middle of BLE's band, 2402 to 2480 MHz (Bluetooth Core Specification, volume 6, part A)."""
-FEWEST = 2
-"""Least number of rows: one to train on and one to score."""
+CARRIER_HZ = 2.44e9  # the middle of BLE's band, 2402 to 2480 MHz (Bluetooth Core Specification, volume 6, part A)
+FEWEST = 2  # least number of rows: one to train on and one to score
 
 
 def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's signal strengths (see ``docs/data.md``).
 
-    The record has the folder's name unless another is given.
-
     Returns:
-        A record with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where nothing was received.
+        A record, by default named after the folder, with ``task="rssi"``: ``observation`` [n_rx, n] in dBm, NaN where
+        nothing was received.
 
     Raises:
         InputError: anything missing, unreadable or inconsistent, or a single transmission; one line with the file and
@@ -94,24 +91,26 @@ def _count_rows(table: files.CsvTable) -> int:
 
 def _read_powers(path: Path, info: dict[Any, Any]) -> NDArray[np.float32]:
     """Powers [gateways, rows] in dBm, NaN where nothing was received."""
-    table, gateways = _headed(path), [str(key) for key in info]
-    if len(table.header) != len(gateways):
-        text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways; give one column per gateway"
-        raise DataFault(path, text, line=1)
-    named = set(table.header) & set(gateways)
-    if named != set(gateways) and _numbered(table):
-        named = set()  # pandas' numbers, though a gateway may have such a name
-    if named and named != set(gateways):
-        lacking = next(gateway for gateway in gateways if gateway not in named)
-        text = f"no column {lacking}; name all columns as {GATEWAYS} does, or none"
-        raise DataFault(path, text, line=1)
-    if named:
-        power = np.stack([table.numbers(gateway) for gateway in gateways])
-    else:
-        columns = [f"{column} ({gateway})" for column, gateway in zip(table.header, gateways, strict=True)]
-        power = np.stack([table.numbers(f"column {what}", index=index) for index, what in enumerate(columns)])
+    table = _headed(path)
+    columns = _columns(table, list(map(str, info)))
+    power = np.stack([table.numbers(name, index=index) for name, index in columns])
     power[power == NOT_RECEIVED_DBM] = np.nan
     return power.astype(np.float32)
+
+
+def _columns(table: files.CsvTable, gateways: list[str]) -> list[tuple[str, int | None]]:
+    """Name in messages and index of each gateway's column, None where the name is that of the column."""
+    if len(table.header) != len(gateways):
+        text = f"{len(table.header)} columns, but {GATEWAYS} has {len(gateways)} gateways; give one column per gateway"
+        raise DataFault(table.path, text, line=1)
+    lacking = [gateway for gateway in gateways if gateway not in table.header]
+    if not lacking:
+        return [(gateway, None) for gateway in gateways]
+    # Gateways may be called like some of pandas' numbers.
+    if len(lacking) < len(gateways) and not _numbered(table):
+        raise DataFault(table.path, f"no column {lacking[0]}; name all columns as {GATEWAYS} does, or none", line=1)
+    pairs = zip(table.header, gateways, strict=True)
+    return [(f"column {column} ({gateway})", index) for index, (column, gateway) in enumerate(pairs)]
 
 
 def _headed(path: Path) -> files.CsvTable:
@@ -123,8 +122,7 @@ def _headed(path: Path) -> files.CsvTable:
         return table
     if _numbered(table):
         return table
-    text = f"{','.join(table.header)[:40]!r} is a row of numbers; put a header above it"
-    raise DataFault(path, text, line=1)
+    raise DataFault(path, f"{','.join(table.header)[:40]!r} is a row of numbers; put a header above it", line=1)
 
 
 def _numbered(table: files.CsvTable) -> bool:

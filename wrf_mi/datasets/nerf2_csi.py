@@ -26,8 +26,7 @@ from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
 
 CHANNELS, STATION, TRUTH = "csidata.npy", "base-station.yml", "downlink_truth.npy"
-FEWEST = 2
-"""Least number of samples: one to train on and one to score."""
+FEWEST = 2  # least number of samples: one to train on and one to score
 
 
 def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
@@ -56,15 +55,12 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
             text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
             raise DataFault(station, f"{text}; give one for each")
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
-    stated = (
-        attempt(files.read_columns, folder / files.POSITIONS, files.AXES)
-        if (folder / files.POSITIONS).exists()
-        else None
-    )
+    positions = folder / files.POSITIONS
+    stated = attempt(files.read_columns, positions, files.AXES) if positions.exists() else None
     with recoverable():
         if stated is not None and len(stated.value) != n.value:
             text = f"{len(stated.value)} rows, but {CHANNELS} has {n.value} samples; give one for each"
-            raise DataFault(folder / files.POSITIONS, text)
+            raise DataFault(positions, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(files.read_official, folder, n, 0, CHANNELS)
     tx_antenna = attempt(files.read_tx_antenna, station, info)
@@ -98,22 +94,13 @@ def write_nerf2_csi(
         InputError: the folder exists or cannot be written, or the record does not fit the layout.
     """
     down, up, array_m = record.observation, record.uplink, record.receivers[0].array_m
-    if down.ndim != 4 or len(down) != 1 or up is None or up.shape != down.shape[1:] or array_m is None:
+    if down.ndim != 4 or up is None or down.shape != (1, *up.shape) or array_m is None:
         need = "one receiver with array_m, and an uplink of as many antennas and subcarriers as the downlink"
         raise InputError(f"{path}: {record.name} cannot be written as {CHANNELS}; it needs {need}")
     files.refuse_unstated(path, record, "folds", "tx_heading_rad", "n_readings", "std", "carriers_hz", "runs")
-    receiver = record.receivers[0]
-    info: dict[str, Any] = {
-        "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),
-        "orientation": receiver.orientation_xyzw.tolist(),
-    }
-    if record.uplink_hz is not None and record.frequencies_hz is not None:
-        info["frequencies_hz"] = [*record.uplink_hz.tolist(), *record.frequencies_hz.tolist()]
-    antennas = {"antenna": files.antenna_entry(receiver.antenna), "tx_antenna": files.antenna_entry(record.tx_antenna)}
-    info |= {key: value for key, value in antennas.items() if value}
     with atomic_folder(Path(path), replace) as part:
         np.save(part / CHANNELS, np.concatenate([up, down[0]], axis=-1).astype(np.complex64))
-        text = yaml.safe_dump(info, sort_keys=False, default_flow_style=None)
+        text = yaml.safe_dump(_station_info(record, array_m), sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
             files.write_positions(part / files.POSITIONS, files.Positions(record.tx_pos_m))
@@ -122,6 +109,18 @@ def write_nerf2_csi(
         files.write_official(part, record.official, first=0)
         files.write_extra(part, extra)
     return Path(path)
+
+
+def _station_info(record: Record, array_m: FloatArray) -> dict[str, Any]:
+    receiver = record.receivers[0]
+    info: dict[str, Any] = {
+        "base_station": (receiver.position_m + array_m @ receiver.to_world.T).tolist(),
+        "orientation": receiver.orientation_xyzw.tolist(),
+    }
+    if record.uplink_hz is not None and record.frequencies_hz is not None:
+        info["frequencies_hz"] = [*record.uplink_hz.tolist(), *record.frequencies_hz.tolist()]
+    antennas = {"antenna": files.antenna_entry(receiver.antenna), "tx_antenna": files.antenna_entry(record.tx_antenna)}
+    return info | {key: value for key, value in antennas.items() if value}
 
 
 def _read_channels(path: Path) -> NDArray[np.complex64]:
@@ -165,11 +164,8 @@ def _frequencies(
     if stated is None:
         return None
     frequencies, subcarriers = files.numbers_of(stated), channel.shape[2]
-    if (
-        frequencies.ndim != 1
-        or not len(frequencies)
-        or not (files.fits_single(frequencies) and (frequencies > 0).all())
-    ):
+    positive = (frequencies > 0) & (frequencies <= files.SINGLE_MAX)
+    if frequencies.ndim != 1 or not len(frequencies) or not positive.all():
         raise DataFault(path, f"frequencies_hz is {files.shown(stated)}; give a list of frequencies in Hz")
     if len(frequencies) != subcarriers:
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
@@ -183,8 +179,7 @@ def _read_truth(path: Path, channel: NDArray[np.complex64]) -> NDArray[np.comple
         return None
     truth, shape = _read_channels(path), [*channel.shape[:2], channel.shape[2] // 2]
     if list(truth.shape) != shape:
-        text = f"shape {list(truth.shape)}, expected {shape}, as the downlink of {CHANNELS}; correct it"
-        raise DataFault(path, text)
+        raise DataFault(path, f"shape {list(truth.shape)}, expected {shape}, as the downlink of {CHANNELS}; correct it")
     return truth[None]
 
 

@@ -19,7 +19,7 @@ import itertools
 import math
 import pickle
 import pickletools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -40,12 +40,9 @@ TEST_FRACTION = 0.2
 """Share of the rows, the last ones, that the authors hold out (their ``DatasetLoader.split_train_val``)."""
 SCALARS = ("TxID", "RxID", "Frequency", "LineOfSight")
 ARRAYS = ("TxPos", "RxPos", "CSI", "LastXPts", "RxChanPerRay")
-LARGEST_BYTES = 64 * 2**20
-"""Largest file that is read."""
-NUMBERS = frozenset("?bBhHiIlLqQefdFD")
-"""Type characters of arrays of plain numbers."""
-PLAIN = (int, float, complex, type(None))
-"""Types of fields beside arrays in a column of objects."""
+LARGEST_BYTES = 64 * 2**20  # largest file that is read
+NUMBERS = frozenset("?bBhHiIlLqQefdFD")  # type characters of arrays of plain numbers
+PLAIN = (int, float, complex, type(None))  # types of fields beside arrays in a column of objects
 
 
 def read_newrf(path: str | Path, name: str | None = None) -> Record:
@@ -105,8 +102,7 @@ def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         if values.dtype.kind not in kinds:
             refuse(DataFault(file, f"{key} holds {values.dtype}; give {expected}"))
         elif values.shape != shapes[key]:
-            text = f"{key} has shape {list(values.shape)}, expected {list(shapes[key])}; correct it"
-            refuse(DataFault(file, text))
+            refuse(DataFault(file, f"{key} has shape {list(values.shape)}, expected {list(shapes[key])}; correct it"))
         else:
             finite = np.isfinite(np.atleast_1d(values))
             for row in 1 + np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim)))):
@@ -135,26 +131,30 @@ def convert_newrf(path: Path) -> dict[str, NDArray[Any]]:
 def _convert(columns: dict[str, Any]) -> dict[str, NDArray[Any]]:
     scalars = {key: np.asarray(columns[key], float) for key in SCALARS}
     rows = np.flatnonzero(np.isfinite(np.stack(list(scalars.values()))).all(axis=0))
-    tx_pos, frequency_ghz = (
-        np.unique(np.stack([np.asarray(values[r], float) for r in rows]), axis=0)
-        for values in (columns["TxPos"], scalars["Frequency"])
-    )
+    tx_pos = np.unique(np.stack(_fields(columns["TxPos"], rows, float, 3)), axis=0)
+    frequency_ghz = np.unique(scalars["Frequency"][rows])
     if len(tx_pos) != 1 or len(frequency_ghz) != 1:
         raise ValueError(f"{len(tx_pos)} transmitters and {len(frequency_ghz)} frequencies")
-    gains = [np.asarray(columns["RxChanPerRay"][r], complex).ravel() for r in rows]
+    gains = _fields(columns["RxChanPerRay"], rows, complex, -1)
     points = [np.asarray(columns["LastXPts"][r], float).T.reshape(-1, 3) for r in rows]
-    if any(len(g) != len(p) for g, p in zip(gains, points, strict=True)):
+    counts = [len(gain) for gain in gains]
+    if counts != [len(point) for point in points]:
         raise ValueError("a receiver with another number of gains than of points")
     return {
-        "tx_pos": tx_pos[0].reshape(3),
-        "rx_pos": np.stack([np.asarray(columns["RxPos"][r], float).reshape(3) for r in rows]),
+        "tx_pos": tx_pos[0],
+        "rx_pos": np.stack(_fields(columns["RxPos"], rows, float, 3)),
         "frequency_hz": np.asarray(frequency_ghz[0] * 1e9),
-        "csi": np.concatenate([np.asarray(columns["CSI"][r], complex).reshape(1) for r in rows]),
+        "csi": np.concatenate(_fields(columns["CSI"], rows, complex, 1)),
         "line_of_sight": scalars["LineOfSight"][rows] > 0,
-        "path_offsets": np.concatenate([[0], np.cumsum([len(g) for g in gains])]),
+        "path_offsets": np.concatenate([[0], np.cumsum(counts)]),
         "path_gain": np.concatenate(gains),
         "path_last_point": np.concatenate(points),
     }
+
+
+def _fields(column: Any, rows: NDArray[np.int64], kind: type, length: int) -> list[NDArray[Any]]:
+    """Lists of a number of values, or any for -1, in some rows of a column."""
+    return [np.asarray(column[row], kind).reshape(length) for row in rows]
 
 
 class _Named:
@@ -212,20 +212,21 @@ def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
     names = _names(index.get("data")) if isinstance(index, dict) else []
     if not names or not all(isinstance(name, str) for name in names):
         raise ValueError("columns without names")
-    columns: dict[str, list[Any] | NDArray[Any]] = {}
-    for block in blocks:
-        values, places, _ = _arguments(_named(block, "_unpickle_block"), 3)
-        rows = _array(values)
-        if _is(places, "slice"):
-            numbers = list(range(*_arguments(places, 3))[: len(rows) + 1])
-        else:
-            numbers = _array(places).tolist()
-        if len(numbers) != len(rows):
-            raise ValueError(f"{len(rows)} columns with {len(numbers)} numbers")
-        for number, row in zip(numbers, rows, strict=True):
-            plain = row.dtype != object
-            columns[names[number]] = row if plain else [f if isinstance(f, PLAIN) else _array(f) for f in row]
-    return columns
+    numbered = itertools.chain.from_iterable(map(_numbered_columns, blocks))
+    return {names[number]: column for number, column in numbered}
+
+
+def _numbered_columns(block: Any) -> Iterator[tuple[int, list[Any] | NDArray[Any]]]:
+    """Numbers of a block's columns, and their numbers or fields."""
+    values, places, _ = _arguments(_named(block, "_unpickle_block"), 3)
+    rows = _array(values)
+    in_steps = _is(places, "slice")
+    numbers = range(*_arguments(places, 3))[: len(rows) + 1] if in_steps else _array(places).tolist()
+    if len(numbers) != len(rows):
+        raise ValueError(f"{len(rows)} columns with {len(numbers)} numbers")
+    for number, row in zip(numbers, rows, strict=True):
+        plain = row.dtype != object
+        yield number, row if plain else [field if isinstance(field, PLAIN) else _array(field) for field in row]
 
 
 def _names(described: Any) -> list[Any]:
@@ -254,22 +255,27 @@ def _array(described: Any) -> NDArray[Any]:
             raise ValueError("an array without content")
         _, shape, dtype, fortran, data = state
         order = "F" if fortran else "C"
+    flat = _flat_array(data, dtype)
+    if math.prod(shape) != len(flat):
+        raise ValueError(f"{len(flat)} values for the shape {shape}")
+    return flat.reshape(shape, order=order)
+
+
+def _flat_array(data: Any, dtype: Any) -> NDArray[Any]:
+    """Values of an array in the order of its description, a copy."""
     code, *_ = _named(dtype, "dtype").args
     if code == "O8":
         if not isinstance(data, list):
             raise ValueError("an array of objects without a list")
-        flat = np.empty(len(data), object)
-        flat[:] = data
-    else:
-        endian = dtype.state[1] if isinstance(dtype.state, tuple) else "|"
-        if endian not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
-            raise ValueError(f"an array of type {code}")
-        if not isinstance(data, bytes | bytearray):
-            raise ValueError("an array of numbers without bytes")
-        flat = np.frombuffer(data, f"{endian}{code}").copy()
-    if math.prod(shape) != len(flat):
-        raise ValueError(f"{len(flat)} values for the shape {shape}")
-    return flat.reshape(shape, order=order)
+        objects = np.empty(len(data), object)
+        objects[:] = data
+        return objects
+    endian = dtype.state[1] if isinstance(dtype.state, tuple) else "|"
+    if endian not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
+        raise ValueError(f"an array of type {code}")
+    if not isinstance(data, bytes | bytearray):
+        raise ValueError("an array of numbers without bytes")
+    return np.frombuffer(data, f"{endian}{code}").copy()
 
 
 def _is(value: Any, name: str) -> bool:

@@ -13,8 +13,7 @@ from ..core.types import IntArray
 
 logger = logging.getLogger(__name__)
 
-ROWS_PER_CHUNK = 256
-"""Rows that are checked at a time, so that large records are not copied."""
+ROWS_PER_CHUNK = 256  # rows that are checked at a time, so that large records are not copied
 LEAST_ROWS = 2
 """Training rows of a receiver that a fit needs: a level and its slope need two, as do a row that trains and another
 that chooses settings."""
@@ -81,29 +80,32 @@ def check_observations(record: Record, split: Split, complete: bool = False, may
         InputError: a receiver without any training row; an observation of a training row that
             is not finite; an uplink of any row that is not finite, or all zero.
     """
-    known, used = split.all_train, np.concatenate([split.all_train, split.test])
+    known = split.all_train
     states = [_states(observed, known) for observed in record.observation]
-    for number, (receiver, (missing, _)) in enumerate(zip(record.receivers, states, strict=True)):
-        if missing.all() and not (complete or may_be_silent) and number not in split.held_receivers:
-            text = f"receiver {receiver.name}: received none of {len(known)} training rows"
-            raise InputError(f"{place_of(record)}, {text}; leave it out or use another split")
+    never = np.setdiff1d(np.flatnonzero([missing.all() for missing, _ in states]), split.held_receivers)
+    if len(never) and not (complete or may_be_silent):
+        text = f"receiver {record.receivers[never[0]].name}: received none of {len(known)} training rows"
+        raise InputError(f"{place_of(record)}, {text}; leave it out or use another split")
     for receiver, observed, (missing, broken) in zip(record.receivers, record.observation, states, strict=True):
-        bad = np.flatnonzero(missing | broken if complete else broken)
+        bad = np.flatnonzero(broken | missing & complete)
         if len(bad):
             row = known[bad[0]]
             where = f"{place_of(record)}, receiver {receiver.name}, row {row}"
             remedy = "correct or remove the row" if broken[bad[0]] else "remove the row or choose another model"
             raise InputError(f"{where}: {count_not_finite(observed[row])}; {remedy}")
-    if record.uplink is not None:
-        uplink = record.uplink[used].reshape(len(used), -1)
-        bad = np.flatnonzero(~np.isfinite(uplink).all(axis=1))
-        if len(bad):
-            text = f"{place_of(record)}, row {used[bad[0]]}: uplink, {count_not_finite(uplink[bad[0]])}"
-            raise InputError(f"{text}; correct or remove the row")
-        silent = np.flatnonzero(~uplink.any(axis=1))
-        if len(silent):
-            text = f"{place_of(record)}, row {used[silent[0]]}: uplink of zeros, where nothing was received"
-            raise InputError(f"{text}; remove the row")
+    _check_uplink(record, np.concatenate([known, split.test]))
+
+
+def _check_uplink(record: Record, used: IntArray) -> None:
+    if record.uplink is None:
+        return
+    uplink = record.uplink[used].reshape(len(used), -1)
+    for row in np.flatnonzero(~np.isfinite(uplink).all(axis=1)):
+        text = f"{place_of(record)}, row {used[row]}: uplink, {count_not_finite(uplink[row])}"
+        raise InputError(f"{text}; correct or remove the row")
+    for row in np.flatnonzero(~uplink.any(axis=1)):
+        text = f"{place_of(record)}, row {used[row]}: uplink of zeros, where nothing was received"
+        raise InputError(f"{text}; remove the row")
 
 
 def scorable(observation: NDArray[np.generic]) -> tuple[NDArray[np.generic], int]:

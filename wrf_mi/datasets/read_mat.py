@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat
 
-FAULT = "fault/"
-"""Prefix of the key of a message, of a file that cannot be read."""
+FAULT = "fault/"  # prefix of the key of a message, of a file that cannot be read
 
 
 def main(out: str, *stated: str) -> int:

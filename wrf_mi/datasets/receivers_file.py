@@ -9,17 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Antenna, DataFault, Record
+from ..core import Antenna, DataFault, Receiver, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT, boresight_orientation
 from ..core.carriers import FREQUENCY
-from .faults import attempt, refuse, stop_at_faults
+from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import ANTENNA_WORDS, TX_ANTENNA_WORDS, CsvTable, read_antenna, shown
 
 logger = logging.getLogger(__name__)
 
 TX = "tx_"
 QUATERNION, AZIMUTH, DOWNTILT = ("qx", "qy", "qz", "qw"), "azimuth_deg", "downtilt_deg"
+WORDS = {"": ANTENNA_WORDS, TX: TX_ANTENNA_WORDS}
+"""Attributes of the antennas of the receivers and of the transmitter, by the prefix of their columns."""
 TX_COLUMNS = tuple(TX + word for word in TX_ANTENNA_WORDS)
 COLUMNS = ("id", "x", "y", "z", *QUATERNION, AZIMUTH, DOWNTILT, FREQUENCY, *ANTENNA_WORDS, *TX_COLUMNS)
 """Columns of the file of receivers."""
@@ -57,69 +59,87 @@ def read_transmitter(anchors: CsvTable) -> Antenna:
     for row, antenna in enumerate(others, start=2):
         if antenna != first:
             text = f"{TX}pattern or {TX}polarization differs from row 1"
-            remedy = "there is one transmitter: state the same in every row"
-            refuse(DataFault(anchors.path, f"{text}; {remedy}", row=row))
+            refuse(DataFault(anchors.path, f"{text}; there is one transmitter: state the same in every row", row=row))
     return first
 
 
 def read_antennas(table: CsvTable, prefix: str, orientations: Sequence[FloatArray | None] = ()) -> list[Antenna]:
     """The antenna of each row; an empty field or a missing column is the default, with an orientation its frame."""
-    words = TX_ANTENNA_WORDS if prefix else ANTENNA_WORDS
-    stated = {key: table.texts(prefix + key) for key in words if prefix + key in table.header}
-    entries = [
-        {key: text for key, texts in stated.items() if (text := texts[row].strip())} for row in range(len(table.rows))
-    ]
+    entries = _antenna_entries(table, prefix)
     for entry, orientation in zip(entries, orientations, strict=False):
         if orientation is not None:
             entry.setdefault("frame", "array")
     antennas = [
-        attempt(read_antenna, table.path, f"{prefix}antenna", entry, words, row)
+        attempt(read_antenna, table.path, f"{prefix}antenna", entry, WORDS[prefix], row)
         for row, entry in enumerate(entries, start=1)
     ]
     return [antenna.value for antenna in antennas]
+
+
+def _antenna_entries(table: CsvTable, prefix: str) -> list[dict[str, str]]:
+    """Attributes of the antenna of each row whose fields are not empty."""
+    stated = {word: table.texts(prefix + word) for word in WORDS[prefix] if prefix + word in table.header}
+    rows = range(len(table.rows))
+    return [{word: text for word, texts in stated.items() if (text := texts[row].strip())} for row in rows]
 
 
 def read_orientations(table: CsvTable) -> list[FloatArray | None]:
     """Orientation [4] of each receiver from its quaternion or azimuth and downtilt; None: its fields are empty."""
     names = [name for name in (*QUATERNION, AZIMUTH, DOWNTILT) if name in table.header]
     columns = {name: table.numbers(name, may_be_empty=True) for name in names}
-    orientations: list[FloatArray | None] = []
+    orientations: list[FloatArray | None] = [None] * len(table.rows)
     for row in range(len(table.rows)):
         stated = {name: float(values[row]) for name, values in columns.items() if not np.isnan(values[row])}
-        orientation = None
-        if np.isinf(list(stated.values())).any():
-            pass  # a damaged row, or a field that is refused already
-        elif tuple(stated) == QUATERNION:
-            orientation = np.array(list(stated.values()))
-            if abs(norm := np.linalg.norm(orientation) - 1) > UNIT_QUATERNION_TOLERANCE:
-                text = f"quaternion of norm {norm + 1:.4g}; {','.join(QUATERNION)} must be a unit x, y, z, w"
-                refuse(DataFault(table.path, text, row=row + 1))
-        elif tuple(stated) in ((AZIMUTH,), (AZIMUTH, DOWNTILT)):
-            orientation = boresight_orientation(*np.radians(list(stated.values())))
-        elif stated:
-            text = f"{', '.join(stated)} alone; give {','.join(QUATERNION)}, or {AZIMUTH} and, if not 0, {DOWNTILT}"
-            refuse(DataFault(table.path, text, row=row + 1))
-        orientations.append(orientation)
+        if np.isfinite([*stated.values()]).all():  # else a damaged row, or a field that is refused already
+            with recoverable():
+                orientations[row] = _orientation(table, row, stated)
     return orientations
+
+
+def _orientation(table: CsvTable, row: int, stated: dict[str, float]) -> FloatArray | None:
+    """Orientation [4] of a row from those of its fields that are not empty; None without any."""
+    numbers = np.array([*stated.values()])
+    if not stated:
+        return None
+    if tuple(stated) in ((AZIMUTH,), (AZIMUTH, DOWNTILT)):
+        return boresight_orientation(*np.radians(numbers))
+    text = f"{', '.join(stated)} alone; give {','.join(QUATERNION)}, or {AZIMUTH} and, if not 0, {DOWNTILT}"
+    if tuple(stated) == QUATERNION:
+        norm = np.linalg.norm(numbers)
+        if abs(norm - 1) <= UNIT_QUATERNION_TOLERANCE:
+            return numbers
+        text = f"quaternion of norm {norm:.4g}; {','.join(QUATERNION)} must be a unit x, y, z, w"
+    raise DataFault(table.path, text, row=row + 1)
+
+
+def receiver_of(
+    anchor: str, position_m: FloatArray, orientation: FloatArray | None, antenna: Antenna, hz: float | None = None
+) -> Receiver:
+    """The receiver of an id; with None as its orientation it is upright."""
+    orientation = np.array(UPRIGHT) if orientation is None else orientation
+    return Receiver(receiver_name(anchor), position_m, orientation, antenna, frequency_hz=hz)
 
 
 def receiver_columns(record: Record, ids: list[str]) -> dict[str, Any]:
     """Columns of the file of receivers; those of which all are as by default are omitted."""
-    receivers = record.receivers
-    positions = np.stack([receiver.position_m for receiver in receivers])
-    columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions.T.tolist(), strict=True))}
-    turned = any(receiver.orientation_xyzw.tolist() != list(UPRIGHT) for receiver in receivers)
+    positions_m = np.stack([receiver.position_m for receiver in record.receivers])
+    orientations = np.stack([receiver.orientation_xyzw for receiver in record.receivers])
+    columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", positions_m.T.tolist(), strict=True))}
+    turned = bool((orientations != UPRIGHT).any())
     if turned:
-        orientations = np.stack([receiver.orientation_xyzw for receiver in receivers])
         columns |= dict(zip(QUATERNION, orientations.T.tolist(), strict=True))
     if (carriers_hz := record.receiver_carriers_hz) is not None:
         columns[FREQUENCY] = carriers_hz.tolist()
-    antennas = [receiver.antenna for receiver in receivers]
-    for prefix, words, group in (("", ANTENNA_WORDS, antennas), (TX, TX_ANTENNA_WORDS, [record.tx_antenna] * len(ids))):
-        # Beside an orientation the frame is stated in any case, as its default is then another.
-        if (turned and not prefix) or any(antenna != ANTENNA for antenna in group):
-            columns |= {prefix + word: [getattr(antenna, word) for antenna in group] for word in words}
-    return columns
+    # Beside an orientation the frame is stated in any case, as its default is then another.
+    columns |= _antenna_columns("", [receiver.antenna for receiver in record.receivers], turned)
+    return columns | _antenna_columns(TX, [record.tx_antenna] * len(ids))
+
+
+def _antenna_columns(prefix: str, antennas: list[Antenna], stated: bool = False) -> dict[str, list[str]]:
+    """Columns of antennas; none where all are the default, unless they are to be ``stated``."""
+    if not stated and all(antenna == ANTENNA for antenna in antennas):
+        return {}
+    return {prefix + word: [getattr(antenna, word) for antenna in antennas] for word in WORDS[prefix]}
 
 
 def plain_id(text: str) -> str:

@@ -79,8 +79,7 @@ class DataSetStatus:
     location: Path | None
 
 
-FOLDER = files(__package__) / "data"
-"""Folder with the known data sets' descriptions, manifests and folds."""
+FOLDER = files(__package__) / "data"  # folder with the known data sets' descriptions, manifests and folds
 KNOWN = tuple(DataSet(**entry) for entry in yaml.safe_load((FOLDER / "datasets.yml").read_text(encoding="utf-8")))
 
 
@@ -150,7 +149,16 @@ def load(name_or_folder: str | Path) -> Record:
     path, dataset = find(name_or_folder)
     if dataset is None:
         return layout_of(path).read(path, None)
-    record = layout_of(path).read(path, dataset.name)
+    record = _completed(layout_of(path).read(path, dataset.name), dataset)
+    if dataset.array is not None:
+        array_m = planar_array(*dataset.array)
+        receivers = tuple(rx if rx.array_m is not None else replace(rx, array_m=array_m) for rx in record.receivers)
+        record = replace(record, receivers=receivers)
+    return record
+
+
+def _completed(record: Record, dataset: DataSet) -> Record:
+    """A record with the folds, carrier and runs that its files do not state."""
     if record.folds is None and dataset.folds is not None:
         with as_file(FOLDER / dataset.folds) as folds:
             record = replace(record, folds=parse_folds(folds, len(record)))
@@ -159,10 +167,6 @@ def load(name_or_folder: str | Path) -> Record:
     if record.runs is None and dataset.runs is not None and record.official is not None:
         of_test = np.isin(np.arange(len(record)), record.official[1])
         record = replace(record, runs=np.array(dataset.runs)[of_test.astype(int)])
-    if dataset.array is not None:
-        array_m = planar_array(*dataset.array)
-        receivers = tuple(rx if rx.array_m is not None else replace(rx, array_m=array_m) for rx in record.receivers)
-        record = replace(record, receivers=receivers)
     return record
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 
 IMPOSSIBLE_DBM = -150.0  # thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver reports less
 STRONG_DBM = -10.0  # values at the upper end are suspicious from here: below, they are rows next to the receiver
@@ -45,29 +46,44 @@ class Value:
 def suspicious_values(strengths_dbm: FloatArray) -> list[Value]:
     """Values that stand for "not heard" among strengths [n] of a receiver, one after the other without those before."""
     suspicious: list[Value] = []
-    remaining = strengths_dbm
-    while len(suspicious) < MOST_VALUES and (value := _next_value(remaining)) is not None:
+    while len(suspicious) < MOST_VALUES:
+        values, counts = np.unique(strengths_dbm, return_counts=True)
+        if len(values) < 2:
+            break  # one value in every row is reported as constant
+        step = float(np.median(np.diff(values)))
+        value = _value_alone(values, counts, step) or _frequent_value(values, counts, step)
+        if value is None:
+            break
         suspicious.append(value)
-        remaining = remaining[remaining != value.dbm]
+        strengths_dbm = strengths_dbm[strengths_dbm != value.dbm]
     return suspicious
 
 
-def _next_value(strengths_dbm: FloatArray) -> Value | None:
-    values, counts = np.unique(strengths_dbm, return_counts=True)
-    if len(values) < 2:
-        return None  # one value in every row is reported as constant
-    step, rows = float(np.median(np.diff(values))), len(strengths_dbm)
+def _value_alone(values: FloatArray, counts: IntArray, step: float) -> Value | None:
+    """A value at an end that is far from all others."""
     # The lower end last: next to a mark of 100 dBm the weakest strength may stand alone, too.
-    for end, inward in ((len(values) - 1, -2), (0, 1)):
-        value, gap_db, count = float(values[end]), abs(float(values[end] - values[inward])), int(counts[end])
+    for end, inward in ((-1, -2), (0, 1)):
+        value, neighbour, count = float(values[end]), float(values[inward]), int(counts[end])
         if end and value < STRONG_DBM:
             continue
-        needed = CUSTOMARY_ALONE_DB if value in CUSTOMARY_DBM else ALONE_DB
-        impossible = value < IMPOSSIBLE_DBM or (value >= 0 and values[inward] < 0)
-        alone_db = needed[3] if impossible else max(needed[min(count, 3)], STEPS * step if rows - count > count else 0)
-        if gap_db >= alone_db and (impossible or count >= 3 or rows - count >= FEWEST_OTHERS):
+        if abs(values[end] - values[inward]) >= _least_gap_db(value, neighbour, count, int(counts.sum()) - count, step):
             return Value(value, adjoins=False)
-    near_db = max(NEAR_DB, LEVELS * step)
+    return None
+
+
+def _least_gap_db(value: float, neighbour: float, count: int, others: int, step: float) -> float:
+    """Gap from which a value at an end in ``count`` rows is alone; infinite beside too few rows to tell."""
+    gaps_db = CUSTOMARY_ALONE_DB if value in CUSTOMARY_DBM else ALONE_DB
+    if value < IMPOSSIBLE_DBM or value >= 0 > neighbour:
+        return gaps_db[3]
+    if count < 3 and others < FEWEST_OTHERS:
+        return np.inf
+    return max(gaps_db[min(count, 3)], STEPS * step if others > count else 0)
+
+
+def _frequent_value(values: FloatArray, counts: IntArray, step: float) -> Value | None:
+    """A value at an end, or among the weakest, that is far more frequent than those near it."""
+    rows, near_db = int(counts.sum()), max(NEAR_DB, LEVELS * step)
     below = np.cumsum(counts) - counts
     for place in np.flatnonzero((counts >= FEWEST) & (counts >= SHARE * rows)).tolist():
         near = (np.abs(values - values[place]) <= near_db) & (values != values[place])

@@ -27,15 +27,11 @@ from ..core.yaml_files import read_yaml
 from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
 
-CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")
-"""Keys under which a file may state carriers."""
+CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")  # keys under which a file may state carriers
 GATEWAYS, FOLDS, IMAGES = "gateway_info.yml", "blocked_folds.txt", "spectrum"
-RESERVED = ("array", files.TX_ANTENNA)
-"""Mappings of the file that are no receivers; receivers cannot have these names."""
-MOST_PIXELS = 1 << 22
-"""Most pixels of a spectrum: 2,048 elevations and as many azimuths."""
-MOST_ELEMENTS = 1 << 14
-"""Most elements of an array: 128 x 128."""
+RESERVED = ("array", files.TX_ANTENNA)  # mappings of the file that are no receivers; receivers cannot have these names
+MOST_PIXELS = 1 << 22  # most pixels of a spectrum: 2,048 elevations and as many azimuths
+MOST_ELEMENTS = 1 << 14  # most elements of an array: 128 x 128
 GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 """Largest grey value of each Pillow image mode that a grey PNG opens in (older Pillow reads 16 bits as ``I``)."""
 
@@ -43,11 +39,9 @@ GREY_LEVELS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the NeRF2 spectrum layout (see ``docs/data.md``).
 
-    The record has the folder's name unless another is given.
-
     Returns:
-        A record with ``task="spectrum"``, positions [n, 3] in metres and ``observation`` [n_rx, n, height, width]
-        in 0..1.
+        A record, by default named after the folder, with ``task="spectrum"``, positions [n, 3] in metres and
+        ``observation`` [n_rx, n, height, width] in 0..1.
 
     Raises:
         InputError: anything missing, unreadable or inconsistent; one line with the file and the row.
@@ -70,7 +64,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     folds = attempt(parse_folds, folder / FOLDS, rows) if (folder / FOLDS).exists() else None
     tx_antenna = attempt(files.read_tx_antenna, gateways, info)
     stop_at_faults()
-    record = files.folder_record(
+    return files.folder_record(
         folder,
         name,
         "spectrum",
@@ -82,8 +76,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         frequencies_hz=stated,
         tx_antenna=tx_antenna,
         runs=table.value.runs,
-    )
-    return record if table.value.carriers_hz is None else record.at_carriers(table.value.carriers_hz)
+    ).at_carriers(table.value.carriers_hz)
 
 
 def write_spectrum_folder(
@@ -124,11 +117,8 @@ def write_spectrum_folder(
 
 
 def _check_writable(path: str | Path, record: Record) -> None:
-    if (
-        record.observation.ndim != 4
-        or np.iscomplexobj(record.observation)
-        or not (record.observation.min() >= 0 and record.observation.max() <= 1)
-    ):
+    spectra = record.observation
+    if spectra.ndim != 4 or np.iscomplexobj(spectra) or not 0 <= spectra.min() <= spectra.max() <= 1:
         raise InputError(f"{path}: {record.name} holds no spectra within 0..1; scale them first")
     for name in (receiver.name for receiver in record.receivers if receiver.name in RESERVED):
         raise InputError(f"{path}: a receiver is named {name!r}, which means something else in {GATEWAYS}; rename it")
@@ -140,7 +130,6 @@ def _check_writable(path: str | Path, record: Record) -> None:
 
 
 def _gateway_info(record: Record) -> dict[str, Any]:
-    """Content of `GATEWAYS`."""
     content: dict[str, Any] = {"dataset_name": record.name}
     for rx in record.receivers:
         content[rx.name] = {"position": rx.position_m.tolist(), "orientation": rx.orientation_xyzw.tolist()}
@@ -178,23 +167,11 @@ def parse_folds(path: Path, rows: int) -> IntArray:
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
     """The carrier [1] of all rows, stated for all receivers or in their entries; None if it is not stated."""
-    stated = {key: info[key] for key in CARRIER_KEYS if key in info}
-    for name, entry in info.items():
-        if isinstance(entry, dict):
-            stated |= {f"{name}: {key}": entry[key] for key in CARRIER_KEYS if key in entry}
+    entries = {"": info} | {f"{name}: ": entry for name, entry in info.items() if isinstance(entry, dict)}
     carriers: dict[float, str] = {}
-    for where, value in stated.items():
-        for number in value if isinstance(value, list) else [value]:
-            try:
-                frequency_hz = float(number)  # YAML reads 920e6 as text
-            except (TypeError, ValueError):
-                frequency_hz = np.nan
-            if 0 < frequency_hz < np.inf:
-                carriers[frequency_hz] = where
-            else:
-                text = f"{one_line(where)} is {files.shown(value)}; give the carrier in Hz, such as 920e6"
-                refuse(DataFault(path, text))
-                break
+    for prefix, entry in entries.items():
+        for key in filter(entry.__contains__, CARRIER_KEYS):
+            carriers |= dict.fromkeys(_carriers_hz(path, f"{prefix}{key}", entry[key]), f"{prefix}{key}")
     if len(carriers) > 1:
         (a, first), (b, second) = list(carriers.items())[:2]
         text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
@@ -203,37 +180,49 @@ def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
     return np.array(list(carriers)) if carriers else None
 
 
+def _carriers_hz(path: Path, name: str, value: Any) -> list[float]:
+    """Carriers of an entry, a number or a list of numbers."""
+    try:
+        carriers_hz = [float(number) for number in (value if isinstance(value, list) else [value])]  # 920e6 is a text
+    except (TypeError, ValueError, OverflowError):
+        carriers_hz = [np.nan]
+    if all(0 < carrier_hz < np.inf for carrier_hz in carriers_hz):
+        return carriers_hz
+    refuse(DataFault(path, f"{one_line(name)} is {files.shown(value)}; give the carrier in Hz, such as 920e6"))
+    return []
+
+
 def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:
     """Elements [m, 3] of an entry's ``array``, which messages call ``name``; None if it has none."""
     if "array" not in entry:
         return None
     array = entry["array"]
     try:
-        if "elements_m" in array:
-            elements = np.array(array["elements_m"], float)
-        else:
-            rows, columns = (operator.index(array[key]) for key in ("rows", "columns"))
-            if rows * columns > MOST_ELEMENTS:
-                raise DataFault(path, f"{one_line(name)} has {rows} x {columns} elements; give {MOST_ELEMENTS} at most")
-            elements = planar_array(rows, columns, float(array["spacing_m"]))
+        elements = np.array(array["elements_m"], float) if "elements_m" in array else _planar(path, array, name)
     except InputError:
         raise
     except (TypeError, ValueError, KeyError, OverflowError):
         elements = np.empty(0)
-    if elements.ndim != 2 or elements.shape[1] != 3 or not np.isfinite(elements).all():
+    if elements.shape[1:] != (3,) or not np.isfinite(elements).all():
         remedy = "give rows, columns and spacing_m, or elements_m as a list of x, y, z in metres"
         text = f"{one_line(name)} is {files.shown(array if isinstance(array, dict) else str(array))}"
         raise DataFault(path, f"{text}; {remedy}")
     return elements
 
 
+def _planar(path: Path, array: dict[Any, Any], name: str) -> FloatArray:
+    rows, columns = operator.index(array["rows"]), operator.index(array["columns"])
+    if rows * columns > MOST_ELEMENTS:
+        raise DataFault(path, f"{one_line(name)} has {rows} x {columns} elements; give {MOST_ELEMENTS} at most")
+    return planar_array(rows, columns, float(array["spacing_m"]))
+
+
 def _poses(path: Path, info: dict[Any, Any]) -> dict[str, dict[Any, Any]]:
-    """Entries of the receivers by their names."""
     poses = {key: value for key, value in info.items() if isinstance(value, dict) and key not in RESERVED}
     if not poses:
         raise DataFault(path, "no receiver in it; give gateway1 with position and orientation")
     for name in poses:
-        if not isinstance(name, str) or Path(name).name != name or name == ".." or not name.isprintable():
+        if Path(str(name)).name != name or name == ".." or not name.isprintable():
             refuse(DataFault(path, f"{name!r} cannot name a folder; call receivers gateway1, gateway2, ..."))
     return poses
 
@@ -254,32 +243,15 @@ def _receivers(path: Path, poses: dict[str, dict[Any, Any]], array_m: FloatArray
 
 def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> NDArray[np.float32]:
     """Spectra [receivers, rows, height, width]."""
-    names = [f"{row:05d}.png" for row in range(1, rows + 1)]
     observation: NDArray[np.float32] | None = None
     for receiver, place in enumerate([folder] if len(poses) == 1 else [folder / name for name in poses]):
-        if not place.is_dir():
-            text = "missing folder; images lie in spectrum/, or in spectrum/NAME/ for several receivers"
-            refuse(DataFault(place, text))
-            continue
-        present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
-        count = f"{len(present)} images for {rows} rows of {files.POSITIONS}"
-        for row, image in enumerate(names, start=1):
-            if image not in present:
-                text = f"missing ({count}); add the image or remove the row"
-                refuse(DataFault(place / image, text, row=row, file_per_row=True))
-        for image in sorted(present - set(names)):
-            text = f"no row belongs to it ({count}); add its position or remove the image"
-            refuse(DataFault(place / image, text, file_per_row=True))
-        for row, image in enumerate(names, start=1):
-            if image not in present:
-                continue
+        for row, image in _images(place, rows).items():
             with recoverable():
-                grey = _read_grey(place / image, row, None if observation is None else observation.shape[2:])
+                grey = _read_grey(image, row, None if observation is None else observation.shape[2:])
                 if observation is None:
                     what = f"{folder}: {len(poses) * rows} spectra of {grey.shape[1]} x {grey.shape[0]} pixels"
-                    require_memory(
-                        4 * len(poses) * rows * grey.size, what, "give images of fewer pixels, or fewer rows"
-                    )
+                    needed = 4 * len(poses) * rows * grey.size
+                    require_memory(needed, what, "give images of fewer pixels, or fewer rows")
                     observation = np.zeros((len(poses), rows, *grey.shape), np.float32)
                 observation[receiver, row - 1] = grey
     stop_at_faults()
@@ -287,21 +259,36 @@ def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> N
     return observation
 
 
+def _images(place: Path, rows: int) -> dict[int, Path]:
+    """The image of each row, from 1, that a receiver's folder has."""
+    if not place.is_dir():
+        refuse(DataFault(place, "missing folder; images lie in spectrum/, or in spectrum/NAME/ for several receivers"))
+        return {}
+    row_of = {f"{row:05d}.png": row for row in range(1, rows + 1)}
+    present = {entry.name for entry in place.iterdir() if entry.suffix.lower() == ".png"}
+    count = f"{len(present)} images for {rows} rows of {files.POSITIONS}"
+    for image in sorted(row_of.keys() - present, key=row_of.__getitem__):
+        text = f"missing ({count}); add the image or remove the row"
+        refuse(DataFault(place / image, text, row=row_of[image], file_per_row=True))
+    for image in sorted(present - row_of.keys()):
+        text = f"no row belongs to it ({count}); add its position or remove the image"
+        refuse(DataFault(place / image, text, file_per_row=True))
+    return {row: place / image for image, row in row_of.items() if image in present}
+
+
 def _read_grey(path: Path, row: int, size: tuple[int, ...] | None) -> NDArray[np.float32]:
     try:
         with open_picture(path, MOST_PIXELS) as image:
-            mode = image.mode
             if size is not None and image.size != size[::-1]:
                 (width, height), (first_height, first_width) = image.size, size
                 text = f"{width} x {height} pixels, but the first image has {first_width} x {first_height}"
                 raise DataFault(path, f"{text}; give all images one size", row=row, file_per_row=True)
-            values = np.asarray(image) if mode in GREY_LEVELS else np.zeros(0)
+            if image.mode not in GREY_LEVELS:
+                text = f"image mode {image.mode}; give a grey PNG of 8 or 16 bits"
+                raise DataFault(path, text, row=row, file_per_row=True)
+            return np.asarray(image).astype(np.float32) / np.float32(GREY_LEVELS[image.mode])
     except InputError:
         raise
     except PICTURE_ERRORS as error:
         text = f"unreadable ({one_line(error)}); replace the image"
         raise DataFault(path, text, row=row, file_per_row=True) from None
-    if mode not in GREY_LEVELS:
-        text = f"image mode {mode}; give a grey PNG of 8 or 16 bits"
-        raise DataFault(path, text, row=row, file_per_row=True)
-    return values.astype(np.float32) / np.float32(GREY_LEVELS[mode])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,23 +16,20 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable
 from ..core.types import IntArray
 
-FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")
-"""Splits of several folds."""
-NONE = "none"
-"""Split whose last part trains on all rows and tests none; its scores are those of the folds before."""
+FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")  # splits of several folds
+NONE = "none"  # split whose last part trains on all rows and tests none; its scores are those of the folds before
 SPLIT_NAMES = ("official", "random", *FOLDED, "trajectory", NONE)
+NAME = re.compile(rf"(?:{'|'.join(FOLDED)}|receiver\+0*[1-9][0-9]*)(?::.*)?|{'|'.join(SPLIT_NAMES)}", re.DOTALL)
+"""Name of a split, with the rows that it leaves each receiver and the number of a fold."""
+PARTS = ("train", "validation", "test")
 TRAIN_FRACTION = 0.8
 """Training share of ``random`` and ``trajectory``, as in the authors' split of rfid-lab (160 of 200)."""
-FOLDS = 5
-"""Number of spatial blocks of data without folds."""
-FOLD_SEED = 0
-"""Seed of the spatial blocks, which belong to the data and do not depend on the seed of a run."""
+FOLDS = 5  # number of spatial blocks of data without folds
+FOLD_SEED = 0  # seed of the spatial blocks, which belong to the data and do not depend on the seed of a run
 MOST_RECEIVERS, RECEIVER_FOLDS = 8, 4
 """Largest number of receivers that are held out in turn, and number of folds of more."""
-CLUSTER_STARTS = 10
-"""Starts of k-means; the tightest clusters without an empty one are used."""
-SPLIT_FORMAT = 1
-"""Version of the split file."""
+CLUSTER_STARTS = 10  # starts of k-means; the tightest clusters without an empty one are used
+SPLIT_FORMAT = 1  # version of the split file
 
 
 def make_splits(
@@ -106,11 +104,7 @@ def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, 
     # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it is
     # nested in a longer one, validation rows included.
     order = np.random.default_rng([seed, 1]).permutation(np.sort(rows.train))
-    count = len(order)
-    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
-        count = int(n_train)
-    elif n_train is not None:
-        count = round(float(n_train) * len(order)) if 0 < n_train <= 1 else 0
+    count = _training_count(n_train, len(order))
     if not 1 <= count <= len(order):
         raise InputError(f"{what}: n_train {n_train}; choose 1 to {len(order)} rows or a fraction in (0, 1]")
     order = order[:count]
@@ -126,6 +120,15 @@ def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, 
     return Split(rows.name, seed, *parts, rows.held_receivers, left)
 
 
+def _training_count(n_train: int | float | None, count: int) -> int:
+    """Number of ``count`` training rows that are kept; 0 for a share out of range."""
+    if n_train is None:
+        return count
+    if isinstance(n_train, int | np.integer) and not isinstance(n_train, bool):
+        return int(n_train)
+    return round(float(n_train) * count) if 0 < n_train <= 1 else 0
+
+
 def default_split(record: Record) -> str:
     """Name of the split where none is asked for: that of the data, or else ``none``."""
     return NONE if record.official is None else "official"
@@ -133,8 +136,9 @@ def default_split(record: Record) -> str:
 
 def splits_below(record: Record, name: str) -> tuple[str, ...]:
     """Name of the split of rows that a split by receivers divides further; none for any other split."""
-    by_receiver = name.partition(":")[0].partition("+")[0] == "receiver"
-    return ("random" if record.official is None else "official",) if by_receiver else ()
+    if re.split("[+:]", name)[0] != "receiver":
+        return ()
+    return ("random" if record.official is None else "official",)
 
 
 def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: int, seed: int) -> IntArray:
@@ -142,8 +146,7 @@ def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: i
     received = np.asarray(np.isfinite(record.observation[:, rows]).reshape(len(record.receivers), len(rows), -1).all(2))
     pairs = [np.zeros((0, 2), np.int64)]
     for receiver in receivers:
-        order = np.random.default_rng([seed, 7, receiver]).permutation(rows[received[receiver]])
-        chosen = np.sort(order[:count])
+        chosen = np.sort(np.random.default_rng([seed, 7, receiver]).permutation(rows[received[receiver]])[:count])
         pairs.append(np.stack([np.full(len(chosen), receiver), chosen], axis=1))
     return np.concatenate(pairs)
 
@@ -170,24 +173,30 @@ def load_split(path: str | Path) -> Split:
     """
     remedy = "give a split.npz of a run folder"
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
-        arrays = stored_arrays(Path(path))
-        content = {key: arrays[key] for key in ("format", "name", "seed", "train", "validation", "test")}
-    held_receivers = tuple(int(number) for number in np.ravel(arrays.get("held_receivers", np.zeros(0, np.int64))))
-    left = arrays.get("left", np.zeros((0, 2), np.int64))
-    if content["format"] != SPLIT_FORMAT:
-        raise InputError(f"{path}: format {content['format']}, not {SPLIT_FORMAT}; use the version that wrote it")
-    parts = [content[key] for key in ("train", "validation", "test")]
-    rows = np.concatenate([part.ravel() for part in parts])
-    lists = all(part.ndim == 1 and part.dtype.kind == "i" for part in parts) and rows.min(initial=0) >= 0
-    if not lists or left.ndim != 2 or left.shape[1] != 2 or left.dtype.kind != "i":
-        raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
-    if len(np.unique(rows)) != len(rows):
-        raise InputError(f"{path}: a row is in the split twice; make the split again")
-    train, validation, test, left = (part.astype(np.int64) for part in (*parts, left))
-    split = Split(str(content["name"]), int(content["seed"]), train, validation, test, held_receivers, left)
+        none_held_out = {"held_receivers": np.zeros(0, np.int64), "left": np.zeros((0, 2), np.int64)}
+        arrays = none_held_out | stored_arrays(Path(path))
+        version, name, seed, *lists = (arrays[key] for key in ("format", "name", "seed", *PARTS, "left"))
+    if version != SPLIT_FORMAT:
+        raise InputError(f"{path}: format {version}, not {SPLIT_FORMAT}; use the version that wrote it")
+    _check_rows(path, lists)
+    train, validation, test, left = (part.astype(np.int64) for part in lists)
+    held_receivers = np.ravel(arrays["held_receivers"]).astype(int)
+    split = Split(str(name), int(seed), train, validation, test, tuple(held_receivers.tolist()), left)
     if not (np.isin(left[:, 0], held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
         raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
     return split
+
+
+def _check_rows(path: str | Path, lists: list[NDArray[np.generic]]) -> None:
+    """Refuse parts of a split that are not lists of different rows, or not followed by pairs of receiver and row."""
+    *parts, left = lists
+    rows = np.concatenate([part.ravel() for part in parts])
+    shapes = [*((part.size,) for part in parts), (left.size // 2, 2)]
+    numbers = [part.shape == shape and part.dtype.kind == "i" for part, shape in zip(lists, shapes, strict=True)]
+    if not all(numbers) or rows.min(initial=0) < 0:
+        raise InputError(f"{path}: rows are not lists of whole numbers from 0; make the split again")
+    if len(np.unique(rows)) != len(rows):
+        raise InputError(f"{path}: a row is in the split twice; make the split again")
 
 
 def position_folds(record: Record) -> IntArray:
@@ -231,43 +240,58 @@ class _Rows(NamedTuple):
 
 
 def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
+    kind = _rule_of(name)
     missing = np.isnan(record.observation).reshape(len(record.receivers), len(record), -1)
-    received = np.asarray(~missing.all(axis=(0, 2)))
-    rows = np.flatnonzero(received)
-    rule, colon, _ = name.partition(":")
-    kind, plus, left = rule.partition("+")
-    leaves = kind == "receiver" and left.isascii() and left.isdecimal() and int(left) > 0
-    if kind not in SPLIT_NAMES or (colon and kind not in FOLDED) or (plus and not leaves):
-        known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
-        raise InputError(f"split {name!r}: unknown; choose {known}")
+    rows = np.flatnonzero(~missing.all(axis=(0, 2)))
     if kind == "official":
         if record.official is None:
             raise InputError(f"{record.name}: has no official split; add its index files or choose another split")
-        train, test = (part[received[part]] for part in record.official)
+        train, test = (part[np.isin(part, rows)] for part in record.official)
         return [_Rows(name, train, test)]
     if kind == NONE:
-        able = record.folds is not None or (len(np.unique(record.tx_pos_m, axis=0)) >= FOLDS and record.has_positions)
-        drawn = np.random.default_rng([seed, 8]).permutation(len(record)) % FOLDS
-        fold = (position_folds(record) if able else drawn)[rows]
-        folds = [_Rows(f"{NONE}:{k}", rows[fold != k], rows[fold == k]) for k in np.unique(fold)]
-        return [*folds, _Rows(NONE, rows, rows[:0])]
+        return _all_rows(record, seed, rows)
     if kind == "receiver":
-        return _receivers_held_out(record, name, seed, int(left or 0))
+        return _receivers_held_out(record, name, seed)
     if kind in FOLDED:
-        if kind.startswith("frequency"):
-            fold, tested = _carrier_numbers(record, kind)[rows], _held_out_positions(record, seed)[rows]
-        else:
-            fold = (position_folds if kind == "blocked" else _run_numbers)(record)[rows]
-            tested = np.ones(len(rows), bool)
-        # Held-out positions are new to the model: with "frequency-known" they are known at the other carriers.
-        trains = ~tested if kind == "frequency" else np.ones(len(rows), bool)
-        chosen = _folds(record, name, int(fold.max(initial=0)) + 1)
-        return [_Rows(f"{kind}:{k}", rows[(fold != k) & trains], rows[(fold == k) & tested]) for k in chosen]
+        return _folds_held_out(record, name, seed, rows)
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
         raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [_Rows(name, order[:first], order[first:])]
+
+
+def _rule_of(name: str) -> str:
+    """Name of a split without the number of a fold or of the rows left; an `InputError` if it is unknown."""
+    if not NAME.fullmatch(name):
+        known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
+        raise InputError(f"split {name!r}: unknown; choose {known}")
+    return re.split("[+:]", name)[0]
+
+
+def _all_rows(record: Record, seed: int, rows: IntArray) -> list[_Rows]:
+    """Spatial folds of the rows, or drawn ones where positions do not suffice, and a part that trains on all rows."""
+    fold = np.random.default_rng([seed, 8]).permutation(len(record)) % FOLDS
+    if record.folds is not None or (len(np.unique(record.tx_pos_m, axis=0)) >= FOLDS and record.has_positions):
+        fold = position_folds(record)
+    fold = fold[rows]
+    folds = [_Rows(f"{NONE}:{k}", rows[fold != k], rows[fold == k]) for k in np.unique(fold)]
+    return [*folds, _Rows(NONE, rows, rows[:0])]
+
+
+def _folds_held_out(record: Record, name: str, seed: int, rows: IntArray) -> list[_Rows]:
+    """A split for each spatial fold, run or carrier."""
+    kind = name.partition(":")[0]
+    trains = tested = np.ones(len(rows), bool)
+    if kind.startswith("frequency"):
+        fold, tested = _carrier_numbers(record, kind)[rows], _held_out_positions(record, seed)[rows]
+    else:
+        fold = (position_folds if kind == "blocked" else _run_numbers)(record)[rows]
+    # Held-out positions are new to the model: with "frequency-known" they are known at the other carriers.
+    if kind == "frequency":
+        trains = ~tested
+    chosen = _folds(record, name, int(fold.max(initial=0)) + 1)
+    return [_Rows(f"{kind}:{k}", rows[(fold != k) & trains], rows[(fold == k) & tested]) for k in chosen]
 
 
 def _carrier_numbers(record: Record, kind: str) -> IntArray:
@@ -313,7 +337,7 @@ def _folds(record: Record, name: str, count: int) -> range:
     return range(int(fold), int(fold) + 1)
 
 
-def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list[_Rows]:
+def _receivers_held_out(record: Record, name: str, seed: int) -> list[_Rows]:
     """A split for each receiver, or for each fold of many, with rows that the trained and the held-out receive."""
     count = len(record.receivers)
     if count < 2:
@@ -324,6 +348,8 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
         order = np.random.default_rng([seed, 6]).permutation(count) % RECEIVER_FOLDS
     (rows,) = (only for below in splits_below(record, name) for only in _train_and_test(record, below, seed))
     received = np.asarray(np.isfinite(record.observation).reshape(count, len(record), -1).all(axis=2), bool)
+    label = name.partition(":")[0]
+    left = int("0" + label.partition("+")[2])
     splits = []
     for k in _folds(record, name, int(order.max()) + 1):
         held_out = np.asarray(order == k)
@@ -332,6 +358,5 @@ def _receivers_held_out(record: Record, name: str, seed: int, left: int) -> list
         )
         # A receiver without test rows cannot be scored; the others can.
         if len(test) or ":" in name:
-            label = f"{name.partition(':')[0]}:{k}"
-            splits.append(_Rows(label, train, test, tuple(np.flatnonzero(held_out).tolist()), left))
+            splits.append(_Rows(f"{label}:{k}", train, test, tuple(np.flatnonzero(held_out).tolist()), left))
     return splits

@@ -30,8 +30,7 @@ RECEIVER = (
     *("pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""
-SHOWN = 8
-"""Columns or files that a message names."""
+SHOWN = 8  # columns or files that a message names
 
 
 @dataclass(frozen=True)
@@ -46,15 +45,17 @@ def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
     """The error about a folder or file that no layout describes; ``inner`` are folders in it that are data sets."""
     if path.is_file():
         table = _read_header(path)
-        what = "a file of no known layout" if table is None else "a table, where a folder is wanted"
-        return DataFault(path, f"{what}; {WANTED if table is None else table_text(table)}")
+        if table is None:
+            return DataFault(path, f"a file of no known layout; {WANTED}")
+        return DataFault(path, f"a table, where a folder is wanted; {table_text(table)}")
     content = sorted(path.iterdir())
     if not content:
         return DataFault(path, f"an empty folder; {WANTED}")
-    holding = f"holds {_listed([file.name for file in content])} and is no data set itself"
+    names = one_line(listed([file.name for file in content], SHOWN, ","))
+    holding = f"holds {names} and is no data set itself"
     if inner:
         return DataFault(path, f"{holding}; give {one_line(inner[0])}")
-    tables = [table for file in content if file.is_file() and (table := _read_header(file)) is not None]
+    tables = [table for table in map(_read_header, content) if table is not None]
     tables.sort(key=lambda table: long_columns(table.header) is None)  # tables of single readings first
     return DataFault(path, f"{holding}; {table_text(tables[0]) if tables else WANTED}")
 
@@ -63,7 +64,8 @@ def table_text(table: Table) -> str:
     """What a table lacks as signal strengths, and the command that makes a data set of it."""
     kind = "" if long_columns(table.header) is None else ", a row for each reading"
     remedy = f"make a data set of it by wrf-mi data import {one_line(table.name)} --out FOLDER"
-    return f"{table.name} has the columns {_listed(table.header)}{kind}; {TABLE}: {remedy}"
+    columns = one_line(listed(table.header, SHOWN, ","))
+    return f"{table.name} has the columns {columns}{kind}; {TABLE}: {remedy}"
 
 
 def name_words(name: str) -> set[str]:
@@ -75,9 +77,8 @@ def long_columns(header: Sequence[str]) -> tuple[str, str] | None:
     """Columns of receivers and of strengths in a table with a row for each reading, or None."""
     words = {column: name_words(column) for column in header}
     strengths = [column for column, parts in words.items() if parts & STRENGTH]
-    receivers = [column for word in RECEIVER for column, parts in words.items() if word in parts]
-    receivers = [column for column in receivers if column not in strengths]
-    return (receivers[0], strengths[0]) if len(strengths) == 1 and receivers else None
+    receivers = (name for word in RECEIVER for name in header if word in words[name] and name not in strengths)
+    return next(zip(receivers, strengths, strict=False), None) if len(strengths) == 1 else None
 
 
 def _read_header(file: Path) -> Table | None:
@@ -93,5 +94,6 @@ def _read_header(file: Path) -> Table | None:
     return Table(file.name, tuple(header)) if len(header) > 1 else None
 
 
-def _listed(names: Sequence[str]) -> str:
-    return one_line(",".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""))
+def listed(names: Sequence[str], most: int = 6, mark: str = ", ") -> str:
+    """The first names, and the number of the others."""
+    return mark.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...core import DataFault, InputError
 from ...core.files import one_line
-from ..unknown import STRENGTH, long_columns, name_words
+from ..unknown import STRENGTH, listed, long_columns, name_words
 from .files import Table
 
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
@@ -102,15 +102,14 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
     columns = Columns(long or of)
     if long is None:
         chosen = _wide_columns(table, free, receivers)
-        ids = _receiver_ids(chosen)
-        columns.strengths = dict(zip(chosen, ids, strict=True))
+        columns.strengths = dict(zip(chosen, _receiver_ids(chosen), strict=True))
     _sort_others(table, columns)
     return columns
 
 
 def shown_names(names: Sequence[str]) -> str:
     """The first names of columns, for a message."""
-    return one_line(", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else ""))
+    return one_line(listed(names, 12))
 
 
 def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:

@@ -26,10 +26,8 @@ SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
 """In the order of trial: a table with a decimal comma has commas in every line, too."""
 SPACES = r"\s+"
 SAMPLE = 50  # lines from which separator and decimal mark are read
-MOST_FIELDS = 300_000_000
-"""Largest number of rows times columns of all files: 2.4 GB of numbers in double precision."""
-EMPTY = ("-", "--", "?")
-"""Fields that are empty beside those that pandas knows (NaN, NA, null, None)."""
+MOST_FIELDS = 300_000_000  # largest number of rows times columns of all files: 2.4 GB of numbers in double precision
+EMPTY = ("-", "--", "?")  # fields that are empty beside those that pandas knows (NaN, NA, null, None)
 FRACTION = re.compile(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?|[+-]?\d+\.")
 COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|nan", re.IGNORECASE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +18,10 @@ from ...core.angles import FloatArray
 from ...core.files import one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
-from .columns import HERTZ, Columns, described, find_columns, parsed_columns, unit_of
+from ..unknown import listed
+from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
-from .further import further_columns
 from .options import ImportOptions
-from .picture import plan_picture
 from .places import (
     POSITION_DIGITS,
     LocalFrame,
@@ -32,13 +32,14 @@ from .places import (
     place_numbers,
     plane_columns,
     unit_scale,
+    with_cells,
+    with_positions,
 )
-from .positions_file import with_cells, with_positions
 from .readings import (
     Means,
     Readings,
     chosen,
-    listed,
+    further_columns,
     mean_strengths,
     merged,
     read_readings,
@@ -47,14 +48,11 @@ from .readings import (
 )
 from .receivers_table import read_receivers
 
-FACTS, PICTURE = "import.yml", "plan.png"
-"""Files beside the tables: what the import assumed, and a plan of the rows."""
+FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
-MOST_CELLS = 50_000_000
-"""Largest number of receivers times places: 2 GB while means are computed."""
+MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
-
-
+MOST_NAMED = 9  # receivers with a colour of their own in the plan; the others are grey
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
@@ -124,8 +122,7 @@ class _Import:
             self.table = with_cells(self.table, self.stated["cell"])
         self.notes += self.table.notes
         self.columns = find_columns(self.table, self.stated, options.receivers)
-        self.units: dict[str, str] = {}
-        self.carrier_of: dict[str, float] = {}
+        self.units, self.carrier_of = dict[str, str](), dict[str, float]()
         self.facts: dict[str, Any] = {"files": [path.name for path, _ in self.table.files]}
 
     def run(self, replace: bool) -> ImportReport:
@@ -136,9 +133,8 @@ class _Import:
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
         conditions = self._conditions(readings)
-        place = place_numbers(
-            {"z": xyz_m[:, 2], **conditions, "part": self.is_test}, xyz_m[:, :2], self.options.place_m
-        )
+        keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
+        place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
         first = np.unique(place, return_index=True)[1]
         readings, means = self._means(readings, place, len(count))
@@ -146,16 +142,17 @@ class _Import:
         receivers, notes = self._receivers(readings, frame)
         self.notes += notes
         record = self._record(means, position_m, receivers)
-        conditions = {name: values[first] for name, values in conditions.items()}
-        record = self._with_conditions(record, conditions)
+        record = self._with_conditions(record, {name: values[first] for name, values in conditions.items()})
         record = self._with_split(record, self.is_test[first])
         further, notes = further_columns(self.table, self.columns, readings, place)
-        self.notes += [*notes, *_reciprocity(self.columns)]
+        fixed = one_line(self.columns.of.get("id", "the columns of strengths"))
+        text = f"the fixed ends, named by {fixed}, are the receivers, and the moving end is the transmitter"
+        self.notes += [*notes, f"{text}: by reciprocity it does not matter who sends"]
         lines = described(self.table, self.columns, self.units)
         self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
         extra: dict[str, str | bytes] = {
             FACTS: yaml.safe_dump(self.facts, sort_keys=False, allow_unicode=True, width=120),
-            PICTURE: plan_picture(record),
+            PICTURE: _plan_picture(record),
         }
         write_ble_folder(self.out, record, replace, extra, further)
         return ImportReport(self.out, record, tuple(lines), tuple(self.notes))
@@ -173,8 +170,7 @@ class _Import:
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
-        rows = [len(table) for table in tables]
-        is_test = np.repeat([number >= len(files) for number in range(len(paths))], rows)
+        is_test = np.repeat(np.arange(len(paths)) >= len(files), list(map(len, tables)))
         table = joined(tables)
         for name, text in options.where.items():
             chosen_rows = table.where(name, text)
@@ -221,8 +217,7 @@ class _Import:
                 self.columns.kept.append(of.pop(meaning))
         if "heading" in of:
             headings = finite_columns(table, [of["heading"]])[:, 0]
-            conditions["heading"], unit = headings_rad(headings, of["heading"], self.options.heading)
-            self.units["heading"] = unit
+            conditions["heading"], self.units["heading"] = headings_rad(headings, of["heading"], self.options.heading)
         if "run" in of:
             conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
         if "frequency" in of and not self.options.frequency_hz:
@@ -300,14 +295,11 @@ class _Import:
         )
 
     def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]]) -> Record:
-        carriers_hz = conditions.get("frequency_hz")
         record = dataclasses.replace(record, tx_heading_rad=conditions.get("heading"), runs=conditions.get("run"))
-        if (of_receivers := record.receiver_carriers_hz) is not None:
-            return record.at_receiver_carriers(of_receivers)
-        return record if carriers_hz is None else record.at_carriers(carriers_hz)
+        of_receivers = record.receiver_carriers_hz
+        return record.at_carriers(conditions.get("frequency_hz")).at_receiver_carriers(of_receivers)
 
     def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
-        """The record with its official split, if test rows are stated."""
         if not is_test.any() or is_test.all():
             self.notes.append("no test rows are stated: train scores folds in space, then fits all rows (--split none)")
             return record
@@ -335,7 +327,27 @@ def _hertz(table: Table, column: str) -> FloatArray:
     return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
 
 
-def _reciprocity(columns: Columns) -> list[str]:
-    what = one_line(columns.of["id"]) if "id" in columns.of else "the columns of strengths"
-    text = f"the fixed ends, named by {what}, are the receivers, and the moving end is the transmitter"
-    return [f"{text}: by reciprocity it does not matter who sends"]
+def _plan_picture(record: Record) -> bytes:
+    """PNG with the rows of signal strengths in their plan and the receivers at known positions."""
+    from matplotlib.figure import Figure  # not before: every command imports the data sets
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axes = figure.add_subplot()
+    heard = np.isfinite(record.observation).any(axis=0)
+    strongest = np.where(heard, np.argmax(np.nan_to_num(record.observation, nan=-np.inf), axis=0), -1)
+    numbers, counts = np.unique(strongest[heard], return_counts=True)
+    named = numbers[np.argsort(-counts, kind="stable")][:MOST_NAMED]
+    others = ~np.isin(strongest, named)
+    for number in named:
+        rows = record.tx_pos_m[strongest == number]
+        axes.plot(*rows[:, :2].T, ".", markersize=4, label=record.receivers[number].name[:24])
+    if others.any():
+        axes.plot(*record.tx_pos_m[others, :2].T, ".", color="0.7", markersize=3, label="another or none", zorder=0)
+    places = np.stack([receiver.position_m for receiver in record.receivers])
+    if np.isfinite(places).all(axis=1).any():
+        axes.plot(*places[:, :2].T, "k^", markersize=7, label="receivers")
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=f"{record.name}: strongest receiver of each row")
+    figure.legend(loc="outside right upper", fontsize="small")
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
+    return stream.getvalue()

@@ -1,4 +1,4 @@
-"""Single readings of a table: numbers for "not heard", virtual networks of one radio, and means of places."""
+"""Readings of a table: numbers for "not heard", virtual networks of one radio, means of places, and other columns."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +18,20 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..receivers_file import plain_id
 from ..sentinels import CUSTOMARY_DBM, suspicious_values
-from .columns import MAC, Columns
+from ..unknown import listed
+from .columns import MAC, METRES, RANGES, Columns, unit_of
 from .files import Table, package
 
-MOST_SHOWN = 6
 POOLED_READINGS = 4.0
 """Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""
 LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
 FEWEST_SHARED, LEAST_CORRELATION, MOST_DIFFERENCE_DB = 5, 0.8, 3.0
 """Places at which two networks were heard, correlation and median difference from which they are one radio's: the bands
 of one access point differ by more, and so do neighbouring access points."""
+RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
+PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
+FEWEST_EQUAL = 3
+SEPARATOR = "|"
 
 
 @dataclass(frozen=True)
@@ -200,7 +205,69 @@ def chosen(readings: Readings, receivers: IntArray) -> Readings:
     return Readings(ids, readings.row[part], renumbered[part], readings.dbm[part])
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first names, and the number of the others."""
-    more = f" and {len(names) - MOST_SHOWN} more" if len(names) > MOST_SHOWN else ""
-    return ", ".join(names[:MOST_SHOWN]) + more
+def further_columns(
+    table: Table, columns: Columns, readings: Readings, place: IntArray
+) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Kept columns [places] by name, and what they are in words.
+
+    Numbers are averaged over the rows of a place, lengths in metres; different texts are joined by a bar.
+    """
+    values: dict[str, NDArray[Any]] = {}
+    notes: list[str] = []
+    if "time" in columns.of:
+        values["time"] = table.frame[columns.of["time"]].to_numpy()[np.unique(place, return_index=True)[1]]
+    for name, (quantity, receiver) in columns.others.items():
+        numbers, unit = table.numbers(name), ""
+        if quantity in RANGES:
+            numbers, mark = _without_mark(numbers)
+            numbers, unit = numbers * METRES.get(unit_of(name), 1.0), "_m"
+            notes += [f"{number:g} is no {quantity}: empty fields" for number in mark]
+        means = {receiver: _means(numbers, place)} if receiver else _by_receiver(numbers, readings, place)
+        values |= {f"{quantity}_{normal_id(one)}{unit}": column for one, column in means.items()}
+    values |= {one_line(name): _of_places(table, name, place) for name in columns.kept}
+    if values:
+        notes.append(f"kept as columns that no model uses: {listed(list(values))}")
+    return {_free(name): column for name, column in values.items()}, list(dict.fromkeys(notes))
+
+
+def _by_receiver(numbers: FloatArray, readings: Readings, place: IntArray) -> dict[str, FloatArray]:
+    places, columns = int(place.max()) + 1, {}
+    for number, receiver in enumerate(readings.ids):
+        rows = readings.row[readings.receiver == number]
+        columns[receiver] = _means(numbers[rows], place[rows], places)
+    return columns
+
+
+def _free(name: str) -> str:
+    return f"source_{name}" if name in RESERVED or name.startswith(PREFIXES) else name
+
+
+def _without_mark(values: FloatArray) -> tuple[FloatArray, list[float]]:
+    """Ranges without a number that stands for none: equal in several rows and further away than all others spread."""
+    distinct, counts = np.unique(values[~np.isnan(values)], return_counts=True)
+    for end, inner in ((-1, slice(None, -1)), (0, slice(1, None))):
+        others = distinct[inner]
+        if len(others) > 1 and counts[end] >= FEWEST_EQUAL and abs(distinct[end] - others[end]) > np.ptp(others):
+            return np.where(values == distinct[end], np.nan, values), [float(distinct[end])]
+    return values, []
+
+
+def _means(values: FloatArray, place: IntArray, places: int | None = None) -> FloatArray:
+    """Means over the rows of each place, NaN without a number."""
+    known = ~np.isnan(values)
+    size = int(place.max()) + 1 if places is None else int(places)
+    with np.errstate(invalid="ignore"):
+        total = np.bincount(place[known], values[known], minlength=size)
+        return np.asarray(total / np.bincount(place[known], minlength=size))
+
+
+def _of_places(table: Table, name: str, place: IntArray) -> NDArray[Any]:
+    """Means of numbers, or the different texts of each place in the order of its rows."""
+    if table.is_numeric(name):
+        return _means(table.numbers(name), place)
+    frame = package("pandas").DataFrame({"place": place, "text": table.frame[name].astype("object")}).dropna()
+    frame = frame.drop_duplicates()
+    texts = np.full(int(place.max()) + 1, "", object)
+    for number, part in frame.groupby("place", sort=False)["text"]:
+        texts[number] = SEPARATOR.join(one_line(text) for text in part)
+    return texts

@@ -9,15 +9,15 @@ import numpy as np
 
 from ...core import DataFault, Receiver
 from ...core.angles import FloatArray
-from ...core.antenna import ANTENNA, UPRIGHT
+from ...core.antenna import ANTENNA
 from ...core.carriers import FREQUENCY
 from ..folder_files import CsvTable
-from ..receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_name
-from ..unknown import RECEIVER, name_words
+from ..receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
+from ..unknown import RECEIVER, listed, name_words
 from .columns import named_columns, shown_names, unit_of
 from .files import Table
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
-from .readings import listed, normal_id
+from .readings import normal_id
 
 POSES = tuple(name for name in COLUMNS if name not in ("id", "x", "y", "z", *TX_COLUMNS))
 """Columns of the layout that are taken over as they are: orientation, carrier and antenna."""
@@ -38,20 +38,23 @@ def read_receivers(
     Raises:
         InputError: no column of ids or positions, a receiver that is in it twice, or fields that are wrong.
     """
-    unknown = {name: Receiver(receiver_name(name), np.full(3, np.nan), np.array(UPRIGHT)) for name in ids}
+    unknown = {name: receiver_of(name, np.full(3, np.nan), None, ANTENNA) for name in ids}
     if table is None:
         text = "positions of the receivers are unknown, their fields empty; --anchors FILE states them"
         return tuple(unknown.values()), [text]
     table = _with_ids(table)
     stated = _stated(table, frame, units, height_m)
     receivers = unknown | {name: receiver for name, receiver in stated.items() if name in unknown}
-    return tuple(receivers.values()), [*_notes(table, receivers, stated), *_height_note(table, height_m)]
+    notes = _notes(table, receivers, stated)
+    if "z" not in named_columns(list(table.frame.columns), {}):
+        notes.append(f"{table.files[0][0].name}: no column z, so receivers are {height_m:g} m above the floor")
+    return tuple(receivers.values()), notes
 
 
 def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str, Receiver]) -> list[str]:
     """What the table lacks, and what of it is not used."""
     of = named_columns(list(table.frame.columns), {})
-    used = ["id", *(of.get(meaning) for meaning in ("x", "y", "z", "lat", "lon")), *POSES]
+    used = ["id", *map(of.get, ("x", "y", "z", "lat", "lon")), *POSES]
     lacking = [name for name, receiver in receivers.items() if np.isnan(receiver.position_m).any()]
     groups = {
         "columns that are not used": [name for name in table.frame.columns if name not in used],
@@ -62,14 +65,7 @@ def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str,
     return [f"{file}: {what} ({len(names)}): {listed(names)}" for what, names in groups.items() if names]
 
 
-def _height_note(table: Table, height_m: float) -> list[str]:
-    if "z" in named_columns(list(table.frame.columns), {}):
-        return []
-    return [f"{table.files[0][0].name}: no column z, so receivers are {height_m:g} m above the floor"]
-
-
 def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dict[str, Receiver]:
-    """The receivers of a table by id."""
     places = _stated_positions(table, frame, units, height_m).round(POSITION_DIGITS)
     names = [name for name in POSES if name in table.frame]
     fields = table.frame[names].astype(object).where(table.frame[names].notna(), "").astype(str)
@@ -82,16 +78,12 @@ def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dic
     for row, text in enumerate(table.frame["id"].astype(str)):
         if (name := normal_id(text)) in receivers:
             raise table.fault(f"receiver {name} is in an earlier row, too; remove one of them", row)
-        orientation = orientations[row]
         hz = None if np.isnan(carriers[row]) else float(carriers[row])
-        upright = np.array(UPRIGHT)
-        pose = places[row], upright if orientation is None else orientation
-        receivers[name] = Receiver(receiver_name(name), *pose, antennas[row], frequency_hz=hz)
+        receivers[name] = receiver_of(name, places[row], orientations[row], antennas[row], hz)
     return receivers
 
 
 def _stated_positions(table: Table, frame: LocalFrame, units: str, height_m: float) -> FloatArray:
-    """Positions [rows, 3] of a table of receivers."""
     of = named_columns(list(table.frame.columns), {})
     first, second, geographic = plane_columns(of, table)
     if geographic and not frame.crs:
