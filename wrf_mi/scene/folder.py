@@ -97,27 +97,20 @@ def write_scene(
     folder = Path(folder)
     if not surfaces:
         raise InputError(f"{source}: no surface was found in it; a scene needs at least one")
-    names = [surface.name for surface in surfaces]
-    if len(set(names)) < len(names):
-        raise ValueError("write_scene: two surfaces have the same name")
-    materials = materials or Materials()
-    if unknown := [name for name in materials.surfaces if name not in names]:
-        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
+    full = _complete(materials or Materials(), surfaces)
     require_near(box_of(surfaces), source)
-    full = materials.complete({surface.name: surface.kind for surface in surfaces})
-    matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
     facts = {
         "description": description or f"{len(surfaces)} surfaces made from {Path(source).name}",
         "frame": frame,
         "units": "m",
         "xml": XML_FILE,
         "source": source,
-        "origin_m": None if origin_m is None else [float(value) for value in origin_m],
-        "registration": None if matrix is None else matrix.tolist(),
+        "origin_m": None if origin_m is None else np.asarray(origin_m, float).tolist(),
+        "registration": None if registration is None else np.asarray(registration, float).reshape(4, 4).tolist(),
         "counts": {
             "surfaces": len(surfaces),
             "faces": sum(len(surface.faces) for surface in surfaces),
-            **{key: int(value) for key, value in (counts or {}).items()},
+            **(counts or {}),
         },
     }
     with atomic_folder(folder, replace=replace) as part:
@@ -129,6 +122,16 @@ def write_scene(
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
         write_figure(part / PREVIEW_FILE, draw_scene(surfaces, points_m=points_m))
     return folder
+
+
+def _complete(materials: Materials, surfaces: Sequence[Surface]) -> Materials:
+    """Materials of all surfaces; `InputError` for those of a surface that is not among them."""
+    kinds = {surface.name: surface.kind for surface in surfaces}
+    if len(kinds) < len(surfaces):
+        raise ValueError("write_scene: two surfaces have the same name")
+    if unknown := [name for name in materials.surfaces if name not in kinds]:
+        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(kinds)}")
+    return materials.complete(kinds)
 
 
 def plain_name(name: str, odd: str, names_in_use: Collection[str]) -> str:

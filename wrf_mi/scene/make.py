@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -34,6 +35,7 @@ PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
+UNSTATED: Storey = (None, 0.0, None, None)  # these options where none is given
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -101,24 +103,17 @@ def make_scene(
     'open'
     >>> shutil.rmtree(folder)
     """
-    files = [Path(f) for f in ([points_file] if isinstance(points_file, str | Path) else points_file)]
+    files = list(map(Path, [points_file] if isinstance(points_file, str | Path) else points_file))
     file, out = files[0], Path(out)
-    if out.exists() and not replace:
-        raise InputError(f"{out}: exists; remove it or choose another folder")
-    if registration is not None and register_walls_of is not None:
-        raise InputError(f"{file}: registration by pairs and to walls: give one of them")
-    if up not in (None, "y", "z"):
-        raise InputError(f"{file}: {up!r} is up: give y or z")
+    _check_options(file, out, replace, up)
     materials = read_materials(materials) if isinstance(materials, str | Path) else materials
-    matrix = None if registration is None else _rigid(registration)
-    measured = None if positions is None else read_positions(positions)
-    known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
+    matrix, known_walls, measured = _references(file, registration, register_walls_of, positions)
     shift = _shift(file, origin_m)
     source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0))
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
-    if source.scan is not None and matrix is known_walls is None:  # before minutes are spent on its planes
+    if matrix is known_walls is None:  # before minutes are spent on a scan's planes
         require_near(trimesh.transform_points(source.extent_m, shift), file)
     surfaces = source.surfaces(up)
     if known_walls is not None:
@@ -128,7 +123,6 @@ def make_scene(
     if measured is not None:
         mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
-    scanned = None if source.scan is None else source.scan.points_m
     write_scene(
         out,
         placed,
@@ -137,11 +131,28 @@ def make_scene(
         source=", ".join(map(str, files)),
         materials=materials,
         registration=matrix,
-        points_m=None if scanned is None else trimesh.transform_points(_sample(scanned), motion),
-        counts={} if scanned is None else {"points": len(scanned)},
         replace=replace,
+        **source.sample(motion),
     )
     return read_scene_folder(out)
+
+
+def _check_options(file: Path, out: Path, replace: bool, up: Up | None) -> None:
+    if out.exists() and not replace:
+        raise InputError(f"{out}: exists; remove it or choose another folder")
+    if up not in (None, "y", "z"):
+        raise InputError(f"{file}: {up!r} is up: give y or z")
+
+
+def _references(
+    file: Path, registration: ArrayLike | None, walls_of: str | Path | None, positions: str | Path | None
+) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
+    """Rigid motion [4, 4], walls [m, 2, 2] to register to, and measured positions [n, 3]; None where not stated."""
+    if registration is not None and walls_of is not None:
+        raise InputError(f"{file}: registration by pairs and to walls: give one of them")
+    matrix = None if registration is None else _rigid(registration)
+    walls = None if walls_of is None else layout_walls(read_layout(walls_of))
+    return matrix, walls, None if positions is None else read_positions(positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +183,15 @@ class _Source:
                 raise _other_up(self.file)
         return surfaces
 
+    def sample(self, motion: FloatArray) -> dict[str, Any]:
+        """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""
+        if self.scan is None:
+            return {}
+        count = len(self.scan.points_m)
+        # At random: every k-th point would show the scanner's pattern.
+        chosen = np.random.default_rng(1).integers(count, size=min(PREVIEW_POINTS, count))
+        return {"points_m": trimesh.transform_points(self.scan.points_m[chosen], motion), "counts": {"points": count}}
+
 
 def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey: Storey) -> _Source:
     file = files[0]
@@ -180,8 +200,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if is_plan(file):
         surfaces, grid = _read_plan(file, units, up, *storey)
         return _Source(file, surfaces, grid)
-    height_m, floor_m, resolution_m, row_0 = storey
-    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+    if storey != UNSTATED:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
@@ -204,11 +223,6 @@ def _frame(file: Path, origin_m: Sequence[float] | None, matrix: FloatArray | No
     """Axes and origin of the scene in words."""
     origin = "" if origin_m is None else f", less the origin {', '.join(f'{value:.12g}' for value in origin_m)}"
     return f"that of {file.name}, z upwards{origin}{'' if matrix is None else ', moved by the registration'}"
-
-
-def _sample(points_m: FloatArray) -> FloatArray:
-    """Points of a scan for the preview, at random: every k-th point would show the scanner's pattern."""
-    return points_m[np.random.default_rng(1).integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
 
 
 def _rigid(registration: ArrayLike) -> FloatArray:

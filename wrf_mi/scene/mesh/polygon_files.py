@@ -163,23 +163,11 @@ def read_ply(path: Path) -> Polygons:
 
     Source: G. Turk, "The PLY polygon file format" (1994).
     """
-    content = path.read_bytes()
-    elements, order, at = ply_header(content)
-    body, columns = content[at:], dict[str, dict[str, Any]]()
-    if not order:
-        # Numbers of text as one binary table, so that both are cut into rows by the same code.
-        body = np.fromstring(body.strip(), float, sep=" ").tobytes()
-        elements = [
-            PlyElement(e.name, e.count, [(name, "f8", count and "f8") for name, _, count in e.properties])
-            for e in elements
-        ]
-    at = 0
-    for element in elements:
-        columns[element.name], at = _ply_columns(body, at, element, order or "=")
+    columns = _ply_elements(path.read_bytes())
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
     if not {"x", "y", "z"} <= set(vertex):
         raise ValueError("no vertices with x, y and z in it")
-    if any(element.name == "tristrips" and element.count for element in elements):
+    if columns.get("tristrips"):
         raise ValueError("its faces are triangle strips; store them as faces")
     vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(float)
     lists = next((face[name] for name in CORNERS if name in face), None)
@@ -193,6 +181,22 @@ def read_ply(path: Path) -> Polygons:
         np.zeros(len(sizes), np.int64),
         lambda polygon: f"face {polygon + 1}",
     )
+
+
+def _ply_elements(content: bytes) -> dict[str, dict[str, Any]]:
+    """Columns of each element of a PLY file, see `_ply_columns`."""
+    elements, order, at = ply_header(content)
+    body, at, columns = content[at:], 0, dict[str, dict[str, Any]]()
+    if not order:
+        # Numbers of text as one binary table, so that both are cut into rows by the same code.
+        body = np.fromstring(body.strip(), float, sep=" ").tobytes()
+        elements = [
+            PlyElement(e.name, e.count, [(name, "f8", count and "f8") for name, _, count in e.properties])
+            for e in elements
+        ]
+    for element in elements:
+        columns[element.name], at = _ply_columns(body, at, element, order or "=")
+    return columns
 
 
 def _ply_columns(body: bytes, at: int, element: PlyElement, order: str) -> tuple[dict[str, Any], int]:
