@@ -44,9 +44,7 @@ def _colour_bytes(material: str) -> IntArray:
 
 
 class _Exported(NamedTuple):
-    """Materials of a folder for Sionna RT: their new names, and by these constants, slabs of ITU-R P.2040, and facts
-    about all.
-    """
+    """Materials of a folder: new names, and by these constants, slabs of ITU-R P.2040, and facts about all."""
 
     names: dict[str, str]
     constants: dict[str, dict[str, float]]
@@ -101,8 +99,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     with atomic_folder(out, options.replace) as folder:
         (folder / "meshes").mkdir()
         for name, (surface, _) in files.items():
-            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-            mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
+            surface.mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
         write_atomically(folder / XML, scene_xml(materials, exported.constants, exported.slabs))
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
         text = json.dumps({"frequency_hz": frequency_hz, "materials": exported.facts}, indent=1)

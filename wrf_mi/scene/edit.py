@@ -54,11 +54,7 @@ class Move:
 
 
 def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
-    """Surfaces of a scene folder in the order of ``materials.yml``, and its materials.
-
-    Raises:
-        InputError: not a scene folder, or a damaged one.
-    """
+    """Surfaces of a scene folder in the order of ``materials.yml``, and its materials; `InputError`: a damaged one."""
     scene = read_scene_folder(folder)
     surfaces = []
     for name, entry in scene.materials.surfaces.items():
@@ -87,7 +83,7 @@ def edit_scene(
     remove: Sequence[str] = (),
     replace_folder: bool = False,
 ) -> Path:
-    """Write a scene with parts moved or removed; materials stay.
+    """Write a folder of a scene with parts moved or removed, and return its path; materials stay.
 
     Parts that are moved partly out of the scene, or into other surfaces, are named in the log with the distance.
 
@@ -97,9 +93,6 @@ def edit_scene(
         moves: motions, in their order; a part may move more than once.
         remove: names of surfaces to leave out; ``*`` and ``?`` are wildcards.
         replace_folder: replace an existing folder.
-
-    Returns:
-        The new folder.
 
     Raises:
         InputError: not a scene folder, a name that no surface has, nothing to change, a part that is moved and removed

@@ -102,16 +102,10 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
         yield scene, supposed
         return
     kinds = {**materials.surfaces, **{face.name: face.kind for face in supposed.hidden}}
+    materials = replace(materials, surfaces=kinds)
+    parts, frame = [*surfaces, *supposed.hidden], f"that of {scene}"
     with TemporaryDirectory() as place:
-        folder = Path(place) / "scene"
-        write_scene(
-            folder,
-            [*surfaces, *supposed.hidden],
-            frame=f"that of {scene}",
-            source=str(scene),
-            materials=replace(materials, surfaces=kinds),
-        )
-        yield folder, supposed
+        yield write_scene(Path(place) / "scene", parts, frame=frame, source=str(scene), materials=materials), supposed
 
 
 def boxes(surfaces: Sequence[Surface]) -> Boxes:

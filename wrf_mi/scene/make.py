@@ -56,7 +56,7 @@ def make_scene(
     row_0: Row0 | None = None,
     replace: bool = False,
 ) -> SceneFolder:
-    r"""Make a scene folder that Mitsuba and Sionna RT both open.
+    r"""Make a scene folder that Mitsuba and Sionna RT both open, and return its content.
 
     Args:
         points_file: a 3D scan, or several in one frame (`wrf_mi.scene.scan.points.read_scan`); a plan in two dimensions
@@ -81,9 +81,6 @@ def make_scene(
             source whose walls they cross, or that they fit better when mirrored, is refused.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         replace: replace an existing folder.
-
-    Returns:
-        The content of the folder.
 
     Raises:
         InputError: an unusable file, a missing package, options that do not fit the source, coordinates too far from
@@ -198,8 +195,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if len(files) > 1 and (flat := [f for f in files if is_plan(f) or has_faces(f)]):
         raise InputError(f"{flat[0]}: several files are scans of one place, and this is none; give it alone")
     if is_plan(file):
-        surfaces, grid = _read_plan(file, units, up, *storey)
-        return _Source(file, surfaces, grid)
+        return _read_plan(file, units, up, storey)
     if storey != UNSTATED:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if has_faces(file):
@@ -236,16 +232,8 @@ def _rigid(registration: ArrayLike) -> FloatArray:
     return matrix
 
 
-def _read_plan(
-    file: Path,
-    units: str | None,
-    up: Up | None,
-    height_m: float | None,
-    floor_m: float,
-    resolution_m: float | None,
-    row_0: Row0 | None,
-) -> tuple[list[Surface], PlanGrid | None]:
-    """The surfaces of a plan, and the cells of an occupancy grid."""
+def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> _Source:
+    height_m, floor_m, resolution_m, row_0 = storey
     if file.suffix.lower() == ".csv" and _has_heights(file):
         text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
@@ -257,7 +245,7 @@ def _read_plan(
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0)
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
-    return walls, plan if isinstance(plan, PlanGrid) else None
+    return _Source(file, walls, plan if isinstance(plan, PlanGrid) else None)
 
 
 def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
@@ -285,15 +273,13 @@ def is_plan(path: str | Path) -> bool:
     suffix = file.suffix.lower()
     if suffix in PLAN_SUFFIXES:
         return True
-    try:
+    with suppress(OSError, ValueError, BadZipFile, NotImplementedError):  # the reader of points raises
         if suffix == ".npz":
             return bool(stored_names(file) & {"log_odds", "xy_m"})
         if suffix in (".xyz", ".txt"):
             with file.open(encoding="utf-8-sig") as stream:
                 rows = (line.split("#")[0].replace(",", " ").split() for line in stream)
-                return len(next((row for row in rows if row), [])) == 2
-    except (OSError, ValueError, BadZipFile, NotImplementedError):
-        pass  # the reader of points raises
+                return len(next(filter(None, rows), [])) == 2
     return False
 
 

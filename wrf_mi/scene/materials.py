@@ -99,8 +99,7 @@ class Materials:
 def read_materials(path: str | Path) -> Materials:
     """Read and check a ``materials.yml``, or that of a scene folder.
 
-    Raises:
-        InputError: missing, not YAML, an unknown kind or material, or a thickness or constant out of range.
+    `InputError`: missing, not YAML, an unknown kind or material, or a thickness or constant out of range.
     """
     file = Path(path)
     file = file / FILE if file.is_dir() else file

@@ -85,6 +85,8 @@ def draw_scene(
 ) -> Figure:
     """A scene at a slant and in plan, with a scan, paths, both ends of these, or Gaussians.
 
+    `ValueError`: no surface, or paths without both ends.
+
     Args:
         surfaces: surfaces of the scene, at least one.
         points_m: a scan [n, 3] or [n, 2].
@@ -93,9 +95,6 @@ def draw_scene(
         receivers_m: shape [n_rx, 3].
         gaussians: Gaussians of a field.
         title: text above the picture.
-
-    Raises:
-        ValueError: no surface, or paths without both ends.
     """
     if not surfaces:
         raise ValueError("draw_scene: no surface")
@@ -216,9 +215,7 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
 
 
 def _lit_faces(surface: Surface, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners [f, 3, 3] of faces that hide nothing from above, and their colours [f, 4] lit from the side; walls in
-    front are transparent.
-    """
+    """Corners [f, 3, 3] of faces below the ceiling, and colours [f, 4] lit from the side; walls in front fade."""
     corners = surface.vertices_m[surface.faces]
     (normal, level), centre = _normals(corners), corners.mean(axis=1)
     light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
@@ -243,8 +240,7 @@ def _draw_slant(axes: Any, surfaces: Sequence[Surface], low: FloatArray, high: F
             flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}
             axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
-    lines = np.concatenate([np.empty((0, 2, 3)), *map(free_edges, floors + others)])
-    if len(lines):
+    if len(lines := np.concatenate([np.empty((0, 2, 3)), *map(free_edges, floors + others)])):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
     _set_view(axes, low, high)
 
@@ -269,18 +265,14 @@ def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: F
     """The floor, and a cut through everything that stands on it."""
     level = float(low[2] + CUT * (high[2] - low[2]))
     for surface in surfaces:
-        colour = KIND_COLOURS[surface.kind]
+        colour = np.array(to_rgb(KIND_COLOURS[surface.kind]))
         if surface.kind == "floor":
             triangles = surface.vertices_m[surface.faces][..., :2]
-            light = 0.45 * np.array(to_rgb(colour)) + 0.55
-            axes.add_collection(
-                PolyCollection(list(triangles), facecolors=[light], edgecolors="none", antialiased=False, zorder=1)
-            )
-            continue
-        cut = cut_lines(surface, level)
-        if len(cut):
-            edge = tuple(0.6 * c for c in to_rgb(colour))
-            axes.add_collection(LineCollection(list(cut), colors=[edge], linewidths=2.2, capstyle="round", zorder=3))
+            flat: dict[str, Any] = {"edgecolors": "none", "antialiased": False, "zorder": 1}
+            axes.add_collection(PolyCollection(list(triangles), facecolors=[0.45 * colour + 0.55], **flat))
+        elif len(cut := cut_lines(surface, level)):
+            lines = LineCollection(list(cut), colors=[0.6 * colour], linewidths=2.2, capstyle="round", zorder=3)
+            axes.add_collection(lines)
     size = np.maximum(high - low, 0.1)[:2]
     margin = 0.06 * size.max()
     axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)

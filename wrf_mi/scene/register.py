@@ -138,11 +138,11 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     (pose, score), *others = _find_poses(points, walls)
     _, mirrored = _find_poses(points * [-1, 1], walls)[0]
     if mirrored > max(score + CLEAR_LEAD, LEAST_AGREEMENT):
-        text = f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
-        text += (
+        text = f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f})"
+        remedy = (
             "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
-        raise InputError(text)
+        raise InputError(f"{text}; {remedy}")
     if score < LEAST_AGREEMENT:
         scale, agreement = best_scale(points, pose, walls)
         share = np.mean(distance_to_walls(_moved(points, pose), walls) <= NEAR_M)

@@ -46,8 +46,7 @@ def parsed_xml(path: Path) -> Element:
 def read_scene_xml(path: Path) -> Element:
     """The root of a scene file.
 
-    Raises:
-        InputError: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
+    `InputError`: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
     """
     try:
         root = parsed_xml(path)

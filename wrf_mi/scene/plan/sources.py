@@ -71,8 +71,7 @@ def grid_from_probability(
 ) -> PlanGrid:
     """A grid from the probability [rows, columns] that a cell is occupied, NaN where that is unknown.
 
-    Raises:
-        InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
+    `InputError`: it has not two axes, holds nothing occupied, or the resolution is not positive.
     """
     p = np.asarray(probability, float)
     if p.size > LARGEST_PICTURE:
@@ -95,8 +94,7 @@ def grid_from_probability(
 def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> PlanGrid:
     """A grid of the cells that hold points [n, 2]; none is free, since points do not show which cells are empty.
 
-    Raises:
-        InputError: no points, or more cells than `LARGEST_GRID_CELLS`.
+    `InputError`: no points, or more cells than `LARGEST_GRID_CELLS`.
     """
     xy = np.asarray(xy_m, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
@@ -165,8 +163,7 @@ def read_plan(
 def read_layout(path: str | Path) -> FloatArray:
     """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
 
-    Raises:
-        InputError: missing file, header or number, or no wall in it.
+    `InputError`: missing file, header or number, or no wall in it.
     """
     vertices = read_columns(Path(path), "x,y")
     if not np.any(np.diff(vertices, axis=0)):
@@ -185,7 +182,7 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
             raise InputError(f"{path}: {key} holds no numbers but {content[key].dtype}")
         numbers[key] = content[key].astype(float)
     if "log_odds" in numbers:
-        return _grid_of_arrays(path, numbers, resolution_m, row_0, content.get("row_0"))
+        return _grid_of_arrays(path, numbers, resolution_m, row_0 or _stated_side(path, content.get("row_0")))
     if "xy_m" not in numbers:
         text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
         raise InputError(f"{text}; give one of them")
@@ -202,13 +199,7 @@ def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> Pl
     return PlanPoints(xy, time)
 
 
-def _grid_of_arrays(
-    path: Path,
-    numbers: Mapping[str, FloatArray],
-    resolution_m: float | None,
-    row_0: Row0 | None,
-    stated_row_0: NDArray[Any] | None,
-) -> PlanGrid:
+def _grid_of_arrays(path: Path, numbers: Mapping[str, FloatArray], resolution_m: float | None, row_0: Row0) -> PlanGrid:
     if resolution_m is None:
         if "resolution_m" not in numbers:
             raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
@@ -220,7 +211,6 @@ def _grid_of_arrays(
     known = values[~np.isnan(values)]
     if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
         values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
-    row_0 = row_0 or _stated_side(path, stated_row_0)
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
 
 

@@ -120,8 +120,8 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
     for spread_deg in NORMAL_SPREADS_DEG:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
-        candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
-        candidates = [candidate for candidate in candidates if not repeats(candidate, planes, REPEAT * noise)]
+        layers_of_boxes = (layer for box in boxes for layer in _patch_layers(cloud, free, box, noise))
+        candidates = [layer for layer in layers_of_boxes if not repeats(layer, planes, REPEAT * noise)]
         if not candidates:
             break
         merged, planes = _merge(cloud, [*planes, *candidates], noise), []
@@ -203,15 +203,9 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
 
 def repeats(plane: Plane, others: Sequence[Plane], least_m: float) -> bool:
     """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
-    return any(_repeats(plane, other, least_m) for other in others)
-
-
-def _repeats(plane: Plane, other: Plane, least_m: float) -> bool:
-    if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
-        return False
-    if abs(other.distance(plane.centre_m)) > least_m:
-        return False
-    return bool(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)))
+    parallel = [other for other in others if abs(plane.normal @ other.normal) >= np.cos(np.radians(10))]
+    near_ones = [other for other in parallel if abs(other.distance(plane.centre_m)) <= least_m]
+    return any(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)) for other in near_ones)
 
 
 def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:
