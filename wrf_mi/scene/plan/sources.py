@@ -182,7 +182,7 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
             raise InputError(f"{path}: {key} holds no numbers but {content[key].dtype}")
         numbers[key] = content[key].astype(float)
     if "log_odds" in numbers:
-        return _grid_of_arrays(path, numbers, resolution_m, row_0 or _stated_side(path, content.get("row_0")))
+        return _grid_of_arrays(path, {**content, **numbers}, resolution_m, row_0)
     if "xy_m" not in numbers:
         text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
         raise InputError(f"{text}; give one of them")
@@ -199,18 +199,21 @@ def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> Pl
     return PlanPoints(xy, time)
 
 
-def _grid_of_arrays(path: Path, numbers: Mapping[str, FloatArray], resolution_m: float | None, row_0: Row0) -> PlanGrid:
+def _grid_of_arrays(
+    path: Path, content: Mapping[str, NDArray[Any]], resolution_m: float | None, row_0: Row0 | None
+) -> PlanGrid:
     if resolution_m is None:
-        if "resolution_m" not in numbers:
+        if "resolution_m" not in content:
             raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
-        resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
-    origin = numbers.get("origin_m", np.zeros(2))
+        resolution_m = float(content["resolution_m"].reshape(-1)[0])
+    origin = content.get("origin_m", np.zeros(2))
     if origin.shape != (2,) or not np.isfinite(origin).all():
         raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
-    values = numbers["log_odds"]
+    values = content["log_odds"]
     known = values[~np.isnan(values)]
     if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
         values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+    row_0 = row_0 or _stated_side(path, content.get("row_0"))
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
 
 
