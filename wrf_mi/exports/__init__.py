@@ -23,10 +23,10 @@ _WRITERS: dict[str, tuple[tuple[str, ...], str, str, tuple[str, ...]]] = {
     "sionna": (SCENES, "", "scenes:write_sionna", ("frequency_hz", "material")),
     "glb": (SCENES, ".glb", "scenes:write_glb", ("material",)),
     "ply": (SCENES, ".ply", "scenes:write_mesh", ("material",)),
-    "spectra": ((DATASET,), "", "measurements:write_spectra", ()),
-    "ble": ((DATASET,), "", "measurements:write_strengths", ()),
-    "nerf2-csi": ((DATASET,), "", "measurements:write_channels", ()),
-    "npz": ((DATASET,), ".npz", "measurements:write_npz", ()),
+    "spectra": ((DATASET,), "", "source:write_spectra", ()),
+    "ble": ((DATASET,), "", "source:write_strengths", ()),
+    "nerf2-csi": ((DATASET,), "", "source:write_channels", ()),
+    "npz": ((DATASET,), ".npz", "source:write_npz", ()),
 }
 """Kinds of sources, suffix, writer and options of each format, as the attributes of `Format`."""
 _TEXTS = {

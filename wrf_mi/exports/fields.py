@@ -68,15 +68,18 @@ def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:
     x, y, z, w = numbers["rotation"] / np.linalg.norm(numbers["rotation"], axis=0)
     columns = dict(zip("xyz", numbers["position"], strict=True))
     columns |= {f"n{axis}": np.zeros_like(alpha) for axis in "xyz"}
-    columns |= {f"f_dc_{k}": colour[:, k] for k in range(3)}
+    columns |= _numbered("f_dc_", colour.T)
     columns |= {"opacity": np.log(alpha) - np.log1p(-alpha)}
-    columns |= {f"scale_{k}": np.log(values) for k, values in enumerate(numbers["scale"])}
-    columns |= {f"rot_{k}": values for k, values in enumerate((w, x, y, z))}
+    columns |= _numbered("scale_", np.log(numbers["scale"])) | _numbered("rot_", np.stack([w, x, y, z]))
     for k, values in enumerate(signal):
         columns |= {f"signal_re_{k}": values.real, f"signal_im_{k}": values.imag}
     if delta is not None:
         columns |= {"attenuation_re": delta[0], "attenuation_im": delta[1]}
     return {name: values.astype(np.float32) for name, values in columns.items()}
+
+
+def _numbered(prefix: str, rows: FloatArray) -> dict[str, FloatArray]:
+    return {f"{prefix}{k}": values for k, values in enumerate(rows)}
 
 
 def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:

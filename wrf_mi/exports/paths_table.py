@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ logger = logging.getLogger(__name__)
 
 LETTERS = {1: "R", 2: "S", 4: "T", 8: "D"}
 """Letters of the kinds of interaction: reflection, scattering, transmission, diffraction."""
+CODES = {letter: code for code, letter in LETTERS.items()}
 ANGLES = ("azimuth", "elevation")
 SEPARATOR = ";"  # between the interactions, vertices and objects of a path
 
@@ -65,18 +67,27 @@ def _traced(source: Source, options: ExportOptions) -> TraceResult:
         if stated := [name for name, value in (ends | more).items() if value is not None]:
             raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
         return source.trace()
+    return _traced_now(source, ends, options)
+
+
+def _traced_now(source: Source, ends: dict[str, Any], options: ExportOptions) -> TraceResult:
     if options.tx_pos_m is None or options.rx_pos_m is None or options.frequency_hz is None:
         lacking = ", ".join(name for name, value in ends.items() if value is None)
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
+    scene = open_scene(source.name, options.frequency_hz, material=options.material)
+    receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
+    return trace_paths(scene, options.tx_pos_m, receivers, _trace_options(options), options.progress)
+
+
+def _trace_options(options: ExportOptions) -> TraceOptions:
+    """Stated kinds of paths and depth; those without effect are logged."""
     chosen: dict[str, Any] = {} if options.kinds is None else stated_kinds(options.kinds)
     chosen |= {} if options.depth is None else {"depth": options.depth}
     trace_options = TraceOptions(**chosen)
     for name, reason in without_effect(trace_options).items():
         option = "--depth" if name == "depth" else f"--paths {name}"
         logger.warning("%s has no effect: %s", option, reason)
-    scene = open_scene(source.name, options.frequency_hz, material=options.material)
-    receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
-    return trace_paths(scene, options.tx_pos_m, receivers, trace_options, options.progress)
+    return trace_options
 
 
 def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
@@ -108,29 +119,32 @@ def read_paths(file: str | Path) -> Paths:
     """
     table = read_csv(Path(file))
     tx, rx = (table.numbers(name).astype(np.int64) for name in ("tx", "rx"))
-    lists = {
-        name: [text.split(SEPARATOR) if text else [] for text in table.texts(name)]
-        for name in ("interactions", "vertices_m", "objects")
-    }
-    depth = max((len(parts) for parts in lists["interactions"]), default=0)
-    shape = len(tx), depth
+    gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
+    directions = _directions(table, "departure"), _directions(table, "arrival")
+    counts = (int(numbers.max(initial=-1)) + 1 for numbers in (tx, rx))
+    return Paths(tx, rx, gain, table.numbers("length_m"), *directions, *_bounces(file, table), *counts)
+
+
+def _bounces(file: str | Path, table: CsvTable) -> Any:
+    """Interactions [p, k], vertices [p, k, 3], objects [p, k] and their names, as `Paths` has them."""
+    kinds, points, met = (list(map(_items, table.texts(name))) for name in ("interactions", "vertices_m", "objects"))
+    shape = len(kinds), max(map(len, kinds), default=0)
     interactions, objects = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32)
     vertices = np.full((*shape, 3), np.nan)
-    names = list(dict.fromkeys(name for parts in lists["objects"] for name in parts))
-    codes = {letter: code for code, letter in LETTERS.items()}
-    for path, (kinds, points, met) in enumerate(zip(*lists.values(), strict=True)):
+    names = list(dict.fromkeys(chain(*met)))
+    for path, items in enumerate(zip(kinds, points, met, strict=True)):
         try:
-            for k, (kind, point, name) in enumerate(zip(kinds, points, met, strict=True)):
-                interactions[path, k], objects[path, k] = codes[kind], names.index(name)
+            for k, (kind, point, name) in enumerate(zip(*items, strict=True)):
+                interactions[path, k], objects[path, k] = CODES[kind], names.index(name)
                 vertices[path, k] = [float(number) for number in point.split()]
         except (ValueError, KeyError):
             text = "interactions, vertices and objects do not fit"
             raise InputError(f"{file}, row {path + 1}: {text}; restore it") from None
-    gain = table.numbers("gain_re") + 1j * table.numbers("gain_im")
-    directions = _directions(table, "departure"), _directions(table, "arrival")
-    bounces: Any = (interactions, vertices, objects, tuple(names))
-    counts = (int(numbers.max(initial=-1)) + 1 for numbers in (tx, rx))
-    return Paths(tx, rx, gain, table.numbers("length_m"), *directions, *bounces, *counts)
+    return interactions, vertices, objects, tuple(names)
+
+
+def _items(text: str) -> list[str]:
+    return text.split(SEPARATOR) if text else []
 
 
 def _directions(table: CsvTable, end: str) -> FloatArray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -42,6 +43,38 @@ def _colour_bytes(material: str) -> IntArray:
     return (255 * np.array(COLOURS.get(material, OTHER_COLOUR).split(), float)).round().astype(int)
 
 
+class _Exported(NamedTuple):
+    """Materials of a folder: new names, and by these constants, slabs of ITU-R P.2040, and facts about all."""
+
+    names: dict[str, str]
+    constants: dict[str, dict[str, float]]
+    slabs: dict[str, tuple[str, float]]
+    facts: dict[str, dict[str, Any]]
+
+
+def _exported(scene: Any, used: Iterable[str], frequency_hz: float) -> _Exported:
+    """Materials of a ``sionna.rt.Scene`` that are used, at a carrier."""
+    names, constants, slabs, facts = exported = _Exported({}, {}, {}, {})
+    for name in used:
+        material = scene.radio_materials[name]
+        if absorbs(material):
+            names[name], facts[ABSORBER] = ABSORBER, {"absorbs": True}
+            continue
+        numbers = (material.relative_permittivity, material.conductivity, material.thickness)
+        values = dict(zip(PERFECT_CONSTANTS, (float(np.ravel(number)[0]) for number in numbers), strict=True))
+        itu: Any = getattr(material, "itu_type", None)
+        follows = itu is not None and in_itu_range(itu, frequency_hz)
+        new_name = name if follows or itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
+        names[name] = new_name = plain_name(new_name, ODD_IN_FILES, names.values())
+        if follows:
+            slabs[new_name] = itu, values["thickness"]
+        else:
+            constants[new_name] = values
+        exponent = conductivity_exponent(material, frequency_hz)
+        facts[new_name] = {**values, "conductivity_exponent": exponent, "follows_frequency": follows}
+    return exported
+
+
 def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
     """Write a scene as a folder for plain Sionna RT (`wrf_mi.exports.source.Write`).
 
@@ -57,43 +90,22 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
     scene, stated_m, laws = _loaded(source, options)
     set_frequency(scene, frequency_hz, stated_m, laws)
     check_materials(scene)
-    parts, renamed = _parts(scene), dict[str, str]()
-    constants: dict[str, dict[str, float]] = {}
-    slabs: dict[str, tuple[str, float]] = {}
-    listed: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys(material for _, material in parts):
-        material = scene.radio_materials[name]
-        if absorbs(material):
-            renamed[name], listed[ABSORBER] = ABSORBER, {"absorbs": True}
-            continue
-        numbers = (material.relative_permittivity, material.conductivity, material.thickness)
-        values = dict(zip(PERFECT_CONSTANTS, (float(np.ravel(number)[0]) for number in numbers), strict=True))
-        itu = getattr(material, "itu_type", None)
-        if itu is not None and in_itu_range(itu, frequency_hz):
-            renamed[name] = plain_name(name, ODD_IN_FILES, renamed.values())
-            slabs[renamed[name]] = itu, values["thickness"]
-        else:
-            new_name = name if itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
-            renamed[name] = plain_name(new_name, ODD_IN_FILES, renamed.values())
-            constants[renamed[name]] = values
-        exponent = conductivity_exponent(material, frequency_hz)
-        facts = {"conductivity_exponent": exponent, "follows_frequency": renamed[name] in slabs}
-        listed[renamed[name]] = values | facts
+    parts = _parts(scene)
+    exported = _exported(scene, dict.fromkeys(material for _, material in parts), frequency_hz)
     files = dict[str, tuple[Surface, str]]()
     for surface, material in parts:
         files[plain_name(surface.name, ODD_IN_FILES, files)] = surface, material
-    materials = {name: renamed[material] for name, (_, material) in files.items()}
+    materials = {name: exported.names[material] for name, (_, material) in files.items()}
     with atomic_folder(out, options.replace) as folder:
         (folder / "meshes").mkdir()
         for name, (surface, _) in files.items():
-            mesh = trimesh.Trimesh(surface.vertices_m, surface.faces, process=False)
-            mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
-        write_atomically(folder / XML, scene_xml(materials, constants, slabs))
+            surface.mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
+        write_atomically(folder / XML, scene_xml(materials, exported.constants, exported.slabs))
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
-        text = json.dumps({"frequency_hz": frequency_hz, "materials": listed}, indent=1)
+        text = json.dumps({"frequency_hz": frequency_hz, "materials": exported.facts}, indent=1)
         write_atomically(folder / FACTS, f"{text}\n")
-    fixed = ", ".join(constants) or "none"
-    return {"surfaces": len(parts), "materials": len(listed), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
+    fixed = ", ".join(exported.constants) or "none"
+    return {"surfaces": len(parts), "materials": len(exported.facts), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
 
 
 def write_glb(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
@@ -121,21 +133,21 @@ def write_mesh(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     Faces have colours, and the numbers of their ``material`` and ``surface``, whose names are in the header's comments.
     """
     parts = _parts(_loaded(source, options)[0])
-    names = list(dict.fromkeys(material for _, material in parts))
-    first = np.cumsum([0, *(len(surface.vertices_m) for surface, _ in parts)])
-    count = [len(surface.faces) for surface, _ in parts]
-    number = np.array([names.index(material) for _, material in parts])
+    surfaces, materials = zip(*parts, strict=True)
+    names = list(dict.fromkeys(materials))
+    first = np.cumsum([0, *(len(surface.vertices_m) for surface in surfaces)])
+    count = [len(surface.faces) for surface in surfaces]
     mesh = trimesh.Trimesh(
-        np.concatenate([surface.vertices_m for surface, _ in parts]),
-        np.concatenate([surface.faces + at for (surface, _), at in zip(parts, first, strict=False)]),
-        face_colors=np.repeat([_colour_bytes(material) for _, material in parts], count, axis=0).astype(np.uint8),
+        np.concatenate([surface.vertices_m for surface in surfaces]),
+        np.concatenate([surface.faces + at for surface, at in zip(surfaces, first, strict=False)]),
+        face_colors=np.repeat(list(map(_colour_bytes, materials)), count, axis=0).astype(np.uint8),
         process=False,
     )
-    mesh.face_attributes["material"] = np.repeat(number, count).astype(np.int32)
+    mesh.face_attributes["material"] = np.repeat(list(map(names.index, materials)), count).astype(np.int32)
     mesh.face_attributes["surface"] = np.repeat(np.arange(len(parts)), count).astype(np.int32)
     comments = ["metres, z up"]
     comments += [f"material {k} {name}" for k, name in enumerate(names)]
-    comments += [f"surface {k} {surface.name}" for k, (surface, _) in enumerate(parts)]
+    comments += [f"surface {k} {surface.name}" for k, surface in enumerate(surfaces)]
     header, end, content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False).partition(b"end_header")
     lines = "".join(f"comment {one_line(comment)}\n" for comment in comments)
     write_atomically(out, header + lines.encode() + end + content)

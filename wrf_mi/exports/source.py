@@ -1,4 +1,4 @@
-"""What is exported: a run, a scene or a data set, recognised by its files or its name."""
+"""Sources of exports: a run, a scene or a data set, recognised by its files or its name; writers of data sets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 from wrf_mi_scenes import scenes
 
 from ..core import InputError, Record
+from ..datasets import write_ble_folder, write_nerf2_csi, write_spectrum_folder
 from ..datasets.layouts import is_data
+from ..datasets.record_file import write_record_file
 from ..datasets.registry import KNOWN
 from ..models.ray_tracing import CORRECTED, PATHS
 from ..runs.folder import CONFIG
@@ -19,6 +21,8 @@ from ..scene.folder import FACTS_FILE
 from ..tracing.paths.result import TraceResult, load_trace
 from ..tracing.sionna.scenes import MESHES
 from .format import DATASET, RUN, SCENE, ExportOptions
+
+BITS = 16  # bits of a pixel: 8 would round spectra that are computed or of 16 bits
 
 
 @dataclass(frozen=True)
@@ -89,3 +93,25 @@ def kinds_of(name: str | Path) -> tuple[str, ...]:
         what = "a file of another kind" if path.exists() else "no such file or name"
         raise InputError(f"{name}: {what}; give {ways}")
     return tuple(kind for kind, fits in kinds.items() if fits)
+
+
+def _written(task: str | None, write: Callable[[Path, Record, bool], object]) -> Write:
+    """A `Write` of a layout for data of a task."""
+
+    def write_layout(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+        record = source.record(options.progress)
+        if task is not None and record.task != task:
+            layouts = ", ".join(name for name, of in TASKS_OF.items() if of in (record.task, None))
+            raise InputError(f"{source.name}: a data set of {record.task}, the layout holds {task}; choose {layouts}")
+        write(out, record, options.replace)
+        return {"rows": len(record), "receivers": len(record.receivers)}
+
+    return write_layout
+
+
+TASKS_OF = {"spectra": "spectrum", "ble": "rssi", "nerf2-csi": "csi", "npz": None}
+"""Task of the data of each layout; None: any."""
+write_spectra = _written("spectrum", lambda out, record, again: write_spectrum_folder(out, record, BITS, again))
+write_strengths = _written("rssi", write_ble_folder)
+write_channels = _written("csi", write_nerf2_csi)
+write_npz = _written(None, lambda out, record, again: write_record_file(out, record))

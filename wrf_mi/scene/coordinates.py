@@ -82,7 +82,7 @@ def looks_y_up(points_m: FloatArray) -> bool:
         return True
     corridor = length >= CORRIDOR * along_y and along_z <= CORRIDOR_M
     shaft = length <= SHAFT * along_y and along_z >= SHAFT_HEIGHT * length
-    if along_y > most or along_z < TALL * along_y or corridor or shaft:
+    if any((corridor, shaft, along_y > most, along_z < TALL * along_y)):
         return False
     cell = ((points_m - low) / ((high - low).max() / CELLS)).astype(int)
     seen_along_y, seen_along_z = (len(np.unique(cell[:, axes], axis=0)) for axes in ([0, 2], [0, 1]))

@@ -54,11 +54,7 @@ class Move:
 
 
 def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
-    """Surfaces of a scene folder in the order of ``materials.yml``, and its materials.
-
-    Raises:
-        InputError: not a scene folder, or a damaged one.
-    """
+    """Surfaces of a scene folder in the order of ``materials.yml``, and its materials; `InputError`: a damaged one."""
     scene = read_scene_folder(folder)
     surfaces = []
     for name, entry in scene.materials.surfaces.items():
@@ -87,7 +83,7 @@ def edit_scene(
     remove: Sequence[str] = (),
     replace_folder: bool = False,
 ) -> Path:
-    """Write a scene with parts moved or removed; materials stay.
+    """Write a folder of a scene with parts moved or removed, and return its path; materials stay.
 
     Parts that are moved partly out of the scene, or into other surfaces, are named in the log with the distance.
 
@@ -97,9 +93,6 @@ def edit_scene(
         moves: motions, in their order; a part may move more than once.
         remove: names of surfaces to leave out; ``*`` and ``?`` are wildcards.
         replace_folder: replace an existing folder.
-
-    Returns:
-        The new folder.
 
     Raises:
         InputError: not a scene folder, a name that no surface has, nothing to change, a part that is moved and removed
@@ -111,13 +104,7 @@ def edit_scene(
     unmoved, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
-        text = f"move {','.join(move.parts)}"
-        if not any(move.shift_m) and not move.turn_deg % 360:
-            raise InputError(f"{text}: by 0 m and {move.turn_deg:g} degrees changes nothing; omit it")
-        if both := sorted(names & gone):
-            raise InputError(f"{text}: {both[0]} is also removed; omit one of the two")
-        matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
-        surfaces = [moved([part], matrix)[0] if part.name in names else part for part in surfaces]
+        surfaces = _after(move, surfaces, names, gone)
         moved_names |= names
     left = [surface for surface in surfaces if surface.name not in gone]
     _check_moves(unmoved, left, moved_names)
@@ -133,6 +120,17 @@ def edit_scene(
         description=f"An edited scene: {'; '.join(changes)}",
         replace=replace_folder,
     )
+
+
+def _after(move: Move, surfaces: Sequence[Surface], names: set[str], removed: set[str]) -> list[Surface]:
+    """Surfaces after a motion of some of them; `InputError` for none, or for one of removed surfaces."""
+    text = f"move {','.join(move.parts)}"
+    if not any(move.shift_m) and not move.turn_deg % 360:
+        raise InputError(f"{text}: by 0 m and {move.turn_deg:g} degrees changes nothing; omit it")
+    if both := sorted(names & removed):
+        raise InputError(f"{text}: {both[0]} is also removed; omit one of the two")
+    matrix = move.matrix(box_of([surface for surface in surfaces if surface.name in names]))
+    return [moved([part], matrix)[0] if part.name in names else part for part in surfaces]
 
 
 def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[str]) -> set[str]:
@@ -155,19 +153,28 @@ def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set
     earlier = {part.name: part for part in before}
     low, high = box_of(before)
     for part in parts:
-        first, last = box_of([part])
-        outside_m = float(np.maximum(low - first, last - high).max())
-        gap_m = float(np.maximum(low - last, first - high).max())
-        # An outer wall may be moved outwards, which enlarges the room, but not farther than the room is large.
-        if gap_m > (0 if part.kind == "other" else (high - low).max()):
-            text = f"moved out of the scene, {gap_m:.2f} m beyond it; give a smaller displacement, or --remove"
-            raise InputError(f"move {part.name}: {text}")
-        if outside_m > TOUCH_M:
-            logger.warning("move %s: reaches %.2f m out of the scene", part.name, outside_m)
-        for other in others:
-            depth_m = _crossing_depth(part, other)
-            if depth_m > TOUCH_M and depth_m > _crossing_depth(earlier[part.name], other) + TOUCH_M:
-                logger.warning("move %s: reaches %.2f m through %s", part.name, depth_m, other.name)
+        _check_inside(part, low, high)
+        _warn_of_crossings(part, earlier[part.name], others)
+
+
+def _warn_of_crossings(part: Surface, earlier: Surface, others: Sequence[Surface]) -> None:
+    for other in others:
+        depth_m = _crossing_depth(part, other)
+        if depth_m > TOUCH_M and depth_m > _crossing_depth(earlier, other) + TOUCH_M:
+            logger.warning("move %s: reaches %.2f m through %s", part.name, depth_m, other.name)
+
+
+def _check_inside(part: Surface, low: FloatArray, high: FloatArray) -> None:
+    """Refuse a surface outside of the box of a scene, and warn of one that is partly outside."""
+    first, last = box_of([part])
+    outside_m = float(np.maximum(low - first, last - high).max())
+    gap_m = float(np.maximum(low - last, first - high).max())
+    # An outer wall may be moved outwards, which enlarges the room, but not farther than the room is large.
+    if gap_m > (0 if part.kind == "other" else (high - low).max()):
+        text = f"moved out of the scene, {gap_m:.2f} m beyond it; give a smaller displacement, or --remove"
+        raise InputError(f"move {part.name}: {text}")
+    if outside_m > TOUCH_M:
+        logger.warning("move %s: reaches %.2f m out of the scene", part.name, outside_m)
 
 
 def _crossing_depth(part: Surface, other: Surface) -> float:

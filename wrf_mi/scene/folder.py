@@ -70,7 +70,7 @@ def write_scene(
     counts: Mapping[str, int] | None = None,
     replace: bool = False,
 ) -> Path:
-    """Write a scene folder atomically.
+    """Write a scene folder atomically and return its path.
 
     Args:
         folder: path of the folder.
@@ -85,9 +85,6 @@ def write_scene(
         counts: further numbers for ``scene.yml``.
         replace: replace an existing folder.
 
-    Returns:
-        The folder.
-
     Raises:
         InputError: the folder exists or cannot be written, there is no surface, one is too far from the origin, or
             ``materials`` names an unknown surface.
@@ -97,28 +94,18 @@ def write_scene(
     folder = Path(folder)
     if not surfaces:
         raise InputError(f"{source}: no surface was found in it; a scene needs at least one")
-    names = [surface.name for surface in surfaces]
-    if len(set(names)) < len(names):
-        raise ValueError("write_scene: two surfaces have the same name")
-    materials = materials or Materials()
-    if unknown := [name for name in materials.surfaces if name not in names]:
-        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(names)}")
+    full = _complete(materials or Materials(), surfaces)
     require_near(box_of(surfaces), source)
-    full = materials.complete({surface.name: surface.kind for surface in surfaces})
-    matrix = None if registration is None else np.asarray(registration, float).reshape(4, 4)
+    sizes = {"surfaces": len(surfaces), "faces": sum(len(surface.faces) for surface in surfaces)}
     facts = {
         "description": description or f"{len(surfaces)} surfaces made from {Path(source).name}",
         "frame": frame,
         "units": "m",
         "xml": XML_FILE,
         "source": source,
-        "origin_m": None if origin_m is None else [float(value) for value in origin_m],
-        "registration": None if matrix is None else matrix.tolist(),
-        "counts": {
-            "surfaces": len(surfaces),
-            "faces": sum(len(surface.faces) for surface in surfaces),
-            **{key: int(value) for key, value in (counts or {}).items()},
-        },
+        "origin_m": None if origin_m is None else np.asarray(origin_m, float).tolist(),
+        "registration": None if registration is None else np.asarray(registration, float).reshape(4, 4).tolist(),
+        "counts": {**sizes, **(counts or {})},
     }
     with atomic_folder(folder, replace=replace) as part:
         (part / "meshes").mkdir()
@@ -131,12 +118,21 @@ def write_scene(
     return folder
 
 
+def _complete(materials: Materials, surfaces: Sequence[Surface]) -> Materials:
+    """Materials of all surfaces; `InputError` for those of a surface that is not among them."""
+    kinds = {surface.name: surface.kind for surface in surfaces}
+    if len(kinds) < len(surfaces):
+        raise ValueError("write_scene: two surfaces have the same name")
+    if unknown := [name for name in materials.surfaces if name not in kinds]:
+        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(kinds)}")
+    return materials.complete(kinds)
+
+
 def plain_name(name: str, odd: str, names_in_use: Collection[str]) -> str:
     """A name without the characters of a pattern, which become ``_``, and numbered where it is in use."""
     plain = re.sub(odd, "_", name)
-    return next(
-        free for free in chain([plain], (f"{plain}_{number}" for number in count(2))) if free not in names_in_use
-    )
+    candidates = chain([plain], (f"{plain}_{number}" for number in count(2)))
+    return next(free for free in candidates if free not in names_in_use)
 
 
 def read_scene_folder(folder: str | Path) -> SceneFolder:
@@ -145,8 +141,7 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
     If ``scene.xml`` and ``materials.yml`` name different materials, ``scene.xml`` is written anew; additions by hand
     are lost.
 
-    Raises:
-        InputError: a file is missing or damaged, a surface has no mesh, or the scene file cannot be written.
+    `InputError`: a file is missing or damaged, a surface has no mesh, or the scene file cannot be written.
     """
     folder = Path(folder)
     facts = read_yaml(folder / FACTS_FILE)

@@ -32,6 +32,8 @@ SAME_M = 0.1  # distance within which parallel faces are one: a cabinet's back a
 COVERED = 0.3  # share of a face, seen along its normal, from which on another one in its place stands for it
 GRID_M = 1e-4  # grid of outlines that are compared
 LEAST_SIDE_M, MOST_SIDE_M = 0.15, 3.0  # sides of boxes
+Box = tuple[FloatArray, float, float]
+"""Corners [4, 2] of a box's base in the order of the outline, lowest and highest z."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +102,10 @@ def with_hidden_faces(scene: str | Path) -> Iterator[tuple[str | Path, Boxes]]:
         yield scene, supposed
         return
     kinds = {**materials.surfaces, **{face.name: face.kind for face in supposed.hidden}}
+    materials = replace(materials, surfaces=kinds)
+    parts, frame = [*surfaces, *supposed.hidden], f"that of {scene}"
     with TemporaryDirectory() as place:
-        folder = Path(place) / "scene"
-        write_scene(
-            folder,
-            [*surfaces, *supposed.hidden],
-            frame=f"that of {scene}",
-            source=str(scene),
-            materials=replace(materials, surfaces=kinds),
-        )
-        yield folder, supposed
+        yield write_scene(Path(place) / "scene", parts, frame=frame, source=str(scene), materials=materials), supposed
 
 
 def boxes(surfaces: Sequence[Surface]) -> Boxes:
@@ -121,28 +117,43 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
         list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))
         for is_furniture in (True, False)
     )
-    names_in_use = {surface.name for surface in surfaces}
-    names = (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in names_in_use)
+    names = _free_names({surface.name for surface in surfaces})
     hidden, members = list[Rectangle](), dict[frozenset[str], None]()
-    for base, low, high in _boxes(furniture):
-        sizes = np.linalg.norm(base[1:3] - base[:2], axis=1)
-        if min(*sizes, high - low) < LEAST_SIDE_M or max(sizes) > MOST_SIDE_M:
-            continue
-        box_names = set[str]()
-        for face in _faces_of_box(base, low, high):
-            in_place = [other.name for other in (*furniture, *hidden) if face.covered_by(other)]
-            # Walls and floors in its place hide a face for good, and belong to no box.
-            if not in_place and not any(map(face.covered_by, around)):
-                hidden.append(replace(face, name=next(names)))
-                in_place = [hidden[-1].name]
-            box_names.update(in_place)
-        members[frozenset(box_names)] = None
+    for box in filter(_has_size_of_furniture, _boxes(furniture)):
+        known, missing = _known_and_missing(box, [*furniture, *hidden], around)
+        completing = [replace(face, name=next(names)) for face in missing]
+        hidden += completing
+        members[frozenset(face.name for face in known + completing)] = None
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     return Boxes([Surface(face.name, "other", face.corners, halves) for face in hidden], list(members))
 
 
+def _free_names(names_in_use: set[str]) -> Iterator[str]:
+    return (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in names_in_use)
+
+
+def _known_and_missing(
+    box: Box, furniture: Sequence[Rectangle], around: Sequence[Rectangle]
+) -> tuple[list[Rectangle], list[Rectangle]]:
+    """Faces of furniture in the place of a box's faces, and its faces in whose place no face is known."""
+    known, missing = list[Rectangle](), list[Rectangle]()
+    for face in _faces_of_box(*box):
+        in_place = [other for other in furniture if face.covered_by(other)]
+        known += in_place
+        # Walls and floors in its place hide a face for good, and belong to no box.
+        if not in_place and not any(map(face.covered_by, around)):
+            missing.append(face)
+    return known, missing
+
+
+def _has_size_of_furniture(box: Box) -> bool:
+    base, low, high = box
+    sizes = np.linalg.norm(base[1:3] - base[:2], axis=1)
+    return bool(min(*sizes, high - low) >= LEAST_SIDE_M and max(sizes) <= MOST_SIDE_M)
+
+
 def _faces_of_box(base: FloatArray, low: float, high: float) -> Iterator[Rectangle]:
-    """Sides and top of an upright box: corners of its base [4, 2] in the order of the outline, lowest and highest z."""
+    """Sides and top of a `Box`."""
     middle = np.append(base.mean(axis=0), (low + high) / 2)
     along, across = (np.append((base[k + 1] - base[k]) / 2, 0.0) for k in (0, 1))
     up = np.array([0.0, 0.0, (high - low) / 2])
@@ -182,13 +193,13 @@ def _axes(normal: FloatArray, corners: FloatArray) -> FloatArray | None:
     return np.stack([side, np.array([-side[1], side[0], 0.0])])
 
 
-def _boxes(faces: Sequence[Rectangle]) -> Iterator[tuple[FloatArray, float, float]]:
-    """Base [4, 2], lowest and highest z of the boxes of which two faces are known."""
+def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
+    """Boxes of which two faces are known."""
     sides = [face for face in faces if abs(face.normal[2]) < 0.5]
-    for top in (face for face in faces if abs(face.normal[2]) > 0.5):
-        for side in sides:
-            if _is_below(top, side):
-                yield top.corners[:, :2], side.heights_m[0], top.centre[2]
+    tops = [face for face in faces if abs(face.normal[2]) > 0.5]
+    for top, side in product(tops, sides):
+        if _is_below(top, side):
+            yield top.corners[:, :2], side.heights_m[0], top.centre[2]
     for first, second in combinations(sides, 2):
         base = _corner(first, second)
         base = _between(first, second) if base is None else base

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -34,6 +35,7 @@ PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
+UNSTATED: Storey = (None, 0.0, None, None)  # these options where none is given
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -54,7 +56,7 @@ def make_scene(
     row_0: Row0 | None = None,
     replace: bool = False,
 ) -> SceneFolder:
-    r"""Make a scene folder that Mitsuba and Sionna RT both open.
+    r"""Make a scene folder that Mitsuba and Sionna RT both open, and return its content.
 
     Args:
         points_file: a 3D scan, or several in one frame (`wrf_mi.scene.scan.points.read_scan`); a plan in two dimensions
@@ -80,9 +82,6 @@ def make_scene(
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         replace: replace an existing folder.
 
-    Returns:
-        The content of the folder.
-
     Raises:
         InputError: an unusable file, a missing package, options that do not fit the source, coordinates too far from
             the origin, or an existing folder.
@@ -101,24 +100,17 @@ def make_scene(
     'open'
     >>> shutil.rmtree(folder)
     """
-    files = [Path(f) for f in ([points_file] if isinstance(points_file, str | Path) else points_file)]
+    files = list(map(Path, [points_file] if isinstance(points_file, str | Path) else points_file))
     file, out = files[0], Path(out)
-    if out.exists() and not replace:
-        raise InputError(f"{out}: exists; remove it or choose another folder")
-    if registration is not None and register_walls_of is not None:
-        raise InputError(f"{file}: registration by pairs and to walls: give one of them")
-    if up not in (None, "y", "z"):
-        raise InputError(f"{file}: {up!r} is up: give y or z")
+    _check_options(file, out, replace, up)
     materials = read_materials(materials) if isinstance(materials, str | Path) else materials
-    matrix = None if registration is None else _rigid(registration)
-    measured = None if positions is None else read_positions(positions)
-    known_walls = None if register_walls_of is None else layout_walls(read_layout(register_walls_of))
+    matrix, known_walls, measured = _references(file, registration, register_walls_of, positions)
     shift = _shift(file, origin_m)
     source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0))
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
-    if source.scan is not None and matrix is known_walls is None:  # before minutes are spent on its planes
+    if matrix is known_walls is None:  # before minutes are spent on a scan's planes
         require_near(trimesh.transform_points(source.extent_m, shift), file)
     surfaces = source.surfaces(up)
     if known_walls is not None:
@@ -128,7 +120,6 @@ def make_scene(
     if measured is not None:
         mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
         check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
-    scanned = None if source.scan is None else source.scan.points_m
     write_scene(
         out,
         placed,
@@ -137,11 +128,28 @@ def make_scene(
         source=", ".join(map(str, files)),
         materials=materials,
         registration=matrix,
-        points_m=None if scanned is None else trimesh.transform_points(_sample(scanned), motion),
-        counts={} if scanned is None else {"points": len(scanned)},
         replace=replace,
+        **source.sample(motion),
     )
     return read_scene_folder(out)
+
+
+def _check_options(file: Path, out: Path, replace: bool, up: Up | None) -> None:
+    if out.exists() and not replace:
+        raise InputError(f"{out}: exists; remove it or choose another folder")
+    if up not in (None, "y", "z"):
+        raise InputError(f"{file}: {up!r} is up: give y or z")
+
+
+def _references(
+    file: Path, registration: ArrayLike | None, walls_of: str | Path | None, positions: str | Path | None
+) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
+    """Rigid motion [4, 4], walls [m, 2, 2] to register to, and measured positions [n, 3]; None where not stated."""
+    if registration is not None and walls_of is not None:
+        raise InputError(f"{file}: registration by pairs and to walls: give one of them")
+    matrix = None if registration is None else _rigid(registration)
+    walls = None if walls_of is None else layout_walls(read_layout(walls_of))
+    return matrix, walls, None if positions is None else read_positions(positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,16 +180,23 @@ class _Source:
                 raise _other_up(self.file)
         return surfaces
 
+    def sample(self, motion: FloatArray) -> dict[str, Any]:
+        """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""
+        if self.scan is None:
+            return {}
+        count = len(self.scan.points_m)
+        # At random: every k-th point would show the scanner's pattern.
+        chosen = np.random.default_rng(1).integers(count, size=min(PREVIEW_POINTS, count))
+        return {"points_m": trimesh.transform_points(self.scan.points_m[chosen], motion), "counts": {"points": count}}
+
 
 def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey: Storey) -> _Source:
     file = files[0]
     if len(files) > 1 and (flat := [f for f in files if is_plan(f) or has_faces(f)]):
         raise InputError(f"{flat[0]}: several files are scans of one place, and this is none; give it alone")
     if is_plan(file):
-        surfaces, grid = _read_plan(file, units, up, *storey)
-        return _Source(file, surfaces, grid)
-    height_m, floor_m, resolution_m, row_0 = storey
-    if height_m is not None or resolution_m is not None or row_0 is not None or floor_m:
+        return _read_plan(file, units, up, storey)
+    if storey != UNSTATED:
         raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
@@ -206,11 +221,6 @@ def _frame(file: Path, origin_m: Sequence[float] | None, matrix: FloatArray | No
     return f"that of {file.name}, z upwards{origin}{'' if matrix is None else ', moved by the registration'}"
 
 
-def _sample(points_m: FloatArray) -> FloatArray:
-    """Points of a scan for the preview, at random: every k-th point would show the scanner's pattern."""
-    return points_m[np.random.default_rng(1).integers(len(points_m), size=min(PREVIEW_POINTS, len(points_m)))]
-
-
 def _rigid(registration: ArrayLike) -> FloatArray:
     """A rigid motion [4, 4]; `InputError` for another matrix."""
     matrix = np.asarray(registration, float)
@@ -222,16 +232,8 @@ def _rigid(registration: ArrayLike) -> FloatArray:
     return matrix
 
 
-def _read_plan(
-    file: Path,
-    units: str | None,
-    up: Up | None,
-    height_m: float | None,
-    floor_m: float,
-    resolution_m: float | None,
-    row_0: Row0 | None,
-) -> tuple[list[Surface], PlanGrid | None]:
-    """The surfaces of a plan, and the cells of an occupancy grid."""
+def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> _Source:
+    height_m, floor_m, resolution_m, row_0 = storey
     if file.suffix.lower() == ".csv" and _has_heights(file):
         text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
@@ -243,7 +245,7 @@ def _read_plan(
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0)
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
-    return walls, plan if isinstance(plan, PlanGrid) else None
+    return _Source(file, walls, plan if isinstance(plan, PlanGrid) else None)
 
 
 def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
@@ -271,15 +273,13 @@ def is_plan(path: str | Path) -> bool:
     suffix = file.suffix.lower()
     if suffix in PLAN_SUFFIXES:
         return True
-    try:
+    with suppress(OSError, ValueError, BadZipFile, NotImplementedError):  # the reader of points raises
         if suffix == ".npz":
             return bool(stored_names(file) & {"log_odds", "xy_m"})
         if suffix in (".xyz", ".txt"):
             with file.open(encoding="utf-8-sig") as stream:
                 rows = (line.split("#")[0].replace(",", " ").split() for line in stream)
-                return len(next((row for row in rows if row), [])) == 2
-    except (OSError, ValueError, BadZipFile, NotImplementedError):
-        pass  # the reader of points raises
+                return len(next(filter(None, rows), [])) == 2
     return False
 
 

@@ -37,7 +37,9 @@ KEYS = ("rules", "surfaces", "thickness_m", "constants")
 EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 """Optional numbers of a material with constants; both or neither."""
 STEEPEST = 5.0  # largest exponent; ITU-R P.2040 has 0 to 2.4
-NAME = re.compile(r"\w+", re.ASCII)
+LEAST = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0, EXPONENT: -STEEPEST, CARRIER: 0.0}
+POSITIVE = ("thickness", CARRIER)  # constants that must be above `LEAST`
+NAME = re.compile(r"(?!itu)\w+", re.ASCII)
 SURFACE_NAME = re.compile(r"[\w.-]+")
 THICKEST_M = 1e3
 THICKNESS_M: Mapping[str, float] = {**ITU_THICKNESS_M, PERFECT: PERFECT_THICKNESS_M}
@@ -97,19 +99,11 @@ class Materials:
 def read_materials(path: str | Path) -> Materials:
     """Read and check a ``materials.yml``, or that of a scene folder.
 
-    Raises:
-        InputError: missing, not YAML, an unknown kind or material, or a thickness or constant out of range.
+    `InputError`: missing, not YAML, an unknown kind or material, or a thickness or constant out of range.
     """
     file = Path(path)
     file = file / FILE if file.is_dir() else file
-    content = read_yaml(file)
-    if content is None or not set(content) <= set(KEYS):
-        raise InputError(f"{file}: give the keys {', '.join(KEYS)}, no others")
-    parts = {key: content.get(key) or {} for key in KEYS}
-    for key, part in parts.items():
-        if not isinstance(part, dict):
-            raise InputError(f"{file}: {key} must be a mapping, such as {{wall: itu_brick}}")
-
+    parts = _read_parts(file)
     for name, values in parts["constants"].items():
         _check_constants(file, name, values)
     known = (*parts["constants"], *KNOWN)
@@ -123,6 +117,18 @@ def read_materials(path: str | Path) -> Materials:
         _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *known))
     thicknesses(file, parts["thickness_m"])
     return Materials(**parts)
+
+
+def _read_parts(file: Path) -> dict[str, dict[Any, Any]]:
+    """Mapping of each of `KEYS`, empty where the file has none."""
+    content = read_yaml(file)
+    if not set(content) <= set(KEYS):
+        raise InputError(f"{file}: give the keys {', '.join(KEYS)}, no others")
+    parts = {key: content.get(key) or {} for key in KEYS}
+    for key, part in parts.items():
+        if not isinstance(part, dict):
+            raise InputError(f"{file}: {key} must be a mapping, such as {{wall: itu_brick}}")
+    return parts
 
 
 def _check_material(where: str, material: Any, known: Sequence[str]) -> None:
@@ -149,18 +155,21 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= SINGLE_MAX
 
 
+def _in_range(key: str, value: Any) -> bool:
+    return _is_number(value) and (value > 0 if key in POSITIVE else value >= LEAST[key])
+
+
 def _check_constants(file: Path, name: Any, values: Any) -> None:
     where = f"{file}: constants: {name}"
-    if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*KNOWN, *KINDS) or name[:3] == "itu":
+    if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*KNOWN, *KINDS):
         raise InputError(f"{where}: choose a name of letters, digits and _ that is no kind and does not begin with itu")
     needed = set(PERFECT_CONSTANTS)
     if not isinstance(values, dict) or set(values) not in (needed, needed | {EXPONENT, CARRIER}):
         law = f"{EXPONENT} and {CARRIER} for a law of the conductivity"
         raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}, with {law}")
-    least = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0, EXPONENT: -STEEPEST, CARRIER: 0.0}
     for key, value in values.items():
-        if not _is_number(value) or value < least[key] or (key in ("thickness", CARRIER) and value <= 0):
-            raise InputError(f"{where}: {key} is {shown(value)}; give a number from {least[key]:g} upwards")
+        if not _in_range(key, value):
+            raise InputError(f"{where}: {key} is {shown(value)}; give a number from {LEAST[key]:g} upwards")
     if abs(values.get(EXPONENT, 0)) > STEEPEST:
         raise InputError(f"{where}: {EXPONENT} is {values[EXPONENT]!r}; give -{STEEPEST:g} to {STEEPEST:g}")
 

@@ -41,11 +41,9 @@ LARGEST_SHARE = 0.1  # largest share of positions in conflict where no reflectio
 
 
 def read_positions(path: str | Path) -> FloatArray:
-    """Measured positions [n, 3] from a CSV file with the columns x, y and perhaps z in metres, else NaN; others are
-    ignored.
+    """Measured positions [n, 3], metres, from the columns x, y and perhaps z (else NaN) of a CSV file.
 
-    Raises:
-        InputError: missing, no such column, or a field that is not a finite number.
+    `InputError`: missing, no such column, or a field that is not a finite number.
     """
     path = Path(path)
     if not path.is_file():
@@ -89,8 +87,7 @@ def check_positions(
 ) -> None:
     """Refuse a scene that measured positions [n, 3] do not fit, above all a mirrored scene.
 
-    Raises:
-        InputError: a reflection (`reflections`) fits the positions clearly better, or the positions fit neither.
+    `InputError`: a reflection (`reflections`) fits the positions clearly better, or the positions fit neither.
     """
     count = len(distinct(positions_m))
     crossings, outside = conflicts(positions_m, surfaces)

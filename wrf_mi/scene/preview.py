@@ -85,6 +85,8 @@ def draw_scene(
 ) -> Figure:
     """A scene at a slant and in plan, with a scan, paths, both ends of these, or Gaussians.
 
+    `ValueError`: no surface, or paths without both ends.
+
     Args:
         surfaces: surfaces of the scene, at least one.
         points_m: a scan [n, 3] or [n, 2].
@@ -93,43 +95,56 @@ def draw_scene(
         receivers_m: shape [n_rx, 3].
         gaussians: Gaussians of a field.
         title: text above the picture.
-
-    Raises:
-        ValueError: no surface, or paths without both ends.
     """
     if not surfaces:
         raise ValueError("draw_scene: no surface")
-    if paths is not None and (transmitters_m is None or receivers_m is None):
-        raise ValueError("draw_scene: paths need transmitters_m and receivers_m")
     ends = [None if p is None else np.asarray(p, float).reshape(-1, 3) for p in (transmitters_m, receivers_m)]
-    colours = [KIND_COLOURS[surface.kind] for surface in surfaces]
     figure = Figure(figsize=(12.5, 5.8), layout="constrained")
     grid = figure.add_gridspec(1, 2, width_ratios=[1.2, 1])
     slant: Any = figure.add_subplot(grid[0], projection="3d", computed_zorder=False)
     plan = figure.add_subplot(grid[1])
     low, high = box_of(surfaces)
-    _draw_slant(slant, surfaces, colours, low, high)
-    _draw_plan(plan, surfaces, colours, low, high)
-    if points_m is not None and len(scan := np.asarray(points_m, float)):
-        scan = scan[:: -(-len(scan) // MOST_POINTS)]
-        plan.plot(*scan.T[:2], ",", color="0.35", alpha=0.25, zorder=2)
-        if scan.shape[1] == 3:
-            below = scan[scan[:, 2] < low[2] + TOP * (high[2] - low[2])]
-            slant.plot(*below.T, ",", color="0.3", alpha=0.15, zorder=4)
+    _draw_slant(slant, surfaces, low, high)
+    _draw_plan(plan, surfaces, low, high)
+    if points_m is not None:
+        _draw_scan(slant, plan, np.asarray(points_m, float), low[2] + TOP * (high[2] - low[2]))
     if gaussians is not None:
         _draw_gaussians(figure, slant, plan, gaussians.strongest(MOST_GAUSSIANS))
-    if paths is not None and len(paths):
+    if paths is not None:
         _draw_paths(figure, slant, plan, paths, *ends)
-    kinds = dict.fromkeys(surface.kind for surface in surfaces if surface.kind != "ceiling")
-    legend: list[Any] = [Patch(facecolor=KIND_COLOURS[k], edgecolor="0.3", linewidth=0.5, label=k) for k in kinds]
+    kinds = dict.fromkeys(surface.kind for surface in surfaces)
+    kinds.pop("ceiling", None)
+    legend = [Patch(facecolor=KIND_COLOURS[k], edgecolor="0.3", linewidth=0.5, label=k) for k in kinds]
+    figure.legend(
+        handles=[*legend, *_draw_ends(slant, plan, ends)],
+        fontsize=8,
+        loc="outside lower center",
+        ncols=8,
+        frameon=False,
+    )
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _draw_scan(slant: Any, plan: Axes, scan: FloatArray, top_m: float) -> None:
+    """Points [n, 2] or [n, 3], at a slant those below a height."""
+    if not len(scan):
+        return
+    scan = scan[:: -(-len(scan) // MOST_POINTS)]
+    plan.plot(*scan.T[:2], ",", color="0.35", alpha=0.25, zorder=2)
+    if scan.shape[1] == 3:
+        slant.plot(*scan[scan[:, 2] < top_m].T, ",", color="0.3", alpha=0.15, zorder=4)
+
+
+def _draw_ends(slant: Any, plan: Axes, ends: Sequence[FloatArray | None]) -> list[Line2D]:
+    """Markers of transmitters and receivers, and their handles for the legend."""
+    handles = []
     for points, (name, marker, colour) in zip(ends, ENDS, strict=True):
         if points is not None:
             slant.plot(*points.T, marker, color=colour, markersize=5, markeredgecolor="white", zorder=8)
             plan.plot(*points.T[:2], marker, color=colour, markersize=6, markeredgecolor="white", zorder=8)
-            legend.append(Line2D([], [], marker=marker, color=colour, linestyle="none", label=name))
-    figure.legend(handles=legend, fontsize=8, loc="outside lower center", ncols=8, frameon=False)
-    figure.suptitle(title, fontsize=10)
-    return figure
+            handles.append(Line2D([], [], marker=marker, color=colour, linestyle="none", label=name))
+    return handles
 
 
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
@@ -145,6 +160,10 @@ def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud
 
 def _draw_paths(figure: Figure, slant: Any, plan: Axes, paths: Paths, transmitters: Any, receivers: Any) -> None:
     """The strongest paths, the weakest of them first, coloured by 20 log10 of their gains."""
+    if transmitters is None or receivers is None:
+        raise ValueError("draw_scene: paths need transmitters_m and receivers_m")
+    if not len(paths):
+        return
     strength = 20 * np.log10(np.maximum(np.abs(paths.gain), 1e-20))
     order = np.argsort(strength, kind="stable")[-MOST_PATHS:]
     corners = [
@@ -195,39 +214,39 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
     return np.asarray(surface.vertices_m[outer], float).reshape(-1, 2, 3)
 
 
-def _draw_slant(
-    axes: Any, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
-) -> None:
-    """Faces without the ceiling, lit from the side; walls in front are transparent."""
-    middle = (low + high) / 2
-    # Floors, then all else. The empty parts serve scenes that have ceilings only.
-    drawn = [([np.empty((0, 3, 3))], [np.empty((0, 4))]) for _ in range(2)]
-    for surface, colour in zip(surfaces, colours, strict=True):
-        if surface.kind == "ceiling":
-            continue
-        corners = surface.vertices_m[surface.faces]
-        (normal, level), centre = _normals(corners), corners.mean(axis=1)
-        drawn_faces = ~ceiling_faces(surface, low, high)
-        light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
-        if surface.kind == "floor":
-            front = np.zeros(len(corners), bool)
-        else:
-            # A wall fades as a whole; a large body that holds a whole room fades face by face.
-            place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
-            front = (place - middle)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
-        shade = np.clip(light[:, None] * to_rgb(colour), 0, 1)
-        faces, rgba = drawn[surface.kind != "floor"]
-        faces.append(corners[drawn_faces])
-        rgba.append(np.column_stack([shade, np.where(front & ~level, 0.16, 0.95)])[drawn_faces])
-    for order, (corners, shades) in enumerate(([np.concatenate(part) for part in pair] for pair in drawn), start=1):
+def _lit_faces(surface: Surface, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners [f, 3, 3] of faces below the ceiling, and colours [f, 4] lit from the side; walls in front fade."""
+    corners = surface.vertices_m[surface.faces]
+    (normal, level), centre = _normals(corners), corners.mean(axis=1)
+    light = 0.55 + 0.45 * np.abs(normal @ LIGHT)
+    # A wall fades as a whole; a large body that holds a whole room fades face by face.
+    place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
+    front = (place - (low + high) / 2)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
+    alpha = np.where(front & ~level & (surface.kind != "floor"), 0.16, 0.95)
+    shade = np.clip(light[:, None] * to_rgb(KIND_COLOURS[surface.kind]), 0, 1)
+    drawn = ~ceiling_faces(surface, low, high)
+    return corners[drawn], np.column_stack([shade, alpha])[drawn]
+
+
+def _draw_slant(axes: Any, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
+    """Faces and free edges without the ceiling."""
+    floors = [surface for surface in surfaces if surface.kind == "floor"]
+    others = [surface for surface in surfaces if surface.kind not in ("floor", "ceiling")]
+    for order, group in enumerate((floors, others), start=1):
+        # The empty part serves groups without surfaces.
+        lit = [(np.empty((0, 3, 3)), np.empty((0, 4))), *(_lit_faces(surface, low, high) for surface in group)]
+        corners, shades = map(np.concatenate, zip(*lit, strict=True))
         if len(largest := np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]):
             flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}
             axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
-    rims = [np.empty((0, 2, 3))]
-    rims += [free_edges(surface) for surface in surfaces if surface.kind != "ceiling"]
-    if len(lines := np.concatenate(rims)):
+    if len(lines := np.concatenate([np.empty((0, 2, 3)), *map(free_edges, floors + others)])):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
+    _set_view(axes, low, high)
+
+
+def _set_view(axes: Any, low: FloatArray, high: FloatArray) -> None:
+    """Orthographic view of a box of two corners [3], to scale, with labels."""
     axes.set_proj_type("ortho")
     axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
     size = np.maximum(high - low, 0.1)
@@ -242,23 +261,18 @@ def _draw_slant(
     axes.grid(False)
 
 
-def _draw_plan(
-    axes: Axes, surfaces: Sequence[Surface], colours: Sequence[str], low: FloatArray, high: FloatArray
-) -> None:
+def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
     """The floor, and a cut through everything that stands on it."""
     level = float(low[2] + CUT * (high[2] - low[2]))
-    for surface, colour in zip(surfaces, colours, strict=True):
+    for surface in surfaces:
+        colour = np.array(to_rgb(KIND_COLOURS[surface.kind]))
         if surface.kind == "floor":
             triangles = surface.vertices_m[surface.faces][..., :2]
-            light = 0.45 * np.array(to_rgb(colour)) + 0.55
-            axes.add_collection(
-                PolyCollection(list(triangles), facecolors=[light], edgecolors="none", antialiased=False, zorder=1)
-            )
-            continue
-        cut = cut_lines(surface, level)
-        if len(cut):
-            edge = tuple(0.6 * c for c in to_rgb(colour))
-            axes.add_collection(LineCollection(list(cut), colors=[edge], linewidths=2.2, capstyle="round", zorder=3))
+            flat: dict[str, Any] = {"edgecolors": "none", "antialiased": False, "zorder": 1}
+            axes.add_collection(PolyCollection(list(triangles), facecolors=[0.45 * colour + 0.55], **flat))
+        elif len(cut := cut_lines(surface, level)):
+            lines = LineCollection(list(cut), colors=[0.6 * colour], linewidths=2.2, capstyle="round", zorder=3)
+            axes.add_collection(lines)
     size = np.maximum(high - low, 0.1)[:2]
     margin = 0.06 * size.max()
     axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)

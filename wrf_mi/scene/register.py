@@ -59,16 +59,13 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
         InputError: too few pairs, pairs that lie on a point or (in 3D) a line, or a bad fit.
     """
     source, target = np.asarray(source_m, float), np.asarray(target_m, float)
-    if source.shape != target.shape or source.ndim != 2 or source.shape[1] not in (2, 3):
+    if source.shape != target.shape or source.shape[1:] not in ((2,), (3,)):
         text = f"points of shapes {source.shape} and {target.shape} are no pairs"
         raise InputError(f"{name}: {text}; give [n, 2] or [n, 3] each")
     n, dimension = source.shape
     if n < dimension:
         raise InputError(f"{name}: {n} pairs; give at least {dimension}, well apart")
-    spread = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (source, target)]
-    extent = min(spread, key=lambda s: s[0])
-    if extent[0] < SMALLEST_EXTENT_M or (dimension == 3 and extent[1] < SPREAD * extent[0]):
-        where = "at one place" if extent[0] < SMALLEST_EXTENT_M else "on one line"
+    if where := _open_rotation(source, target):
         raise InputError(f"{name}: all pairs lie {where}, so the rotation is open; add a pair away from it")
     rigid, similar = (estimate_transform(kind, source, target) for kind in ("euclidean", "similarity"))
     error = rigid.residuals(source, target)
@@ -82,6 +79,15 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
             raise InputError(f"{text}; {better}: check units and resolution")
         raise InputError(f"{text}: check this pair and the axes")
     return np.asarray(rigid.params if dimension == 3 else planar_matrix_to_3D(rigid.params))
+
+
+def _open_rotation(source: FloatArray, target: FloatArray) -> str:
+    """Where pairs lie if that leaves their rotation open: at one place, or in 3D on one line; else empty."""
+    spread = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (source, target)]
+    extent = min(spread, key=lambda s: s[0])
+    if extent[0] < SMALLEST_EXTENT_M:
+        return "at one place"
+    return "on one line" if len(extent) == 3 and extent[1] < SPREAD * extent[0] else ""
 
 
 def _motion(pose: FloatArray) -> FloatArray:
@@ -132,11 +138,11 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
     (pose, score), *others = _find_poses(points, walls)
     _, mirrored = _find_poses(points * [-1, 1], walls)[0]
     if mirrored > max(score + CLEAR_LEAD, LEAST_AGREEMENT):
-        text = f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f}); "
-        text += (
+        text = f"{name}: its mirror image fits the walls better (agreement {mirrored:.2f}, not {score:.2f})"
+        remedy = (
             "flip a picture upside down, give the other row_0 of an NPZ grid (--row-0), or change the sign of one axis"
         )
-        raise InputError(text)
+        raise InputError(f"{text}; {remedy}")
     if score < LEAST_AGREEMENT:
         scale, agreement = best_scale(points, pose, walls)
         share = np.mean(distance_to_walls(_moved(points, pose), walls) <= NEAR_M)
@@ -220,16 +226,14 @@ def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[Float
             peak = np.array(np.unravel_index(np.argmax(match), match.shape))
             peaks.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))
             match[tuple(slice(max(0, p - APART_CELLS), p + APART_CELLS + 1) for p in peak)] = 0
-    peaks.sort(key=lambda peak: -peak[0])
     starts: list[FloatArray] = []
-    for _, pose in peaks:
-        turn = [abs((pose[2] - s[2] + np.pi) % (2 * np.pi) - np.pi) for s in starts]
-        shift = [np.linalg.norm(pose[:2] - s[:2]) for s in starts]
-        if not any(t < APART_RAD and d < APART_CELLS * cell for t, d in zip(turn, shift, strict=True)):
+    for _, pose in sorted(peaks, key=lambda peak: -peak[0]):
+        away = pose - np.reshape(starts, (-1, 3))
+        turn = np.abs((away[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+        near = (turn < APART_RAD) & (np.linalg.norm(away[:, :2], axis=1) < APART_CELLS * cell)
+        if not near.any():
             starts.append(pose)
-        if len(starts) == STARTS:
-            break
-    return starts
+    return starts[:STARTS]
 
 
 def _image(cells: FloatArray, shape: IntArray) -> FloatArray:

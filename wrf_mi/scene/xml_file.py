@@ -46,8 +46,7 @@ def parsed_xml(path: Path) -> Element:
 def read_scene_xml(path: Path) -> Element:
     """The root of a scene file.
 
-    Raises:
-        InputError: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
+    `InputError`: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
     """
     try:
         root = parsed_xml(path)
@@ -77,15 +76,20 @@ def _check(element: Element, where: str, named: Mapping[int, str], folder: Path,
     where = named.get(id(element), where)
     if depth > DEEPEST:
         raise InputError(f"{where}: elements within elements to more than {DEEPEST} levels; correct the scene")
-    tag, plugin = element.tag, element.get("type", "")
-    known = PLUGINS.get(tag, "").split()
-    if plugin not in known if plugin else tag not in VALUES:
-        what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
-        remedy = f"known are {', '.join(known or [*VALUES, *PLUGINS])}"
-        raise InputError(f"{where}: {one_line(what)} does not belong into a scene; {remedy}")
+    _check_plugin(element, where)
+    tag = element.tag
     if tag in ("string", "default") and "$" in element.get("value", ""):
         raise InputError(f"{where}: a value with a parameter ($); write the value in its place")
     if tag == "string" and element.get("name") in FILES:
         inside(folder, element.get("value", ""), where)
     for child in element:
         _check(child, where, named, folder, depth + 1)
+
+
+def _check_plugin(element: Element, where: str) -> None:
+    tag, plugin = element.tag, element.get("type", "")
+    known = PLUGINS.get(tag, "").split()
+    if plugin not in known if plugin else tag not in VALUES:
+        what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
+        remedy = f"known are {', '.join(known or [*VALUES, *PLUGINS])}"
+        raise InputError(f"{where}: {one_line(what)} does not belong into a scene; {remedy}")

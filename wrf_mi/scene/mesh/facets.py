@@ -46,25 +46,32 @@ def planes_of_mesh(surfaces: Sequence[Surface]) -> list[Surface]:
     Returns:
         Surfaces by kind, the largest first; the triangles are those given. If no plane has a role, the given surfaces.
     """
-    parts_of = [bodies(surface.vertices_m[surface.faces]) for surface in surfaces]
-    mesh_bodies = [body for of_surface in parts_of for body in of_surface]
-    facets = _room_facets(mesh_bodies)
+    mesh_bodies = [body for surface in surfaces for body in bodies(surface.vertices_m[surface.faces])]
+    facets = _facets_with_roles(_room_facets(mesh_bodies))
     if not facets:
         return list(surfaces)
-    low, high = bounds(np.concatenate([facet.corners_m for facet in facets]))[:, 2]
-    roles = _same_on_both_sides(facets, kinds(facets, float(low + high) / 2))
-    parts: list[tuple[Kind, FloatArray]] = []
+    parts = [(role, facet.corners_m) for role, facet in facets]
     without_role = [np.ones(len(body.corners_m), bool) for body in mesh_bodies]
-    for role, facet in zip(roles, facets, strict=True):
-        if role != "other":
-            parts.append((role, facet.corners_m))
-            without_role[facet.body] &= ~facet.rows
-    if not parts:
-        return list(surfaces)
+    for _, facet in facets:
+        without_role[facet.body] &= ~facet.rows
     parts += [
         ("other", body.corners_m[rows]) for body, rows in zip(mesh_bodies, without_role, strict=True) if rows.any()
     ]
-    parts.sort(key=lambda part: (KINDS.index(part[0]), -trimesh.triangles.area(part[1]).sum()))
+    return _surfaces(parts)
+
+
+def _facets_with_roles(facets: Sequence[_Facet]) -> list[tuple[Kind, _Facet]]:
+    """The facets that are floors, ceilings or walls."""
+    if not facets:
+        return []
+    low, high = bounds(np.concatenate([facet.corners_m for facet in facets]))[:, 2]
+    roles = _same_on_both_sides(facets, kinds(facets, float(low + high) / 2))
+    return [(role, facet) for role, facet in zip(roles, facets, strict=True) if role != "other"]
+
+
+def _surfaces(parts: list[tuple[Kind, FloatArray]]) -> list[Surface]:
+    """Surfaces by kind, the largest first."""
+    parts = sorted(parts, key=lambda part: (KINDS.index(part[0]), -trimesh.triangles.area(part[1]).sum()))
     split = []
     for name, (kind, corners) in zip(number_names([kind for kind, _ in parts]), parts, strict=True):
         vertices, faces = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
@@ -79,9 +86,9 @@ def _room_facets(mesh_bodies: Sequence[Body]) -> list[_Facet]:
     shell_m = [bounds(np.concatenate([slab.corners_m for slab in slabs.values()]))] if slabs else []
     facets = [*slabs.values()]
     for index, body in others.items():
-        if _bounds_rooms(body, [other for other in others.values() if other is not body], shell_m):
+        if _bounds_rooms(body, list(others.values()), shell_m):
             facets += _facets(body, index)
-    return [facet for facet in facets if _is_large(facet)]
+    return list(filter(_is_large, facets))
 
 
 def _slab(body: Body, index: int) -> _Facet | None:
@@ -129,16 +136,15 @@ def _is_large(facet: _Facet) -> bool:
 
 
 def _bounds_rooms(body: Body, others: Sequence[Body], shell_m: Sequence[FloatArray]) -> bool:
-    """Whether the facets of a body may bound rooms, among other bodies and a shell of slabs [2, 3]."""
+    """Whether the facets of a body may bound rooms, among all bodies and in a shell of slabs [2, 3]."""
     if not body.closed:
         return True
     height_m = np.ptp(body.bounds_m[:, 2])
     if height_m < STOREY_M:
         return False
-    around = [other for other in others if _within(body.bounds_m, other.bounds_m)]
-    if any(_is_cavity(body, other) for other in around):
+    if any(_is_cavity(body, other) for other in others):
         return True
-    outer_m = [other.bounds_m for other in around] + [shell for shell in shell_m if _within(body.bounds_m, shell)]
+    outer_m = [box for box in (*shell_m, *(other.bounds_m for other in others)) if _within(body.bounds_m, box)]
     return all(height_m >= REACHES * np.ptp(outer[:, 2]) for outer in outer_m)
 
 
@@ -146,7 +152,8 @@ def _is_cavity(body: Body, outer: Body) -> bool:
     """Whether a body is a room in a solid around it: normals face each other, and it is clear of floor and ceiling."""
     (low, high), (floor, ceiling) = body.bounds_m[:, 2], outer.bounds_m[:, 2]
     clear = low > floor + INSIDE_M and high < ceiling - INSIDE_M  # furniture stands on the floor
-    return bool(outer.closed and body.volume_m3 < 0 < outer.volume_m3 and clear)
+    inward = outer.closed and body.volume_m3 < 0 < outer.volume_m3
+    return bool(inward and clear and _within(body.bounds_m, outer.bounds_m))
 
 
 def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:
@@ -158,16 +165,16 @@ def _within(inner_m: FloatArray, outer_m: FloatArray) -> bool:
 def _same_on_both_sides(faces: Sequence[Face], roles: Sequence[Kind]) -> list[Kind]:
     """Roles with both faces of a floor or roof given the same role; a scan sees only one face."""
     same = list(roles)
-    height = [float(np.mean(face.span_m)) for face in faces]
-    level = [i for i, face in enumerate(faces) if face.slope > PARALLEL]
+    height = np.mean([face.span_m for face in faces], axis=1)
+    level = np.flatnonzero([face.slope > PARALLEL for face in faces]).tolist()
     least_m2 = least_level_area([faces[i] for i in level])
-    highest_m = max((height[i] for i in level if roles[i] == "ceiling"), default=-np.inf)
+    ceilings_m = height[level][np.array(roles)[level] == "ceiling"]
+    is_top = height + STOREY_M >= ceilings_m.max(initial=-np.inf)
     for i, j in permutations(level, 2):
-        apart_m = abs(height[i] - height[j])
-        if faces[i].area.area < least_m2 or apart_m > LAYERS_M or not faces[i].overlaps(faces[j], 0.5):
-            continue
         # A floor just above a ceiling, without a ceiling over it, is the upper face of a roof.
-        is_roof = roles[i] == "floor" and roles[j] == "ceiling" and height[i] > height[j]
-        if (roles[i] == "other" and roles[j] != "other") or (is_roof and highest_m <= height[i] + STOREY_M):
+        is_roof = all((roles[i] == "floor", roles[j] == "ceiling", height[i] > height[j], is_top[i]))
+        takes_role = is_roof or roles[i] == "other" != roles[j]
+        are_layers = all((takes_role, faces[i].area.area >= least_m2, abs(height[i] - height[j]) <= LAYERS_M))
+        if are_layers and faces[i].overlaps(faces[j], 0.5):
             same[i] = roles[j]
     return same

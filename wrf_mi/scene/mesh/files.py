@@ -65,17 +65,8 @@ def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
 
 def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | None]:
     """The parts of a mesh file, with z up, and the unit of their coordinates in metres if the file states it."""
-    suffix, unit_m, stated = file.suffix.lower(), None, up_of(file, None)
     try:
-        if suffix in STATING_READERS:
-            contents, unit_m, stated = STATING_READERS[suffix](file)
-            if not 0 < unit_m < np.inf:
-                raise ValueError(f"a unit of {unit_m} m")
-            parts = [part for content in contents for part in _polygon_parts(content)]
-        elif suffix in POLYGON_READERS:
-            parts = _polygon_parts(POLYGON_READERS[suffix](file))
-        else:
-            parts = _trimesh_parts(file)
+        parts, unit_m, stated = _stored_parts(file)
         for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
             _check_part(part)
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
@@ -86,6 +77,19 @@ def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | No
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
         raise InputError(f"{file}: cannot be read as a mesh ({one_line(error)}); convert or restore it") from None
     return parts, unit_m
+
+
+def _stored_parts(file: Path) -> tuple[list[trimesh.Trimesh], float | None, Up]:
+    """Parts and unit of `_parts` as they are stored, and the axis that is up by the file or its format."""
+    suffix, up = file.suffix.lower(), up_of(file, None)
+    if suffix in POLYGON_READERS:
+        return _polygon_parts(POLYGON_READERS[suffix](file)), None, up
+    if suffix not in STATING_READERS:
+        return _trimesh_parts(file), None, up
+    contents, unit_m, up = STATING_READERS[suffix](file)
+    if not 0 < unit_m < np.inf:
+        raise ValueError(f"a unit of {unit_m} m")
+    return [part for content in contents for part in _polygon_parts(content)], unit_m, up
 
 
 def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
@@ -123,18 +127,22 @@ def _check_size(file: Path) -> None:
     if suffix == ".glb" and len(content) >= 12 and (stated := int.from_bytes(content[8:12], "little")) != len(content):
         raise ValueError(f"states {stated} bytes and has {len(content)}; it is cut off or damaged")
     if suffix == ".stl":
-        count = int.from_bytes(content[80:84], "little")
-        if len(content) >= STL_HEADER and len(content) == STL_HEADER + STL_FACE * count:
-            return
-        begins, ends = (len(re.findall(rb"(?im)^\s*" + word + rb"\b", content)) for word in (b"solid", b"endsolid"))
-        # Binary files may begin like those of text, but their numbers have zero bytes.
-        if not begins or b"\0" in content:
-            if len(content) < STL_HEADER:
-                raise ValueError(f"{len(content)} bytes, fewer than its header has; it is cut off")
-            faces = max(len(content) - STL_HEADER, 0) / STL_FACE
-            raise ValueError(f"states {count} triangles and has bytes for {faces:.6g}; it is cut off or damaged")
-        if begins > ends:
-            raise ValueError("a solid without its endsolid; it is cut off")
+        _check_stl(content)
+
+
+def _check_stl(content: bytes) -> None:
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) == STL_HEADER + STL_FACE * count:
+        return
+    begins, ends = (len(re.findall(rb"(?im)^\s*" + word + rb"\b", content)) for word in (b"solid", b"endsolid"))
+    # Binary files may begin like those of text, but their numbers have zero bytes.
+    if not begins or b"\0" in content:
+        if len(content) < STL_HEADER:
+            raise ValueError(f"{len(content)} bytes, fewer than its header has; it is cut off")
+        faces = (len(content) - STL_HEADER) / STL_FACE
+        raise ValueError(f"states {count} triangles and has bytes for {faces:.6g}; it is cut off or damaged")
+    if begins > ends:
+        raise ValueError("a solid without its endsolid; it is cut off")
 
 
 def read_mesh(path: str | Path, units: str | None = None, up: Up | None = None) -> list[Surface]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -177,16 +178,15 @@ def join(planes: Sequence[Plane], areas: Sequence[Any], reach_m: Sequence[float]
     """
     areas = list(areas)
     corners = [_corners(plane, area) for plane, area in zip(planes, areas, strict=True)]
-    for _ in range(PASSES):
-        for i, a in enumerate(planes):
-            for j, b in enumerate(planes):
-                reach = min(reach_m[i], reach_m[j])
-                if i == j or abs(a.normal @ b.normal) >= STEEPEST or _beside(b, corners[i], reach):
-                    continue
-                if _beside(a, corners[j], reach):
-                    continue
-                areas[i] = _end_at(a, areas[i], b, areas[j], reach)
-                corners[i] = _corners(a, areas[i])
+    for i, j in PASSES * list(permutations(range(len(planes)), 2)):
+        a, b, reach = planes[i], planes[j], min(reach_m[i], reach_m[j])
+        if (
+            abs(a.normal @ b.normal) < STEEPEST
+            and not _beside(b, corners[i], reach)
+            and not _beside(a, corners[j], reach)
+        ):
+            areas[i] = _end_at(a, areas[i], b, areas[j], reach)
+            corners[i] = _corners(a, areas[i])
     return areas
 
 

@@ -152,18 +152,17 @@ def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
     large = sorted((face for face in faces if face.area.area >= least_m2), key=lambda face: face.span_m[0])
     roles = dict[Face, Kind]()
     for face in large:
-        if face.slope > LEVEL and (role := _level_role(face, roles, middle_m)):
+        if role := _level_role(face, roles, middle_m):
             roles[face] = role
-    floors = [face for face, role in roles.items() if role == "floor"]
-    sloping = [face for face in large if UPRIGHT < face.slope <= LEVEL]
-    roles |= {face: "ceiling" for face in sloping if _is_high(face, floors, middle_m)}
-    upright = [face for face in faces if face.slope <= UPRIGHT]
-    roles |= {face: "wall" for face in upright if _spans_room(face, roles)}
+    roles |= {face: "ceiling" for face in large if _is_sloping_ceiling(face, roles, middle_m)}
+    roles |= {face: "wall" for face in faces if _is_wall(face, roles)}
     return [roles.get(face, "other") for face in faces]
 
 
 def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> Kind | None:
-    """Role of a level face by the highest face below it; None: it is a table, or a second layer."""
+    """Role of a level face by the highest face below it; None: it is not level, a table, or a second layer."""
+    if face.slope <= LEVEL:
+        return None
     below = max((other for other in roles if face.overlaps(other)), key=lambda other: other.span_m[0], default=None)
     low = face.span_m[0]
     if below is None:
@@ -174,9 +173,11 @@ def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> Kind
     return "floor" if apart_m < SLAB_M else "ceiling"
 
 
-def _is_high(face: Face, floors: Sequence[Face], middle_m: float) -> bool:
-    """Whether a sloping face reaches a storey above the floors below it: the roof of an attic, not a ramp."""
-    top = face.span_m[1]
+def _is_sloping_ceiling(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> bool:
+    """Whether a face slopes and reaches a storey above the floors below it: the roof of an attic, not a ramp."""
+    if not UPRIGHT < face.slope <= LEVEL:
+        return False
+    top, floors = face.span_m[1], [floor for floor, role in roles.items() if role == "floor"]
     below = [floor.span_m[1] for floor in floors if floor.span_m[1] < top and face.overlaps(floor)]
     return top > max(below, default=middle_m) + STOREY_M
 
@@ -191,8 +192,10 @@ def storey(face: Face, roles: Mapping[Face, Kind]) -> tuple[float, float]:
     return floor, min((height for role, height in levels if role == "ceiling" and height > z), default=np.inf)
 
 
-def _spans_room(face: Face, roles: Mapping[Face, Kind]) -> bool:
-    """Whether an upright face spans most of the height between floor and ceiling at its middle."""
+def _is_wall(face: Face, roles: Mapping[Face, Kind]) -> bool:
+    """Whether a face is upright and spans most of the height between floor and ceiling at its middle."""
+    if face.slope > UPRIGHT:
+        return False
     floor, ceiling = storey(face, roles)
     least_m = WALL_SHARE * (ceiling - floor) if np.isfinite(ceiling - floor) else WALL_HEIGHT_M
     left, _, right, _ = face.area.bounds

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
@@ -47,6 +47,14 @@ class Polygons:
     sizes: IntArray
     parts: IntArray
     place: Callable[[int], str]
+
+    @classmethod
+    def of(
+        cls, vertices: ArrayLike, corners: ArrayLike, sizes: ArrayLike, parts: ArrayLike, place: Callable[[int], str]
+    ) -> Polygons:
+        """Polygons of numbers of any type."""
+        numbers = [np.asarray(values, np.int64).reshape(-1) for values in (corners, sizes, parts)]
+        return cls(np.asarray(vertices, float).reshape(-1, 3), numbers[0], numbers[1], numbers[2], place)
 
     def __post_init__(self) -> None:
         """Refuse a polygon without three corners, or with one that is no vertex (`ValueError`)."""
@@ -81,13 +89,7 @@ def read_obj(path: Path) -> Polygons:
                     part = materials.setdefault(" ".join(words[1:]), len(materials))
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from None
-    return Polygons(
-        np.array(vertices, float).reshape(-1, 3),
-        np.array(corners, np.int64),
-        np.array(sizes, np.int64),
-        np.array(parts, np.int64),
-        lambda polygon: f"line {lines[polygon]}",
-    )
+    return Polygons.of(vertices, corners, sizes, parts, lambda polygon: f"line {lines[polygon]}")
 
 
 def _obj_statements(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -163,9 +165,24 @@ def read_ply(path: Path) -> Polygons:
 
     Source: G. Turk, "The PLY polygon file format" (1994).
     """
-    content = path.read_bytes()
+    columns = _ply_elements(path.read_bytes())
+    vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    if not {"x", "y", "z"} <= set(vertex):
+        raise ValueError("no vertices with x, y and z in it")
+    if columns.get("tristrips"):
+        raise ValueError("its faces are triangle strips; store them as faces")
+    vertices = np.column_stack([vertex[axis] for axis in "xyz"])
+    lists = next((face[name] for name in CORNERS if name in face), None)
+    if face and lists is None:
+        raise ValueError(f"faces without a list {' or '.join(CORNERS)}")
+    corners, sizes = lists or (np.empty(0), np.empty(0))
+    return Polygons.of(vertices, corners, sizes, np.zeros(len(sizes)), lambda polygon: f"face {polygon + 1}")
+
+
+def _ply_elements(content: bytes) -> dict[str, dict[str, Any]]:
+    """Columns of each element of a PLY file, see `_ply_columns`."""
     elements, order, at = ply_header(content)
-    body, columns = content[at:], dict[str, dict[str, Any]]()
+    body, at, columns = content[at:], 0, dict[str, dict[str, Any]]()
     if not order:
         # Numbers of text as one binary table, so that both are cut into rows by the same code.
         body = np.fromstring(body.strip(), float, sep=" ").tobytes()
@@ -173,26 +190,9 @@ def read_ply(path: Path) -> Polygons:
             PlyElement(e.name, e.count, [(name, "f8", count and "f8") for name, _, count in e.properties])
             for e in elements
         ]
-    at = 0
     for element in elements:
         columns[element.name], at = _ply_columns(body, at, element, order or "=")
-    vertex, face = columns.get("vertex", {}), columns.get("face", {})
-    if not {"x", "y", "z"} <= set(vertex):
-        raise ValueError("no vertices with x, y and z in it")
-    if any(element.name == "tristrips" and element.count for element in elements):
-        raise ValueError("its faces are triangle strips; store them as faces")
-    vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(float)
-    lists = next((face[name] for name in CORNERS if name in face), None)
-    if face and lists is None:
-        raise ValueError(f"faces without a list {' or '.join(CORNERS)}")
-    corners, sizes = lists or (np.empty(0), np.empty(0))
-    return Polygons(
-        vertices,
-        corners.astype(np.int64),
-        sizes.astype(np.int64),
-        np.zeros(len(sizes), np.int64),
-        lambda polygon: f"face {polygon + 1}",
-    )
+    return columns
 
 
 def _ply_columns(body: bytes, at: int, element: PlyElement, order: str) -> tuple[dict[str, Any], int]:

@@ -101,11 +101,10 @@ def _is_surface(prim: Any, geometry: Any) -> bool:
 
 
 def _polygons(vertices: ArrayLike, corners: IntArray, sizes: IntArray, name: str) -> Polygons:
-    sizes = np.asarray(sizes, np.int64)
     if sizes.sum() != corners.size:
         raise ValueError(f"{name} states {sizes.sum()} corners of faces and has {corners.size}")
-    parts, index = np.zeros(len(sizes), np.int64), np.asarray(corners, np.int64).reshape(-1)
-    return Polygons(np.asarray(vertices, float), index, sizes, parts, lambda polygon: f"face {polygon + 1} of {name}")
+    parts = np.zeros(len(sizes))
+    return Polygons.of(vertices, corners, sizes, parts, lambda polygon: f"face {polygon + 1} of {name}")
 
 
 def _up(path: Path, stated: str) -> Up:

@@ -71,15 +71,15 @@ def grid_from_probability(
 ) -> PlanGrid:
     """A grid from the probability [rows, columns] that a cell is occupied, NaN where that is unknown.
 
-    Raises:
-        InputError: it has not two axes, holds nothing occupied, or the resolution is not positive.
+    `InputError`: it has not two axes, holds nothing occupied, or the resolution is not positive.
     """
     p = np.asarray(probability, float)
     if p.size > LARGEST_PICTURE:
         raise InputError(f"{name}: {p.size:,} cells; give a plan of at most {LARGEST_PICTURE:,}, with larger cells")
     if p.ndim != 2 or not p.size:
         raise InputError(f"{name}: an occupancy grid has two axes (rows, columns), this one has shape {p.shape}")
-    if not (np.isfinite(resolution_m) and resolution_m > 0 and np.isfinite(np.asarray(origin_m, float)).all()):
+    origin = np.asarray(origin_m, float)
+    if not np.isfinite([resolution_m, *origin]).all() or resolution_m <= 0:
         raise InputError(f"{name}: the resolution is {resolution_m}; give the side of a cell in metres, above zero")
     if row_0 == "top":
         p = p[::-1]
@@ -88,14 +88,13 @@ def grid_from_probability(
     if not occupied.any():
         what = "every cell is NaN" if np.isnan(p).all() else "no cell is occupied"
         raise InputError(f"{name}: {what}; there is no wall to find, give another map")
-    return PlanGrid(occupied, free, float(resolution_m), np.asarray(origin_m, float))
+    return PlanGrid(occupied, free, float(resolution_m), origin)
 
 
 def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> PlanGrid:
     """A grid of the cells that hold points [n, 2]; none is free, since points do not show which cells are empty.
 
-    Raises:
-        InputError: no points, or more cells than `LARGEST_GRID_CELLS`.
+    `InputError`: no points, or more cells than `LARGEST_GRID_CELLS`.
     """
     xy = np.asarray(xy_m, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not len(xy):
@@ -164,8 +163,7 @@ def read_plan(
 def read_layout(path: str | Path) -> FloatArray:
     """Consecutive wall vertices [n, 2] in metres from a CSV file with the header ``x,y``; the path may double back.
 
-    Raises:
-        InputError: missing file, header or number, or no wall in it.
+    `InputError`: missing file, header or number, or no wall in it.
     """
     vertices = read_columns(Path(path), "x,y")
     if not np.any(np.diff(vertices, axis=0)):
@@ -178,20 +176,23 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         content = stored_arrays(path)
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
         raise InputError(f"{path}: not an NPZ file ({one_line(error)})") from None
-    numbers = {key: values for key, values in content.items() if key in NUMBERS}
-    for key, values in numbers.items():
-        if values.dtype.kind not in "biuf":
-            raise InputError(f"{path}: {key} holds no numbers but {values.dtype}")
-        numbers[key] = values.astype(float)
+    numbers = dict[str, FloatArray]()
+    for key in sorted(content.keys() & set(NUMBERS)):
+        if content[key].dtype.kind not in "biuf":
+            raise InputError(f"{path}: {key} holds no numbers but {content[key].dtype}")
+        numbers[key] = content[key].astype(float)
     if "log_odds" in numbers:
-        return _grid_of_arrays(path, numbers, resolution_m, row_0, content.get("row_0"))
+        return _grid_of_arrays(path, {**content, **numbers}, resolution_m, row_0)
     if "xy_m" not in numbers:
         text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")
-    xy, time = numbers["xy_m"], numbers.get("time_s")
-    if xy.ndim != 2 or xy.shape[1] != 2:
+    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
+
+
+def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
+    if xy.shape[1:] != (2,):
         raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
     if time is not None and time.shape != xy.shape[:1]:
         raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
@@ -199,24 +200,20 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
 
 
 def _grid_of_arrays(
-    path: Path,
-    numbers: Mapping[str, FloatArray],
-    resolution_m: float | None,
-    row_0: Row0 | None,
-    stated_row_0: NDArray[Any] | None,
+    path: Path, content: Mapping[str, NDArray[Any]], resolution_m: float | None, row_0: Row0 | None
 ) -> PlanGrid:
     if resolution_m is None:
-        if "resolution_m" not in numbers:
+        if "resolution_m" not in content:
             raise InputError(f"{path}: no resolution_m; give the side of a cell in metres (--resolution)")
-        resolution_m = float(numbers["resolution_m"].reshape(-1)[0])
-    origin = numbers.get("origin_m", np.zeros(2))
+        resolution_m = float(content["resolution_m"].reshape(-1)[0])
+    origin = content.get("origin_m", np.zeros(2))
     if origin.shape != (2,) or not np.isfinite(origin).all():
         raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
-    values = numbers["log_odds"]
+    values = content["log_odds"]
     known = values[~np.isnan(values)]
     if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
         values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
-    row_0 = row_0 or _stated_side(path, stated_row_0)
+    row_0 = row_0 or _stated_side(path, content.get("row_0"))
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
 
 
@@ -236,23 +233,10 @@ def _no_rows(path: Path, why: str) -> InputError:
 
 
 def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
-    facts: dict[str, Any] = {}
-    origin = np.zeros(2)
     sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
+    negate, origin = False, np.zeros(2)
     if sheet.is_file():
-        try:
-            facts = read_yaml(sheet)
-            path = inside(sheet.parent, facts["image"], sheet) if path == sheet else path
-            origin = np.array(facts["origin"][:2], float)
-            yaw = float(facts["origin"][2]) if len(facts["origin"]) > 2 else 0.0
-            resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            text = f"not the YAML of a ROS map ({one_line(error)})"
-            raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
-        if yaw or not np.isfinite(yaw):
-            raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
+        path, negate, origin, resolution_m = _read_sheet(sheet, path, resolution_m)
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
     try:
@@ -260,7 +244,24 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
             grey = np.asarray(picture.convert("L"), float) / 255
     except PICTURE_ERRORS as error:
         raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
-    return grid_from_probability(grey if facts.get("negate") else 1 - grey, resolution_m, "top", origin, str(path))
+    return grid_from_probability(grey if negate else 1 - grey, resolution_m, "top", origin, str(path))
+
+
+def _read_sheet(sheet: Path, path: Path, resolution_m: float | None) -> tuple[Path, bool, FloatArray, float]:
+    """Picture, negation, origin [2] and resolution of a ROS map, of which a picture or resolution may be stated."""
+    try:
+        facts = read_yaml(sheet)
+        path = inside(sheet.parent, facts["image"], sheet) if path == sheet else path
+        x, y, yaw = np.array([*facts["origin"], 0.0][:3], float)
+        resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        text = f"not the YAML of a ROS map ({one_line(error)})"
+        raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
+    if yaw or not np.isfinite(yaw):
+        raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
+    return path, bool(facts.get("negate")), np.array([x, y]), resolution_m
 
 
 def _read_text(path: Path) -> PlanPoints:

@@ -9,9 +9,8 @@ from shapely.geometry.base import BaseGeometry
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ...core.types import IntArray
 from ..mesh.outline import triangulated
-from ..mesh.surfaces import Kind, Surface, number_names
+from ..mesh.surfaces import Surface, number_names
 from .alignment import grid_from_scans
 from .sources import PlanGrid, PlanPoints, grid_from_points
 from .walls import find_walls
@@ -101,16 +100,12 @@ def plan_surfaces(
         flat, faces = triangulated(floor_of(walls_m))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    top_m = floor_m + height_m
-    parts: list[tuple[Kind, FloatArray, IntArray]] = [
-        ("floor", _at(flat, floor_m), faces),
-        ("ceiling", _at(flat, top_m), faces),
-    ]
-    for ends in walls_m:
-        vertices = np.concatenate([_at(ends, floor_m), _at(ends[::-1], top_m)])
-        parts.append(("wall", vertices, np.array([[0, 1, 2], [0, 2, 3]])))
-    names = number_names([kind for kind, _, _ in parts])
-    return [Surface(n, kind, v, f) for n, (kind, v, f) in zip(names, parts, strict=True)]
+    top_m, halves = floor_m + height_m, np.array([[0, 1, 2], [0, 2, 3]])
+    floor = Surface("floor", "floor", _at(flat, floor_m), faces)
+    surfaces = [floor, Surface("ceiling", "ceiling", _at(flat, top_m), faces)]
+    for name, ends in zip(number_names(["wall"] * len(walls_m)), walls_m, strict=True):
+        surfaces.append(Surface(name, "wall", np.concatenate([_at(ends, floor_m), _at(ends[::-1], top_m)]), halves))
+    return surfaces
 
 
 def _at(xy_m: FloatArray, z_m: float) -> FloatArray:

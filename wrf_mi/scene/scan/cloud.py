@@ -132,15 +132,23 @@ class _Scan:
             if kind != "other":
                 things &= ~over(plane, area, self.points_m, band_m)
                 thinned &= ~over(plane, area, self.cloud.points_m, band_m)
-        for i, (piece, kind) in enumerate(zip(pieces, roles, strict=True)):
-            if kind != "other":
-                areas[i] = self.without_shadows(piece.plane, areas[i], walls, things)
-            areas[i] = fill_shadows(piece.plane, areas[i], kind, self.cloud.points_m[thinned], self.noise_m)
-            if kind == "floor":
-                areas[i] = fill_blind(piece.plane, areas[i], walls, self.points_m, band_m)
-            if piece.recesses:
-                areas[i] = shapely.difference(areas[i], shapely.union_all(piece.recesses))
+        clutter_m = self.cloud.points_m[thinned]
+        areas = [
+            self._filled(piece, area, kind, walls, things, clutter_m)
+            for piece, area, kind in zip(pieces, areas, roles, strict=True)
+        ]
         return [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
+
+    def _filled(
+        self, piece: _Piece, area: Any, kind: Kind, walls: Sequence[Face], things: Mask, clutter_m: FloatArray
+    ) -> Any:
+        """Area of a piece with its shadows filled, but for its recesses."""
+        if kind != "other":
+            area = self.without_shadows(piece.plane, area, walls, things)
+        area = fill_shadows(piece.plane, area, kind, clutter_m, self.noise_m)
+        if kind == "floor":
+            area = fill_blind(piece.plane, area, walls, self.points_m, BAND * self.noise_m)
+        return shapely.difference(area, shapely.union_all(piece.recesses)) if piece.recesses else area
 
     def pieces(self, planes: Sequence[Plane], walls: Sequence[Face] = ()) -> list[_Piece]:
         """Planes and their parallel layers with the areas that free points cover, those of most points first."""
@@ -238,12 +246,8 @@ class _Scan:
 def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:
     """Planes fitted to all points, turned to right angles where these allow it, with their axes."""
     index = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
-    claims = np.zeros(len(points), np.uint8)
-    for rows in index:
-        claims[rows] += 1
-    # Points in the corner of two planes pull both towards the room.
-    sole = [rows[claims[rows] == 1] for rows in index]
-    chosen = [points[s if len(s) > 0.2 * len(rows) else rows] for s, rows in zip(sole, index, strict=True)]
+    claims = np.bincount(np.concatenate([np.empty(0, int), *index]), minlength=len(points))
+    chosen = [points[_sole(rows, claims)] for rows in index]
     fitted = [fit(part, np.ones(len(part)), plane, noise_m) for part, plane in zip(chosen, planes, strict=True)]
     fitted = [
         fit(part, np.ones(len(part)), plane, noise_m, normal=plane.normal)
@@ -252,6 +256,13 @@ def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> lis
     # The axes follow the most certain upright plane.
     heading = next((plane.normal for plane in fitted if abs(plane.normal[2]) < 1e-6), np.array([1.0, 0.0, 0.0]))
     return [with_axes(plane, heading) for plane in fitted]
+
+
+def _sole(rows: IntArray, claims: IntArray) -> IntArray:
+    """Rows of points that one plane claims, or all where these are few."""
+    # Points in the corner of two planes pull both towards the room.
+    sole = rows[claims[rows] == 1]
+    return sole if len(sole) > 0.2 * len(rows) else rows
 
 
 def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -119,17 +120,24 @@ def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
     for spread_deg in NORMAL_SPREADS_DEG:
         boxes = _patches(cloud, free, spread_deg)
         noise = noise or _noise(cloud, boxes)
-        candidates = [plane for box in boxes for plane in _patch_layers(cloud, free, box, noise)]
-        candidates = [c for c in candidates if not any(repeats(c, plane, REPEAT * noise) for plane in planes)]
+        layers_of_boxes = (layer for box in boxes for layer in _patch_layers(cloud, free, box, noise))
+        candidates = [layer for layer in layers_of_boxes if not repeats(layer, planes, REPEAT * noise)]
         if not candidates:
             break
         merged, planes = _merge(cloud, [*planes, *candidates], noise), []
         for plane in merged:
-            if not any(repeats(plane, other, 2 * noise) for other in planes):
+            if not repeats(plane, planes, 2 * noise):
                 planes.append(plane)
-        for plane in planes:
-            free &= ~near(plane, cloud.points_m, BAND * noise)
+        free &= off_planes(planes, cloud.points_m, BAND * noise)
     return planes, noise
+
+
+def off_planes(planes: Sequence[Plane], points_m: FloatArray, band_m: float) -> Mask:
+    """Points [n, 3] that lie near no patch of planes."""
+    free = np.ones(len(points_m), bool)
+    for plane in planes:
+        free &= ~near(plane, points_m, band_m)
+    return free
 
 
 def fit(
@@ -168,12 +176,13 @@ def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plan
     merged: list[Plane] = []
     while left:
         plane = left.pop(0)
-        same = [other for other in left if _coplanar(plane, other, noise_m)]
-        if not same:
+        is_same = [_coplanar(plane, other, noise_m) for other in left]
+        if not any(is_same):
             merged.append(plane)
             continue
-        left = [other for other in left if not any(other is piece for piece in same)]
-        plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *(piece.patches_m for piece in same)]))
+        patches = [other.patches_m for other in compress(left, is_same)]
+        left = [other for other, same in zip(left, is_same, strict=True) if not same]
+        plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *patches]))
         # The grown plane goes back to the front: it may meet further pieces.
         left.insert(0, _fit_near(cloud, near(plane, cloud.points_m, BAND * noise_m), plane, noise_m))
     return merged
@@ -192,13 +201,11 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
     return bool(shapely.distance(flat, a.region(0)) < MERGE_GAP_M)
 
 
-def repeats(plane: Plane, other: Plane, least_m: float) -> bool:
+def repeats(plane: Plane, others: Sequence[Plane], least_m: float) -> bool:
     """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
-    if abs(plane.normal @ other.normal) < np.cos(np.radians(10)):
-        return False
-    if abs(other.distance(plane.centre_m)) > least_m:
-        return False
-    return bool(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)))
+    parallel = [other for other in others if abs(plane.normal @ other.normal) >= np.cos(np.radians(10))]
+    near_ones = [other for other in parallel if abs(other.distance(plane.centre_m)) <= least_m]
+    return any(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)) for other in near_ones)
 
 
 def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:

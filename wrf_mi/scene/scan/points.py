@@ -96,20 +96,17 @@ def read_scan(paths: Sequence[str | Path], units: str | None = None, up: Up | No
 def _parts(file: Path) -> list[Part]:
     """The scans of a file, each with points, all of them finite."""
     try:
-        parts = [
-            (np.asarray(points, float), viewpoint)
-            for points, viewpoint in READERS.get(file.suffix.lower(), _read_vertices)(file)
-        ]
+        parts = list(READERS.get(file.suffix.lower(), _read_vertices)(file))
+        parts = [(points, viewpoint) for part, viewpoint in parts if (points := np.asarray(part, float)).size]
     except InputError:
         raise
     except Exception as error:  # NumPy, laspy and trimesh raise a dozen kinds on damaged files
         raise InputError(f"{file}: no points to be read ({one_line(error)}); give {FORMATS}") from None
-    parts = [(points, viewpoint) for points, viewpoint in parts if points.size]
     if not parts:
         raise InputError(f"{file}: no points in it; give {FORMATS}")
     first = 0
     for points, _ in parts:
-        if points.ndim != 2 or points.shape[1] != 3:
+        if points.shape[1:] != (3,):
             raise InputError(f"{file}: expected points of shape [m, 3], got {list(points.shape)}")
         if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
             raise InputError(f"{file}, point {first + bad[0] + 1}: not finite; remove that point")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import shapely
@@ -20,8 +21,8 @@ from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.planes import LEVEL, WALL_HEIGHT_M, Face, Mask, Plane, near, with_axes
-from .planes import AROUND, BAND, CELL_RANGE_M, FEWEST_VOXELS, LAYER_CORE, fit, repeats
+from ..mesh.planes import LEVEL, WALL_HEIGHT_M, Face, Mask, Plane, with_axes
+from .planes import AROUND, BAND, CELL_RANGE_M, FEWEST_VOXELS, LAYER_CORE, fit, off_planes, repeats
 
 MOST_BEAMS = 400_000  # beams of a scanner that are used: 0.3 degrees apart over the sphere
 DIRECTIONS = 4000  # directions by which a scan is judged
@@ -156,24 +157,26 @@ def sparse_walls(points_m: FloatArray, walls: Sequence[Plane], planes: Sequence[
 
     A wall far away, or seen through a gap, has few points, but these lie in one plane over a room's height.
     """
-    free = np.ones(len(points_m), bool)
-    for plane in planes:
-        free &= ~near(plane, points_m, BAND * noise_m)
+    points = points_m[off_planes(planes, points_m, BAND * noise_m)]
     # Of a scanner that is not level, walls are upright in the frame of the floor.
     up = next((plane.normal for plane in planes if abs(plane.normal[2]) > LEVEL), np.array([0.0, 0.0, 1.0]))
+    candidates = list[tuple[float, Plane]]()
+    for normal, lean in product(_headings(walls, up), np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD):
+        candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
+    chosen = list[Plane]()
+    for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
+        if not repeats(plane, [*planes, *chosen], AROUND * noise_m):
+            chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
+    return chosen
+
+
+def _headings(walls: Sequence[Plane], up: FloatArray) -> list[FloatArray]:
+    """Distinct normals of walls, and of planes square to them."""
     headings = list[FloatArray]()
     for normal in (side for wall in walls for side in (wall.normal, np.cross(up, wall.normal))):
         if all(abs(normal @ other) < np.cos(SAME_HEADING_RAD) for other in headings):
             headings.append(normal / np.linalg.norm(normal))
-    points, candidates = points_m[free], list[tuple[float, Plane]]()
-    for normal in headings:
-        for lean in np.arange(-MOST_LEAN, MOST_LEAN + 1) * LEAN_RAD:
-            candidates += _parallel_planes(points, np.cos(lean) * normal + np.sin(lean) * up, noise_m)
-    chosen = list[Plane]()
-    for _, plane in sorted(candidates, key=lambda pair: -pair[0]):
-        if not any(repeats(plane, other, AROUND * noise_m) for other in [*planes, *chosen]):
-            chosen.append(fit(points, np.ones(len(points)), plane, noise_m))
-    return chosen
+    return headings
 
 
 def _parallel_planes(points: FloatArray, normal: FloatArray, noise_m: float) -> list[tuple[float, Plane]]:
