@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
+from ...core.array_files import keyed, under
 from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ...training.selection import RowDistance, rows_at_receiver
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
-from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed, under
+from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
 from .scene_side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
@@ -159,36 +160,43 @@ class FittedHybrid(Fitted):
         distance_m, observed = self._distance(tx_pos_m, receiver), self.problem.record.observation
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self._weights(distance_m)
-        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
+        residual_weight = self._residual_weight(weights)
         sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
         paths, size = None, np.zeros((len(tx_pos_m), *shape))
-        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
-            # Residuals are about the scene's side, which is therefore a part of what they predict.
-            share = weight + residual_weight if name == PATHS else weight
-            rows = np.flatnonzero(share)
-            if not len(rows):
-                continue
-            by_part = predict(part, rows)
-            side = int(name in TRACED)
-            sides[side, rows] += _spread(share[rows], shape) * by_part.whole.mean
-            totals[side, rows] += share[rows]
+        for name, rows, share, by_part in self._by_part(weights, residual_weight, predict):
+            side, factor = int(name in TRACED), _spread(share, shape)
+            sides[side, rows] += factor * by_part.whole.mean
+            totals[side, rows] += share
             if by_part.whole.std is not None:
-                size[rows] += _spread(share[rows], shape) * by_part.whole.std
-            if paths is None and by_part.paths is not None:
-                paths = by_part.paths.placed(rows, len(tx_pos_m))
+                size[rows] += factor * by_part.whole.std
+            paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
-        if len(rows) and self.residuals is not None:
-            residual = self.residuals(tx_pos_m[rows], receiver, shape)
+        if len(rows):
+            residual = cast(Residuals, self.residuals)(tx_pos_m[rows], receiver, shape)
             mean[rows] += _spread(residual_weight[rows], shape) * residual
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
-        if not (totals[0].any() and totals[1].any()):
+        if not totals.any(axis=1).all():
             return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
             learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
         return Decomposition(prediction, traced, learned, paths)
+
+    def _by_part(
+        self, weights: FloatArray, residual_weight: FloatArray, predict: Callable[[Fitted, IntArray], Decomposition]
+    ) -> Iterator[tuple[str, IntArray, FloatArray, Decomposition]]:
+        """Name of each part with a weight, its rows, their weights, and its predictions of them."""
+        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
+            # Residuals are about the scene's side, which is therefore a part of what they predict.
+            share = weight + residual_weight if name == PATHS else weight
+            rows = np.flatnonzero(share)
+            if len(rows):
+                yield name, rows, share[rows], predict(part, rows)
+
+    def _residual_weight(self, weights: FloatArray) -> FloatArray:
+        return np.zeros(len(weights)) if self.residuals is None else weights[:, len(self.parts)]
 
     def _weights(self, distance_m: FloatArray) -> FloatArray:
         """Weights of the parts and, as the last, of the residuals, [m, k]; 0 where a part is not worth its time."""
