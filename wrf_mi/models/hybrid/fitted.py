@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,20 +160,26 @@ class FittedHybrid(Fitted):
         distance_m, observed = self._distance(tx_pos_m, receiver), self.problem.record.observation
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self._weights(distance_m)
-        residual_weight = self._residual_weight(weights)
+        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
         sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
         paths, size = None, np.zeros((len(tx_pos_m), *shape))
-        for name, rows, share, by_part in self._by_part(weights, residual_weight, predict):
-            side, factor = int(name in TRACED), _spread(share, shape)
-            sides[side, rows] += factor * by_part.whole.mean
-            totals[side, rows] += share
+        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
+            # Residuals are about the scene's side, which is therefore a part of what they predict.
+            share = weight + residual_weight if name == PATHS else weight
+            rows = np.flatnonzero(share)
+            if not len(rows):
+                continue
+            by_part = predict(part, rows)
+            side = int(name in TRACED)
+            sides[side, rows] += _spread(share[rows], shape) * by_part.whole.mean
+            totals[side, rows] += share[rows]
             if by_part.whole.std is not None:
-                size[rows] += factor * by_part.whole.std
+                size[rows] += _spread(share[rows], shape) * by_part.whole.std
             paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
-        if len(rows):
-            residual = cast(Residuals, self.residuals)(tx_pos_m[rows], receiver, shape)
+        if len(rows) and self.residuals is not None:
+            residual = self.residuals(tx_pos_m[rows], receiver, shape)
             mean[rows] += _spread(residual_weight[rows], shape) * residual
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
@@ -183,20 +189,6 @@ class FittedHybrid(Fitted):
         with np.errstate(divide="ignore", invalid="ignore"):
             learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
         return Decomposition(prediction, traced, learned, paths)
-
-    def _by_part(
-        self, weights: FloatArray, residual_weight: FloatArray, predict: Callable[[Fitted, IntArray], Decomposition]
-    ) -> Iterator[tuple[str, IntArray, FloatArray, Decomposition]]:
-        """Name of each part with a weight, its rows, their weights, and its predictions of them."""
-        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
-            # Residuals are about the scene's side, which is therefore a part of what they predict.
-            share = weight + residual_weight if name == PATHS else weight
-            rows = np.flatnonzero(share)
-            if len(rows):
-                yield name, rows, share[rows], predict(part, rows)
-
-    def _residual_weight(self, weights: FloatArray) -> FloatArray:
-        return np.zeros(len(weights)) if self.residuals is None else weights[:, len(self.parts)]
 
     def _weights(self, distance_m: FloatArray) -> FloatArray:
         """Weights of the parts and, as the last, of the residuals, [m, k]; 0 where a part is not worth its time."""

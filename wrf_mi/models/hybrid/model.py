@@ -150,7 +150,10 @@ class _Fit:
         for name in set(self.parts) - set(used):
             shutil.rmtree(self.session.folder / FOLDER / name, ignore_errors=True)
         if KRIGING in names and len(names) > 1:
-            self.reports.append(self._residual_report(used, chosen["held_out"].get("hybrid")))
+            # Strengths are kriged about the scene's in every case.
+            gained = self.task.in_decibel or not {KRIGING, RESIDUAL}.isdisjoint(used)
+            seconds = time.perf_counter() - self.begun - self.scene_seconds
+            self.reports.append(StageReport(RESIDUAL, gained, chosen["held_out"].get("hybrid"), seconds))
         mixture = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
         weights = [
             {"distance_m": float(distance), **dict(zip(used, map(float, row), strict=True))}
@@ -160,11 +163,6 @@ class _Fit:
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
         return FittedHybrid(self.problem, self.problem.rows(self.split), parts, mixture, residuals, intervals, stated)
-
-    def _residual_report(self, used: Sequence[str], score: float | None) -> StageReport:
-        # Strengths are kriged about the scene's in every case.
-        gained = self.task.in_decibel or not {KRIGING, RESIDUAL}.isdisjoint(used)
-        return StageReport(RESIDUAL, gained, score, time.perf_counter() - self.begun - self.scene_seconds)
 
     def _mixture(self, count: int) -> tuple[Mixture, Intervals | None, dict[str, Any]]:
         """Weights of so many predictions, intervals, and how both were chosen; the first where no rows are held out."""

@@ -188,20 +188,6 @@ class Strengths(Fitted):
         return {"fitted": fitted}
 
 
-def _received(record: Record, rows: IntArray, with_heading: bool) -> Measured:
-    """Strengths and poses of the distinct rows that a receiver received (InputError: as `fit_strengths`)."""
-    require(record, "rssi", why="these strengths are in dBm")
-    if record.frequencies_hz is None:
-        raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
-    rows = np.unique(np.asarray(rows, np.int64))
-    values = np.asarray(record.observation[:, rows], float)
-    received = np.isfinite(values).any(axis=0)
-    rows, values = rows[received], values[:, received]
-    heading = record.tx_heading_rad if with_heading else None
-    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
-    return Measured(poses, values, rows, record.precision(rows))
-
-
 def fit_strengths(
     record: Record,
     rows: IntArray,
@@ -221,10 +207,18 @@ def fit_strengths(
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
     """
-    measured = _received(record, rows, settings.heading)
-    poses, values, rows = measured.poses, measured.value_dbm, measured.rows
+    require(record, "rssi", why="these strengths are in dBm")
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
+    rows = np.unique(np.asarray(rows, np.int64))
+    values = np.asarray(record.observation[:, rows], float)
+    received = np.isfinite(values).any(axis=0)
+    rows, values = rows[received], values[:, received]
     if not len(rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
+    heading = record.tx_heading_rad if settings.heading else None
+    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    measured = Measured(poses, values, rows, record.precision(rows))
     prior = _prior(record, measured, power_map, settings)
     hyperparameters = settings.hyperparameters
 
