@@ -26,6 +26,16 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 REMEDY = "read it on a machine with more memory"
 
 
+def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays with a prefix before their names."""
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
+
+
+def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = False, checksum: bool = False) -> Path:
     """Write an ``.npz`` file of plain arrays atomically. `stored_arrays` compares the checksum."""
     stored = {name: np.asanyarray(values) for name, values in arrays.items()}

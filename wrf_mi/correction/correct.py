@@ -136,10 +136,13 @@ def correct_scene(
     facts: dict[str, Any] = {"rows": len(split.all_train), "held_out": len(held_out.rows)}
     facts |= {"held_out_receivers": list(held_out.out), "paths": len(final.misfit.paths.row)}
     scores = {stage: result.score for stage, result in judged.items()}
-    # Kinds of the surfaces of a scene folder; other scenes state none.
-    entries = read_scene_folder(Path(scene)).materials.surfaces if (Path(scene) / MATERIALS_FILE).is_file() else {}
-    kinds: dict[str, Kind] = {name: entry for name, entry in entries.items() if entry in KINDS}
-    return Correction(state, deviation, scores, kinds, data, time.perf_counter() - begun, facts)
+    return Correction(state, deviation, scores, _kinds(Path(scene)), data, time.perf_counter() - begun, facts)
+
+
+def _kinds(folder: Path) -> dict[str, Kind]:
+    """Kinds of the surfaces of a scene folder; other scenes state none."""
+    entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
+    return {name: entry for name, entry in entries.items() if entry in KINDS}
 
 
 def _checked(

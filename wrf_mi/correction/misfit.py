@@ -128,21 +128,24 @@ class Misfit:
             tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
             for port in self.ports:
                 port.side = port.side.select(tables, self.planes, self.slabs)
-        # The vector: materials, planes and devices in an order that is the same whichever receivers have rows.
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
             self._instruments |= instrument_parameters(receiver, self._traced.pattern_degree)
-        of_scene = self.sides[0].parameters().items()
-        values = {name: value for name, value in of_scene if name.startswith((PREFIX, SHIFT, TILT))} | self._instruments
-        values = {name: value for name, value in values.items() if options.changes(name)}
-        # Positions of parameters in the vector, one after the other.
-        self._shapes = {name: value.shape for name, value in values.items()}
-        bounds = np.cumsum([0, *(value.size for value in values.values())])
-        self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
-        self.start = np.concatenate([value.ravel() for value in values.values()]).astype(float)  # stated values [p]
+        self._lay_out(options)
         self.observed, self.unit = self._observations()  # [n_rx * rows, values], NaN for none, and [n_rx * rows]
         for port in self.ports:
             port.record(self._device(self.start))
+
+    def _lay_out(self, options: CorrectionOptions) -> None:
+        """Positions of parameters in the vector, one after the other, and their stated values ``start`` [p]."""
+        # Materials, planes and devices in an order that is the same whichever receivers have rows.
+        of_scene = self.sides[0].parameters().items()
+        values = {name: value for name, value in of_scene if name.startswith((PREFIX, SHIFT, TILT))} | self._instruments
+        values = {name: value for name, value in values.items() if options.changes(name)}
+        self._shapes = {name: value.shape for name, value in values.items()}
+        bounds = np.cumsum([0, *map(np.size, values.values())])
+        self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
+        self.start = np.concatenate([*map(np.ravel, values.values())]).astype(float)
 
     @property
     def sides(self) -> list[TracedField]:

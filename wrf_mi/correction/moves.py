@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, starmap
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -128,18 +129,19 @@ def joint_choices(
     # In reverse order, so that of several surfaces in a plane that with most paths stays.
     of_plane = {f"plane {material.what.rpartition('/')[2]}": material for material in reversed(materials)}
     every = [(of_plane[shift.what], shift) for shift in shifts if shift.what in of_plane]
-    pairs = [pair for place, pair in enumerate(every) if place < JOINT or pair[0].what in posterior.supposed]
-    joint = list[SurfaceChoice]()
-    for material, shift in pairs:
-        values = {
-            f"{kind}, {place}": np.concatenate([constants, moved])
-            for place, moved in shift.values.items()
-            for kind, constants in material.values.items()
-        }
-        places, mask = ([getattr(c, name) for c in (material, shift)] for name in ("places", "of_plane"))
-        joint.append(SurfaceChoice(material.what, np.concatenate(places), values, np.concatenate(mask)))
-    done = {choice.what for pair in pairs for choice in pair}
-    return [*joint, *(choice for choice in (*shifts, *materials) if choice.what not in done)]
+    pairs = every[:JOINT] + [pair for pair in every[JOINT:] if pair[0].what in posterior.supposed]
+    done = {choice.what for choice in chain.from_iterable(pairs)}
+    return [*starmap(_joint, pairs), *(choice for choice in (*shifts, *materials) if choice.what not in done)]
+
+
+def _joint(material: SurfaceChoice, shift: SurfaceChoice) -> SurfaceChoice:
+    values = {
+        f"{kind}, {place}": np.concatenate([constants, moved])
+        for place, moved in shift.values.items()
+        for kind, constants in material.values.items()
+    }
+    places, mask = np.concatenate([material.places, shift.places]), np.concatenate([material.of_plane, shift.of_plane])
+    return SurfaceChoice(material.what, places, values, mask)
 
 
 def gains(before: float, after: float, bonus: float = 0.0) -> bool:
@@ -297,22 +299,21 @@ class Moves:
         """The least plausible planes in other minima, or materials replaced by others, one after another."""
         # Least squares of all parameters before a comparison: what the others have adapted to the wrong choice makes
         # the right one look worse until they may change.
-        choices = self.material if of_materials else self.joint
-        doubt = (self._far_from_prior if of_materials else self._implausible)(choices, state)
+        choices, doubt_of, elsewhere = self.joint, self._implausible, "in other minima"
+        if of_materials:
+            choices, doubt_of, elsewhere = self.material, self._far_from_prior, "of other materials"
         apart_m = APART * speed_of_light / self.posterior.frequency_hz
-        what = f"{self.title} {'of other materials' if of_materials else 'in other minima'}"
+        doubt, what = doubt_of(choices, state), f"{self.title} {elsewhere}"
         doubtful = [choices[place] for place in np.argsort(-doubt, kind="stable")[:ELSEWHERE]]
         for number, choice in enumerate(doubtful, 1):
             self.posterior.on_stage(f"{what}, {number} of {len(doubtful)}", 0.0)
             trials = near(self.posterior.misfit, state.vector)
             tried = [Alternative(0.0, state.materials.get(choice.what, ""), state.vector)]
             for other in self._alternatives(trials, state.noise, choice, state.vector, of_materials):
-                same = [
-                    other.material == before.material
-                    if of_materials
-                    else abs((other.vector - before.vector)[choice.plane[0]]) < apart_m
-                    for before in tried
-                ]
+                if of_materials:
+                    same = [other.material == before.material for before in tried]
+                else:
+                    same = [abs((other.vector - before.vector)[choice.plane[0]]) < apart_m for before in tried]
                 if len(tried) > MINIMA or any(same):
                     continue
                 tried.append(other)

@@ -137,13 +137,16 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
     # Constants, not their logarithms, which parameters are; their uncertainty is a factor.
     before, after = (np.column_stack([part.table, part.exponent]).tolist() for part in (slabs, fitted))
     changed, absent = state.free, state.absent()
-    quantities = QUANTITIES if misfit.several_carriers else QUANTITIES[:3]
-    parts = [misfit.parts.get(name_of(SURFACE, quantity)) for quantity in quantities]
+    names = [name_of(SURFACE, quantity) for quantity in QUANTITIES[: 3 + misfit.several_carriers]]
+    starts = np.array([misfit.parts[name].start for name in names if name in misfit.parts], int)
     materials = []
     for index, (name, paths) in enumerate(zip(slabs.names, misfit.counts()[1], strict=True)):
-        places = [part.start + index for part in parts if part is not None]
-        sd = correction.deviation[places] if places and places[0] in changed else None
-        measured = None if sd is None else (sd / state.posterior.prior_deviation[places] <= SUPPORTED).tolist()
+        sd: list[float] | None = None
+        measured: list[bool] | None = None
+        places = starts + index
+        if np.isin(places[:1], changed).any():
+            sd = correction.deviation[places].tolist()
+            measured = (sd / state.posterior.prior_deviation[places] <= SUPPORTED).tolist()
         materials.append(
             {
                 "surface": name.partition("/")[0],
@@ -151,7 +154,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
                 "first_choice": state.materials.get(name),
                 "absent": misfit.slabs[index] in absent,
                 **dict(zip(CONSTANTS, map(list, zip(before[index], after[index], strict=True)), strict=True)),
-                "sd_log": None if sd is None else sd.tolist(),
+                "sd_log": sd,
                 "measured": measured,
             }
         )
@@ -229,18 +232,21 @@ def _planes_text(planes: list[dict[str, Any]]) -> list[str]:
     return ["## Planes", "", *_table(header, "lrrrl", rows)] if rows else []
 
 
+def _constant(name: str, value: float, sd: float, measured: bool) -> str:
+    # The exponent is no logarithm.
+    text, spread = f"{value:.3g}", f"x/ {math.exp(sd):.2g}"
+    if name == CONSTANTS[-1]:
+        text, spread = f"{value:.2f}", f"± {sd:.2f}"
+    return f"{text} {spread}" if measured else f"({text})"
+
+
 def _materials_text(correction: Correction, materials: list[dict[str, Any]]) -> list[str]:
     several, rows = correction.misfit.several_carriers, []
     for material in sorted(materials, key=lambda material: -material["paths"]):
         if material["sd_log"] is None:
             continue
-        cells = []
-        for name, sd, measured in zip(CONSTANTS, material["sd_log"], material["measured"], strict=False):
-            value = material[name][1]
-            if name == CONSTANTS[-1]:  # the exponent is no logarithm
-                cells.append(f"{value:.2f} ± {sd:.2f}" if measured else f"({value:.2f})")
-            else:
-                cells.append(f"{value:.3g} x/ {math.exp(sd):.2g}" if measured else f"({value:.3g})")
+        known = zip(CONSTANTS, material["sd_log"], material["measured"], strict=False)
+        cells = [_constant(name, material[name][1], sd, measured) for name, sd, measured in known]
         choice = "absent, left out" if material["absent"] else material["first_choice"] or "as stated"
         rows.append((material["surface"], str(material["paths"]), choice, *cells))
     if not rows:
@@ -313,7 +319,11 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
         room.set(**{f"{axis}lim": (a, b), f"{axis}label": f"{axis} (m)"})
     room.set_box_aspect(np.maximum(high - low, 0.1))
     room.set_title(label)
-    axes = figure.add_subplot(1, 2, 2)
+    _plot_scores(figure.add_subplot(1, 2, 2), correction)
+    return figure
+
+
+def _plot_scores(axes: Any, correction: Correction) -> None:
     # Distributions over the held-out rows: a mean that gains may hide rows that lose.
     for stage, score in correction.scores.items():
         values: FloatArray = np.sort(score[np.isfinite(score)])
@@ -323,4 +333,3 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     axes.set(xlabel=task_of(correction.misfit.record).label, ylabel="share of the held-out rows", ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    return figure

@@ -58,6 +58,23 @@ class _Touched:
         return np.asarray(self.adding @ flat).view(complex).reshape(-1, *waves.shape[1:])
 
 
+def _follows(name: str, moving: bool) -> bool:
+    # Constants of materials, gains of receivers, and, where planes may be ``moving``, their shifts and tilts.
+    is_gain = name.startswith("receiver.") and name.endswith(".gain")
+    return name.startswith(PREFIX) or is_gain or (moving and name in (SHIFT, TILT))
+
+
+def _serves_reports(misfit: Misfit, carriers: int) -> bool:
+    task, models = task_of(misfit.record), [port.model for port in misfit.ports]
+    if task.in_decibel:
+        return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
+    if not task.image:
+        return all((task.is_complex, misfit.record.observation.ndim == 3, SHIFT in misfit.parts, carriers == 1))
+    # Element signals of all paths, of arrays of one size.
+    sizes = [len(m.elements_m) if isinstance(m, ArrayReceiver) and m.instrument_scale else 0 for m in models]
+    return 0 not in sizes and len({*sizes}) == 1 and max(sizes) * len(misfit.paths.row) <= MOST_WAVES
+
+
 class PathSum:
     """Residuals of a misfit that it `serves`, near a vector [p] about which lengths are linear; for several threads."""
 
@@ -97,24 +114,12 @@ class PathSum:
     @staticmethod
     def serves(misfit: Misfit) -> bool:
         """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths without planes."""
-        task, models = task_of(misfit.record), [port.model for port in misfit.ports]
         gains = {port.side.gain_name for port in misfit.ports}
-        carriers = len(models) // len(misfit.receivers)
-        followed = set() if task.in_decibel else {SHIFT, TILT}
-        of_devices = {name for name in misfit.parts if name.startswith("receiver.")}
-        others = {name for name in misfit.parts if not name.startswith(PREFIX)} - of_devices - followed
-        moved = {name for name in of_devices if not name.endswith(".gain")}
+        carriers = len(misfit.ports) // len(misfit.receivers)
         # Receivers of one name share parameters: their sums would not be told apart.
-        if others or moved or len(gains) * carriers < len(models):
-            return False
-        if task.in_decibel:
-            return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
-        if task.image:
-            arrays = [m for m in models if isinstance(m, ArrayReceiver) and m.instrument_scale]
-            sizes, count = {len(m.elements_m) for m in arrays}, len(misfit.paths.row)
-            return len(arrays) == len(models) and len(sizes) == 1 and max(sizes) * count <= MOST_WAVES
-        channels = task.is_complex and misfit.record.observation.ndim == 3
-        return channels and SHIFT in misfit.parts and carriers == 1
+        apart, moving = len(gains) * carriers >= len(misfit.ports), not task_of(misfit.record).in_decibel
+        follows = all(_follows(name, moving) for name in misfit.parts)
+        return apart and follows and _serves_reports(misfit, carriers)
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""

@@ -135,6 +135,11 @@ class State:
         return np.sqrt(np.diag(covariance)), left_out_residuals(derivative, residual, covariance, self.noise)
 
 
+def _met_most(count: IntArray) -> IntArray:
+    order = np.argsort(-count, kind="stable")
+    return order[count[order] >= LEAST_PATHS]
+
+
 class ScenePosterior:
     """Likelihood of the rows of one misfit, and the prior of its parameters.
 
@@ -152,16 +157,15 @@ class ScenePosterior:
     ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
         names = misfit.sides[0].slabs.names  # <object>/<plane>
-        objects = [name.partition("/")[0] for name in names]
-        faces = [np.flatnonzero([thing in body for thing in objects]) for body in bodies]
+        objects = np.array([name.partition("/")[0] for name in names], str)
+        faces = [np.flatnonzero(np.isin(objects, [*body])) for body in bodies]
         self.bodies = [slabs for slabs in faces if len(slabs) > 1]  # places in `Misfit.slabs` of the faces of each box
         # Surfaces of objects that the stated scene lacks: their places in `Misfit.slabs` by name.
-        self.supposed = {name: slab for slab, name in enumerate(names) if objects[slab] in hidden}
+        self.supposed = {names[slab]: slab for slab in np.flatnonzero(np.isin(objects, [*hidden])).tolist()}
         self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
         # Places among the misfit's planes and slabs, most paths first. Few paths tell of no surface: their noise would
         # move it anywhere within the prior.
-        ranked = [(np.argsort(-count, kind="stable"), count) for count in misfit.counts()]
-        self.planes, self.slabs = (order[count[order] >= LEAST_PATHS] for order, count in ranked)
+        self.planes, self.slabs = map(_met_most, misfit.counts())
         self.prior_deviation = np.ones(len(misfit.start))
         for name, part in misfit.parts.items():
             self.prior_deviation[part] = options.deviation(name)

@@ -9,6 +9,7 @@ one Q: a further transmitter costs two products per pixel instead of a footprint
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import drjit as dr
@@ -163,18 +164,25 @@ def _blend_one(
     return result
 
 
+def _read_both(table: Any, signals: Any, layout: Layout, i: Any, slot: Any) -> tuple[list[Any], list[Complex]]:
+    """Record of Gaussian i and its signals, from their ``slot`` if the geometry is shared, else those of the record."""
+    if layout.shared:
+        return read(table, i, layout.fields), _read_signals(signals, slot, layout.size)
+    record = read(table, i, layout.fields + 2)
+    return record, [tuple(record[layout.fields :])]
+
+
 @dr.syntax
 def _forward(table: Any, signals: Any, layout: Layout) -> tuple[Any, Any]:
     """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
-    lists, n, shared, fields, size = layout.lists, layout.n, layout.shared, layout.fields, layout.size
+    lists, n, fields, size = layout.lists, layout.n, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
     lanes = lanes_of(layout)
     state = ForwardState.start(float_type, LANE_ROWS, size)
     j = index_type(0)
     while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
-        record = read(table, i, fields if shared else fields + 2)
-        sent = _read_signals(signals, lanes.group * n + i, size) if shared else [tuple(record[fields:])]
+        record, sent = _read_both(table, signals, layout, i, lanes.group * n + i)
         state = _blend_one(record, fields, sent, lanes, state)
         j += 1
     # Each scatter below is a kernel that would run the loop again.
@@ -217,7 +225,7 @@ def _derivatives(
         is_seen |= g > 0
     cosine, sine = lanes.azimuth
     vectors = [c for level, up in sums for c in (level * cosine, level * sine, up)]
-    return [*vectors, *by_blending], [part for pair in by_signal for part in pair], is_seen, after
+    return [*vectors, *by_blending], list(chain.from_iterable(by_signal)), is_seen, after
 
 
 @dr.syntax
@@ -244,8 +252,7 @@ def _backward(
     while j < lanes.end:
         i = dr.gather(index_type, lists.index, lanes.start + j)
         slot = lanes.group * n + i
-        record = read(table, i, fields if shared else fields + 2)
-        sent = _read_signals(signals, slot, size) if shared else [tuple(record[fields:])]
+        record, sent = _read_both(table, signals, layout, i, slot)
         values, by_signal, is_seen, state = _derivatives(record, fields, sent, lanes, state, slopes)
         # Without a shared geometry a record ends with its signal, and one table takes all gradients.
         values, by_signal = (values, by_signal) if shared else (values + by_signal, [])

@@ -74,12 +74,10 @@ def project(gaussians: Gaussians, pose: Pose) -> Footprints:
         m, f = pose.to_local(axis), scale * inverse
         columns.append((dot(e1, m) * f, dot(e2, m) * f))
     low = LOW_PASS_RAD**2
-    s11 = sum((p * p for p, _ in columns[1:]), columns[0][0] ** 2)
-    s22 = sum((q * q for _, q in columns[1:]), columns[0][1] ** 2)
-    c12 = sum((p * q for p, q in columns[1:]), columns[0][0] * columns[0][1])
-    c11, c22 = s11 + low, s22 + low
-    # det C by Lagrange's identity: a sum of squares, where c11 c22 - c12^2 would cancel for needles.
     (p0, q0), (p1, q1), (p2, q2) = columns
+    s11, s22 = p0**2 + p1 * p1 + p2 * p2, q0**2 + q1 * q1 + q2 * q2
+    c11, c22, c12 = s11 + low, s22 + low, p0 * q0 + p1 * q1 + p2 * q2
+    # det C by Lagrange's identity: a sum of squares, where c11 c22 - c12^2 would cancel for needles.
     minors = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
     determinant = minors + low * (s11 + s22) + low * low
     # C = L L^T; the rows of L^-1 [e1 e2]^T whiten the tangent plane.

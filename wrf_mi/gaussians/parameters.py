@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -139,19 +139,21 @@ def gaussians_in_parts(field: Any, params: Mapping[str, Any], tx_pos: Any, at_on
             values = {name: value[:, chunk] if name in field.per_gaussian else value for name, value in params.items()}
             parts.append(field.gaussians(values, tx_pos))
             dr.eval(vars(parts[-1]))
-        if len(parts) == 1:
-            return parts[0]
-        # Concatenated the parts are [part, transmitter, Gaussian]; the result is [transmitter, Gaussian].
-        sizes = [part.count for part in parts]
-        begin = batch * np.cumsum([0, *sizes[:-1]])
-        slots = [a + np.arange(batch * n).reshape(batch, n) for a, n in zip(begin, sizes, strict=True)]
-        order = on_device(np.concatenate(slots, axis=1), dr.uint32_array_t(type(parts[0].position[0])))
+        return parts[0] if len(parts) == 1 else _joined(parts, count)
 
-        def joined(*arrays: Any) -> Any:
-            joint = dr.concat(list(arrays))
-            return joint if dr.width(joint) == count else dr.gather(type(joint), joint, order)
 
-        names = [f.name for f in fields(Gaussians) if f.name != "batch"]
-        result = Gaussians(**{n: each(joined, *(getattr(part, n) for part in parts)) for n in names}, batch=batch)
-        dr.eval(vars(result))
+def _joined(parts: Sequence[Gaussians], count: int) -> Gaussians:
+    # Concatenated the parts are [part, transmitter, Gaussian]; the result is [transmitter, Gaussian].
+    sizes, batch = [part.count for part in parts], parts[0].batch
+    begin = batch * np.cumsum([0, *sizes[:-1]])
+    slots = [a + np.arange(batch * n).reshape(batch, n) for a, n in zip(begin, sizes, strict=True)]
+    order = on_device(np.concatenate(slots, axis=1), dr.uint32_array_t(type(parts[0].position[0])))
+
+    def joined(*arrays: Any) -> Any:
+        joint = dr.concat(list(arrays))
+        return joint if dr.width(joint) == count else dr.gather(type(joint), joint, order)
+
+    names = [f.name for f in fields(Gaussians) if f.name != "batch"]
+    result = Gaussians(**{n: each(joined, *(getattr(part, n) for part in parts)) for n in names}, batch=batch)
+    dr.eval(vars(result))
     return result

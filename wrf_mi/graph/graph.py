@@ -98,14 +98,7 @@ class Graph:
         evaluation: str = SPLATTED,
     ) -> None:
         self.kind = RECEIVERS[form.receiver]
-        # Phases of an array need its elements and a wavelength; paths need a carrier in any case.
-        array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
-        unknown = form.frequencies_hz is None and form.carriers_hz is None
-        carrier = unknown and (self.kind.needs_carrier or scene is not None)
-        if array or carrier:
-            what = "a scene" if scene is not None else f"setting receiver: {form.receiver}"
-            needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
-            raise InputError(f"{what} needs {needed}; state array and frequency_hz in the data")
+        self._check_data(form, receivers, scene is not None)
         if scene is not None and form.features:
             raise InputError("paths are traced from positions, not from an uplink; omit the scene")
         if field is None and scene is None:
@@ -116,6 +109,15 @@ class Graph:
         self.evaluation: Evaluation = resolve(EVALUATIONS[evaluation])(scene, traced)
         self._stated_hz = form.carrier_hz
         self._take(form)
+
+    def _check_data(self, form: Form, receivers: Sequence[Receiver], with_scene: bool) -> None:
+        # Phases of an array need its elements and a wavelength; paths need a carrier in any case.
+        array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
+        carrier = (self.kind.needs_carrier or with_scene) and np.isnan(form.carrier_hz)
+        if array or carrier:
+            what = "a scene" if with_scene else f"setting receiver: {form.receiver}"
+            needed = "the antenna array and the carrier" if self.kind.needs_array else "the carrier"
+            raise InputError(f"{what} needs {needed}; state array and frequency_hz in the data")
 
     def at_carrier(self, carrier_hz: float) -> Graph:
         """The same graph for rows of another carrier."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
+from ..core.array_files import under
 from ..core.types import IntArray
 from ..tasks import task_of
 from ..training.by_distance import GAPS, Intervals, expected_size, fit_intervals
@@ -28,7 +29,6 @@ from .model import (
     field_arrays,
     from_field_arrays,
     known_positions,
-    under,
 )
 
 INTERVALS, ROWS = "intervals/", "intervals_rows"  # prefix of the arrays of intervals, and key of the training rows

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core import InputError, Record, Split
+from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
@@ -19,29 +20,30 @@ if TYPE_CHECKING:
 
 def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
     """Refuse a record that a model does not serve, naming ``others`` that do; or as `check_parts`."""
-    place, able = place_of(record), [other for other in others if other.serves(record.task)]
-    if not method.serves(record.task):
-        *most, last = method.tasks or ("nothing",)
-        served = f"{', '.join(most)} and {last}" if most else last
-        named = f": {', '.join(other.name for other in able)}" if able else ""
-        text = f"{method.name} serves {served}, so choose another model{named}"
-        raise InputError(f"{place}: holds {record.task}; {text}")
+    place, task = place_of(record), record.task
+    if not method.serves(task):
+        served = " and ".join(", ".join(method.tasks or ["nothing"]).rsplit(", ", 1))
+        named = _names([other for other in others if other.serves(task)], ": {}")
+        raise InputError(f"{place}: holds {task}; {method.name} serves {served}, so choose another model{named}")
     if method.uplink == "required" and record.uplink is None:
         text = f"has no uplink channels, from which {method.name} predicts; choose data with an uplink"
         raise InputError(f"{place}: {text}")
     check_parts(record)
     if record.carriers_hz is not None and not method.several_carriers:
-        names = [other.name for other in able if other.several_carriers]
-        named = f" ({', '.join(names)})" if names else ""
+        named = _names([other for other in others if other.several_carriers and other.serves(task)], " ({})")
         text = f"{carriers_text(record.carriers_hz)}; {method.name} serves one carrier"
         raise InputError(f"{place}: {text}, so choose another model{named} or give the rows of each carrier")
+
+
+def _names(models: Sequence[Model], form: str) -> str:
+    return form.format(", ".join(model.name for model in models)) if models else ""
 
 
 def check_held_receivers(record: Record, split: Split, method: Model, others: Iterable[Model]) -> None:
     """Refuse a split that holds out receivers, for a model or data that do not serve it; raises InputError."""
     if not split.held_receivers:
         return
-    if max(split.held_receivers) >= len(record.receivers) or len(split.held_receivers) == len(record.receivers):
+    if not {*split.held_receivers} < {*range(len(record.receivers))}:
         numbers = ", ".join(map(str, split.held_receivers))
         text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
         raise InputError(f"{place_of(record)}: {text}; leave some to train on")
@@ -54,19 +56,24 @@ def check_held_receivers(record: Record, split: Split, method: Model, others: It
         raise InputError(f"split {split.name}: {text}, or leave them rows, as receiver+20 does")
 
 
+def _check_receiver_carriers(record: Record, carriers_hz: FloatArray) -> None:
+    if record.carriers_hz is not None or not task_of(record).in_decibel:
+        text = "receivers' frequency_hz belongs to signal strengths without carriers_hz"
+        raise InputError(f"{place_of(record)}: {text}; state the carriers of receivers or of rows")
+    if not (carriers_hz > 0).all():
+        text = "some receivers have no positive frequency_hz; give the carrier of each in Hz"
+        raise InputError(f"{place_of(record)}: {text}")
+
+
 def check_parts(record: Record) -> None:
     """Refuse a record whose parts do not fit together; raises InputError."""
     task_of(record).check(record)
     _check_noise(record)
     if record.runs is not None and record.runs.shape != (len(record),):
         raise InputError(f"{place_of(record)}: runs {list(record.runs.shape)}; give one for each of {len(record)} rows")
+    if record.receiver_carriers_hz is not None:
+        _check_receiver_carriers(record, record.receiver_carriers_hz)
     carriers, place = record.carriers_hz, place_of(record)
-    if (of_receivers := record.receiver_carriers_hz) is not None:
-        if carriers is not None or not task_of(record).in_decibel:
-            text = "receivers' frequency_hz belongs to signal strengths without carriers_hz"
-            raise InputError(f"{place}: {text}; state the carriers of receivers or of rows")
-        if not (of_receivers > 0).all():
-            raise InputError(f"{place}: some receivers have no positive frequency_hz; give the carrier of each in Hz")
     if carriers is None:
         return
     if record.frequencies_hz is not None or task_of(record).is_complex:

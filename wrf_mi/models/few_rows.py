@@ -21,22 +21,12 @@ from numpy.typing import NDArray
 from ..core import Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
+from ..core.array_files import under
 from ..core.types import IntArray
 from ..datasets.observations import FEW_ROWS, rows_received
 from ..tasks import TASKS
 from .interpolation.kriging import Trend
-from .model import (
-    Arrays,
-    Decomposition,
-    Fitted,
-    Inputs,
-    Model,
-    Problem,
-    Session,
-    field_arrays,
-    from_field_arrays,
-    under,
-)
+from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, field_arrays, from_field_arrays
 
 FEW = "few/"  # prefix of the arrays of receivers with few rows
 BETWEEN_DB = 4.0  # standard deviation between receivers where fewer than two show it: antennas and their mounting

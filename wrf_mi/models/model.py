@@ -277,16 +277,6 @@ def slices(count: int, size: int) -> list[slice]:
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
-def keyed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Arrays with a prefix before their names."""
-    return {f"{prefix}{name}": values for name, values in arrays.items()}
-
-
-def under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Arrays whose names have a prefix, without it: the inverse of `keyed`."""
-    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
-
-
 def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
     named = ((field.name, getattr(value, field.name)) for field in fields(value))

@@ -159,13 +159,16 @@ def _graph_problem(problem: Problem) -> Problem:
     settings: TracingSettings = problem.settings
     assert settings.calibration is not None
     options = settings.options
-    if options.diffraction or options.scattering:
-        raise InputError("calibration: diffraction and scattering have no derivative here; trace without them")
-    if not options.line_of_sight or options.seed != TraceOptions().seed:
-        what = f"seed={options.seed}" if options.line_of_sight else "paths without line-of-sight"
-        raise InputError(f"calibration: {what} cannot be chosen there; omit it")
-    if options.phase_error:
-        raise InputError(f"calibration: phase_error={options.phase_error:g} belongs to a trace; omit it")
+    sampled = options.diffraction or options.scattering
+    refusals = (
+        (sampled, "diffraction and scattering have no derivative here; trace without them"),
+        (not options.line_of_sight, "paths without line-of-sight cannot be chosen there; omit it"),
+        (options.seed != TraceOptions().seed, f"seed={options.seed} cannot be chosen there; omit it"),
+        (options.phase_error, f"phase_error={options.phase_error:g} belongs to a trace; omit it"),
+    )
+    for is_stated, text in refusals:
+        if is_stated:
+            raise InputError(f"calibration: {text}")
     reflections = options.depth if options.reflections is None else options.reflections
     stated = [
         f"seed={problem.seed}",
@@ -223,6 +226,28 @@ def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | Non
     return tracer.trace(part[0], first_row=part[1], carriers_hz=part[2])
 
 
+def _trace_of_fit(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
+    """Stored paths of all rows, else new ones, which are stored (Interrupted: stopped after them)."""
+    path = session.run / PATHS
+    traced = _stored_trace(path, problem.record) if path.exists() else None
+    if traced is None or len(traced.receivers) < len(problem.record.receivers):  # of a fold that left some out
+        traced = _trace(tracer, problem, session)
+        warn_of_cross_polarization(traced, tracer.scene)
+        save_trace(path, traced)
+        if session.stop():
+            raise session.interrupted("after tracing")
+    return traced
+
+
+def _idle_by_target(settings: TracingSettings) -> dict[str, str]:
+    """Changed settings that a target error replaces, or that need one, with the reason."""
+    reasons = dict.fromkeys(("depth", "rays"), "target_error_db chooses it")
+    if settings.target_error_db is None:
+        reasons = {"target_kinds": "target_error_db is not set"}
+    default = TracingSettings()
+    return {name: why for name, why in reasons.items() if getattr(settings, name) != getattr(default, name)}
+
+
 def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
     """Refuse a phase error that has no effect, and warn of other settings that have none."""
     settings, record = problem.settings, problem.record
@@ -234,14 +259,9 @@ def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
     # The seed is also that of the split, which draws rows unless all official ones are used.
     if record.official is None or any(set(split.all_train) != set(record.official[0]) for split in splits):
         idle.pop("seed", None)
-    default = TracingSettings()
-    if settings.target_error_db is None:
-        target = {"target_kinds": "target_error_db is not set"}
-    else:
-        target = {name: "target_error_db chooses it" for name in ("depth", "rays")}
+    if settings.target_error_db is not None:
         idle.pop("scattering_coefficient", None)
-    idle |= {name: why for name, why in target.items() if getattr(settings, name) != getattr(default, name)}
-    for name, reason in idle.items():
+    for name, reason in (idle | _idle_by_target(settings)).items():
         logger.warning("%s=%s has no effect: %s", name, getattr(settings, name), reason)
 
 
@@ -268,13 +288,7 @@ class RayTracing(Model):
         assert problem.scene is not None
         settings: TracingSettings = problem.settings
         tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
-        traced = _stored_trace(path, record) if path.exists() else None
-        if traced is None or len(traced.receivers) < len(record.receivers):  # of a fold that left some out
-            traced = _trace(tracer, problem, session)
-            warn_of_cross_polarization(traced, tracer.scene)
-            save_trace(path, traced)
-            if session.stop():
-                raise session.interrupted("after tracing")
+        traced = _trace_of_fit(tracer, problem, session)
         seconds = time.perf_counter() - start
         facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
         arrays = {name: np.asarray(value) for name, value in facts.items()}

@@ -65,8 +65,7 @@ def place_of_receiver(
     lower = np.linalg.cholesky(shared)
     middle = places.mean(axis=0)
     middle[2] += MOUNTED_M[0]
-    loud = np.max(power)
-    mean = np.array([*middle, loud, EXPONENT[0]])
+    mean = np.array([*middle, np.max(power), EXPONENT[0]])
     deviation = np.array([extent_m, extent_m, MOUNTED_M[1], LOUD_DB, EXPONENT[1]])
     known = np.flatnonzero(np.isfinite(stated_m))
     middle[known] = mean[known] = stated_m[known]
@@ -89,13 +88,10 @@ def place_of_receiver(
     strongest = np.argsort(-power, kind="stable")[:STARTS]
     # Beside the row, not at it, where the law has no slope.
     starts = [middle, *np.where(np.isfinite(stated_m), stated_m, places[strongest] + [0.1, 0.1, MOUNTED_M[0]])]
-    noise_db = NOISE_DB
-    fits = []
+    noise_db, fits = NOISE_DB, []
     for place in starts:
-        away = np.sqrt(np.square(places - place).sum(axis=1) + LEAST_M**2)
-        level = float(np.mean(power + 10 * EXPONENT[0] * np.log10(away)))
-        first = np.array([*place, level, EXPONENT[0]])
-        fits.append(least_squares(residual, first, derivative, args=(noise_db,)))
+        level = float(np.mean(power + 10 * EXPONENT[0] * np.log10(distance(place))))
+        fits.append(least_squares(residual, np.array([*place, level, EXPONENT[0]]), derivative, args=(noise_db,)))
     best = min(fits, key=lambda fit: float(fit.cost))
     if len(places) > len(mean):
         # Once the law fits, its residuals state their deviation: few of them, no less than a third of the usual one.
@@ -103,8 +99,7 @@ def place_of_receiver(
         noise_db = max(float(np.sqrt(np.square(errors).sum() / (len(places) - len(mean)))), NOISE_DB / 3)
         best = least_squares(residual, best.x, derivative, args=(noise_db,))
     jacobian = derivative(best.x, noise_db)
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
-    std_m = np.sqrt(np.diag(covariance)[:3])
+    std_m = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))[:3])
     std_m[known] = 0.0
     return np.where(np.isfinite(stated_m), stated_m, best.x[:3]), std_m
 
@@ -131,9 +126,11 @@ def placed(record: Record, rows: IntArray) -> Record:
 
 def placed_problem(problem: Problem, rows: IntArray) -> Problem:
     """The problem of `placed` receivers; the problem itself where all are known."""
-    if all(receiver.is_surveyed for receiver in problem.record.receivers):
-        return problem  # a new problem would open its scene anew
-    record = placed(problem.record, rows)
+    return _with_record(problem, placed(problem.record, rows))
+
+
+def _with_record(problem: Problem, record: Record) -> Problem:
+    # A new problem would open its scene anew.
     return problem if record is problem.record else replace(problem, dataset=record, antennas=AS_STATED, left_out=())
 
 
@@ -158,21 +155,12 @@ def stored_places(folder: Path) -> dict[str, dict[str, list[float]]]:
 
 def stored_problem(problem: Problem, folder: Path) -> Problem:
     """The problem with the positions that a run in a folder has estimated."""
-    places = stored_places(folder)
-    if not places:
-        return problem
-    receivers = tuple(
-        replace(
-            receiver,
-            position_m=np.array(places[receiver.name]["position_m"]),
-            position_std_m=np.array(places[receiver.name]["std_m"]),
-        )
-        if receiver.name in places
-        else receiver
-        for receiver in problem.record.receivers
-    )
-    record = replace(problem.record, receivers=receivers)
-    return replace(problem, dataset=record, antennas=AS_STATED, left_out=())
+    receivers, places = list(problem.record.receivers), stored_places(folder)
+    for number, receiver in enumerate(receivers):
+        if place := places.get(receiver.name):
+            position_m, std_m = np.array(place["position_m"]), np.array(place["std_m"])
+            receivers[number] = replace(receiver, position_m=position_m, position_std_m=std_m)
+    return _with_record(problem, replace(problem.record, receivers=tuple(receivers)) if places else problem.record)
 
 
 def check_surveyed(record: Record) -> None:

@@ -147,10 +147,9 @@ class ArrayReceiver(PixelReceiver):
             weights = direction_weights(self.height, self.width, 1, _float_type(learned))
             # The integral over directions gives element signals, so that a learned spectrum has the array's lobes.
             sides[1] = self._steering.adjoint(weighted(learned, weights))
-        present = [side for side in sides if side is not None]
-        if self.how == "coherent" and present:
+        if self.how == "coherent" and any(sides):
             # The Bartlett sum is linear: one image of the sum in place of one of each side.
-            sides = [add(*present), None]
+            sides = [add(*filter(None, sides)), None]
         images = [None if side is None else self._steering.forward(side) for side in sides]
         spectrum = magnitude(images[0], images[1], self.how)
         return scaled(spectrum, self.height * self.width) if self.instrument_scale else spectrum

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Container
 from typing import Any, ClassVar, Literal
@@ -293,7 +294,7 @@ class Csi(Task):
             raise InputError(f"{source}: channel coefficients {list(shape)}; {text}")
         counts = [("", shape[-1], record.frequencies_hz, {1, shape[-1]})]
         if record.uplink is not None:
-            uplink, antennas = record.uplink.shape, shape[2] if len(shape) == 4 else 1
+            uplink, antennas = record.uplink.shape, math.prod(shape[2:-1])
             if len(uplink) != 3 or uplink[:2] != (shape[1], antennas):
                 text = f"a downlink of {shape[1]} rows and {antennas} antennas; give both for the same ones"
                 raise InputError(f"{source}: uplink {list(uplink)} beside {text}")

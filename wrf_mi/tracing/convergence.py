@@ -153,6 +153,17 @@ class _Search:
             calm = calm + 1 if change <= self.share_db else 0  # once may be chance: each number has other rays
         return replace(options, rays=rays), change
 
+    def kinds(self, options: TraceOptions, kinds: Sequence[str], error_db: float) -> tuple[TraceOptions, float]:
+        """Options with those further kinds of path that change more than a share, and the error with all others, dB."""
+        for kind in CHOSEN_KINDS:
+            if kind in kinds and not getattr(options, kind):
+                change_db = self.change(kind, True, options, self.share_db)
+                if change_db > self.share_db:
+                    options = replace(options, **{kind: True})
+                else:
+                    error_db += change_db
+        return options, error_db
+
 
 def choose_options(
     scene: Any,
@@ -184,12 +195,7 @@ def choose_options(
     now, error_db = search.rays(now)
     error_db += depth_db
     now = replace(now, diffraction=options.diffraction, scattering=options.scattering)
-    for kind in (kind for kind in CHOSEN_KINDS if kind in kinds and not getattr(options, kind)):
-        change_db = search.change(kind, True, now, search.share_db)
-        if change_db > search.share_db:
-            now = replace(now, **{kind: True})
-        else:
-            error_db += change_db
+    now, error_db = search.kinds(now, kinds, error_db)
     if now.sampled:
         # Paths that are drawn at random, or along edges, need more rays.
         now, change_db = search.rays(now, MOST_SAMPLED_RAYS)

@@ -11,6 +11,7 @@ import json
 import logging
 import re
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +63,10 @@ def write_deepmimo(path: str | Path, traced: TraceResult, replace: bool = False)
         InputError: no path, several carriers, or a folder as `check_deepmimo_folder` refuses it.
     """
     folder = check_deepmimo_folder(path, replace)
-    several = traced.carriers_hz is not None and len(np.unique(traced.carriers_hz)) > 1
-    if several or any(receiver.frequency_hz is not None for receiver in traced.receivers):
+    carriers_hz = {traced.frequency_hz} if traced.carriers_hz is None else set(traced.carriers_hz.tolist())
+    if len(carriers_hz) > 1 or any(map(attrgetter("frequency_hz"), traced.receivers)):
         raise InputError(f"{folder}: paths of several carriers; DeepMIMO has one, so trace the rows of each alone")
-    carrier_hz = traced.frequency_hz if traced.carriers_hz is None else float(traced.carriers_hz[0])
+    carrier_hz = carriers_hz.pop()
     paths = traced.paths.select(traced.paths.gain != 0)
     if not len(paths):
         raise InputError(f"{folder}: no path from {paths.n_tx} users to {paths.n_rx} base stations; nothing to write")

@@ -83,18 +83,18 @@ class TraceOptions(SpecularOptions):
 
     def __post_init__(self) -> None:
         """Check the settings; `InputError` for one that is out of range."""
-        if not 0 <= self.depth <= MAX_DEPTH:
-            raise InputError(f"depth {self.depth}: give 0 to {MAX_DEPTH}")
-        if self.reflections is not None and self.reflections < 0:
-            raise InputError(f"reflections {self.reflections}: give 0 or more")
-        if self.rays != "auto" and not (isinstance(self.rays, int) and 1 <= self.rays <= MAX_RAYS):
-            raise InputError(f'rays {self.rays}: give 1 to {MAX_RAYS}, or "auto"')
-        if self.seed < 0:
-            raise InputError(f"seed {self.seed}: give 0 or more")
-        if not 0 < self.scattering_coefficient <= 1:
-            raise InputError(f"scattering_coefficient {self.scattering_coefficient}: give a number in (0, 1]")
-        if not 0 <= self.phase_error < np.inf:
-            raise InputError(f"phase_error {self.phase_error}: give 0 or more, rad")
+        is_auto, is_number = self.rays == "auto", isinstance(self.rays, int)
+        ranges = {
+            "depth": (0 <= self.depth <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
+            "reflections": (self.reflections is None or self.reflections >= 0, "0 or more"),
+            "rays": (is_auto or (is_number and 1 <= int(self.rays) <= MAX_RAYS), f'1 to {MAX_RAYS}, or "auto"'),
+            "seed": (self.seed >= 0, "0 or more"),
+            "scattering_coefficient": (0 < self.scattering_coefficient <= 1, "a number in (0, 1]"),
+            "phase_error": (0 <= self.phase_error < np.inf, "0 or more, rad"),
+        }
+        for name, (valid, text) in ranges.items():
+            if not valid:
+                raise InputError(f"{name} {getattr(self, name)}: give {text}")
 
     @property
     def most_reflections(self) -> int:
@@ -130,20 +130,19 @@ def stated_kinds(text: str) -> dict[str, bool]:
 
 def without_effect(options: TraceOptions) -> dict[str, str]:
     """Names of settings that differ from their defaults and change no path, with the reason."""
-    reflects = options.most_reflections > 0
-    interacts = options.reflection or any(getattr(options, kind) for kind in FURTHER)
-    by_rays, needs_rays = reflects or options.sampled, "no reflection, diffraction or scattering is traced"
+    interacts = any(getattr(options, kind) for kind in ("reflection", *FURTHER))
+    without_rays = not max(options.most_reflections, options.sampled)
+    needs_rays = without_rays, "no reflection, diffraction or scattering is traced"
+    most, limit = (options.depth, f"depth is {options.depth}") if options.reflection else (0, "no reflection is traced")
     reasons = {
         # A depth of 0 says what such paths have.
         "depth": (options.depth > 0 and not interacts, "no path has an interaction"),
-        "reflections": (bool(options.reflections) and not options.reflection, "no reflection is traced"),
-        "rays": (not by_rays, needs_rays),
-        "seed": (not by_rays, needs_rays),
-        **{kind: (options.depth == 0, "depth is 0") for kind in FURTHER},
+        "reflections": ((options.reflections or 0) > most, limit),
+        "rays": needs_rays,
+        "seed": needs_rays,
+        **dict.fromkeys(FURTHER, (options.depth == 0, "depth is 0")),
         "scattering_coefficient": (not options.scattering, "no scattering is traced"),
-        "phase_error": (not by_rays, needs_rays),
+        "phase_error": needs_rays,
     }
-    if options.reflections is not None and options.reflection and options.reflections > options.depth:
-        reasons["reflections"] = True, f"depth is {options.depth}"
-    changed = {field.name for field in fields(options) if getattr(options, field.name) != getattr(DEFAULTS, field.name)}
-    return {name: reason for name, (idle, reason) in reasons.items() if idle and name in changed}
+    idle = {name: reason for name, (is_idle, reason) in reasons.items() if is_idle}
+    return {name: reason for name, reason in idle.items() if getattr(options, name) != getattr(DEFAULTS, name)}

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError
-from ..core.array_files import stored_arrays, write_arrays
+from ..core.array_files import stored_arrays, under, write_arrays
 from ..core.files import append_line, readable, write_atomically
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def _check_state(path: Path, arrays: Mapping[str, NDArray[Any]], lead: str) -> N
     shapes = {}
     for group in GROUPS:
         start = f"{lead}{group}/"
-        of_group = {key.removeprefix(start): values for key, values in arrays.items() if key.startswith(start)}
+        of_group = under(start, arrays)
         shapes[group] = {name: values.shape for name, values in of_group.items()}
         # The backend ends the process on arrays of other types and shapes than it was recorded with.
         for name, values in of_group.items():

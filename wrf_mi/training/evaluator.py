@@ -187,10 +187,7 @@ class TracedReports(_InBatches):
         return max(TOGETHER, TRACED_NUMBERS // numbers)
 
     def _evaluated(self, request: Request) -> Any:
-        """Paths alone where no Gaussian has a weight."""
-        port, side, weight = request.port, request.side, request.weight
-        learned = self.graph.field is not None and request.alone != "traced"
-        learned &= side is None or weight is None or bool(np.any(weight))
+        port, side, learned = request.port, request.side, self._evaluates_field(request)
         if side is not None and len(side) == 1 and self._may_record(1):
             return self._of_one(request, side, learned)
         # Numbers of paths differ from batch to batch, and a recording serves one: only the Gaussians' signal, which
@@ -203,6 +200,12 @@ class TracedReports(_InBatches):
             signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
         report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
         return self._not_recorded(report, request, signal=signal)
+
+    def _evaluates_field(self, request: Request) -> bool:
+        """Whether Gaussians are evaluated beside paths: not where none has a weight."""
+        if self.graph.field is None or request.alone == "traced":
+            return False
+        return request.side is None or request.weight is None or bool(np.any(request.weight))
 
     def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
         """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""

@@ -26,7 +26,7 @@ from ..tasks import task_of
 from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
 from .adam import Schedule, density_rounds, plan
-from .config import PATHS_ALONE, TrainConfig
+from .config import PATHS_ALONE, NetworkConfig, TrainConfig
 from .selection import hold_out_groups
 
 BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
@@ -57,20 +57,24 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
         raise InputError(f"model {model!r} cannot be trained here; choose from {', '.join(FIELDS)}")
     if not e.tx_scale_m:
         raise InputError("setting encoding.tx_scale_m: 0 is resolved by the training transmitters; give metres")
-    plus = model == "wrf-gs+"
-    if n.static_geometry and not plus:
+    if n.static_geometry and model != "wrf-gs+":
         raise InputError(f"setting network.static_geometry: {model} always moves signals alone; omit it")
     if n.terms and model != "factorised":
         raise InputError(f"setting network.terms: {model} has none; omit it")
-    sizes: dict[str, Any] = {name: getattr(n, name) for name in ("width", "layers", "terms") if getattr(n, name)}
-    if model == "wrf-gs" and n.width:
-        sizes["signal_widths"] = (n.width, max(1, n.width // 2))
-    if plus:
-        sizes["static_geometry"] = n.static_geometry
-        sizes |= {"skip": n.layers // 2} if n.layers else {}
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
-    field: Field = FIELDS[model](encoding=encoding, components=components, **sizes)
+    field: Field = FIELDS[model](encoding=encoding, components=components, **_sizes(model, n))
     return field
+
+
+def _sizes(model: str, network: NetworkConfig) -> dict[str, Any]:
+    stated = {name: getattr(network, name) for name in ("width", "layers", "terms")}
+    sizes: dict[str, Any] = {name: size for name, size in stated.items() if size}
+    if model == "wrf-gs" and network.width:
+        sizes["signal_widths"] = (network.width, max(1, network.width // 2))
+    if model == "wrf-gs+":
+        sizes["static_geometry"] = network.static_geometry
+        sizes |= {"skip": network.layers // 2} if network.layers else {}
+    return sizes
 
 
 def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
@@ -87,10 +91,10 @@ def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source
     if field is None:
         return
     # The backend ends the process on other shapes.
-    count = params["position"].shape[1] if "position" in params else 0
+    count = params.get("position", np.zeros((3, 0))).shape[1]
     for name, shape in _shapes(field).items():
         wanted = (shape[0], count) if name in field.per_gaussian else shape
-        shape_in_file = params[name].shape if name in params else "none"
+        shape_in_file = getattr(params.get(name), "shape", "none")
         if shape_in_file != wanted or not count:
             text = f"parameter {name} of shape {shape_in_file}, where the settings need {wanted}"
             raise InputError(f"{source}: {text}; train the run anew")
@@ -102,19 +106,18 @@ def check_memory(config: TrainConfig, field: Field) -> None:
     # Of the largest field that density control may grow, so that no fit ends in its middle.
     count = max(config.initial.gaussians, density.max_gaussians if density.every else 0)
     sizes = _shapes(field)
-    neurons = sum(shape[0] for name, shape in sizes.items() if name.endswith(".bias"))
+    widths = [shape[0] for name, shape in sizes.items() if name.endswith(".bias")]
     numbers = sum(sizes[name][0] for name in field.per_gaussian)
-    widest = max((shape[0] for name, shape in sizes.items() if name.endswith(".bias")), default=numbers)
     grown = count > config.initial.gaussians
     what = f"setting {'density.max_gaussians' if grown else 'initial.gaussians'}={count} with batch={config.batch}: "
     remedy = "lower one of them, or network.width"
     pairs = count * config.batch
     # The widest layer has its width of numbers for every pair; Dr.Jit's indices of 32 bits would wrap around unnoticed.
-    if pairs * widest > MOST_NUMBERS:
+    if pairs * max(widths, default=numbers) > MOST_NUMBERS:
         raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
     # `require_memory` knows the machine's memory, not that of a GPU.
     if not (mi.variant() or "").startswith("cuda"):
-        step = pairs * (BYTES_PER_NEURON * neurons + BYTES_PER_PAIR)
+        step = pairs * (BYTES_PER_NEURON * sum(widths) + BYTES_PER_PAIR)
         require_memory(step + BYTES_PER_NUMBER * count * numbers, f"{what}a training step", remedy)
 
 
@@ -211,21 +214,29 @@ def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
     return single.view(np.float32).reshape(*single.shape, 2)
 
 
-def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
-    """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
+def _receiver_of(record: Record, config: TrainConfig, with_scene: bool) -> str:
+    """Name of the receiver model that reports a record (InputError: none, or one that it does not suit)."""
     task = task_of(record)
     default = task.receiver_with_scene if with_scene else task.receiver
     if not default:
         raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
     name = default if config.receiver == AUTO else config.receiver
     receiver_kind(name, task.name)
+    arrays = task.is_complex and record.observation.ndim > 3
+    if with_scene and arrays and any(receiver.array_m is None for receiver in record.receivers):
+        raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
+    return name
+
+
+def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
+    """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
+    task, name = task_of(record), _receiver_of(record, config, with_scene)
     height, width = map(int, record.observation.shape[-2:] if task.image else (config.view.height, config.view.columns))
-    basis = _basis(targets, rows, config.view.components) if task.is_complex else None
-    outputs = tuple(map(int, record.observation.shape[2:])) if task.is_complex else ()
+    basis, outputs = None, tuple[int, ...]()
+    if task.is_complex:
+        basis, outputs = _basis(targets, rows, config.view.components), tuple(map(int, record.observation.shape[2:]))
     features = 0 if record.uplink is None or with_scene else len(targets.condition)
     headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
-    if len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers) and with_scene:
-        raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
     # The tracer finds no path through many walls; what was measured there is the weakest of all.
     floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
     size, carriers_hz = (height, width), targets.carriers_hz
@@ -291,12 +302,11 @@ class FitPlan:
         self.stages = self._stage_names()
         # What corrects paths is chosen also on rows far from the training rows: near them, Gaussians that interpolate
         # always gain, whatever they do elsewhere.
-        wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0
-        wanted &= config.holdout_steps_fraction > 0
+        wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0 < config.holdout_steps_fraction
         self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted else split
         self.in_groups = wanted and (self.choosing is not split or self.graph.corrects)
-        self.unjudged = self.in_groups and self.choosing is split
         # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
+        self.unjudged = self.in_groups and self.choosing is split
         self.schedule = self._planned()
         # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
@@ -329,15 +339,20 @@ class FitPlan:
         everything, train = ([targets.received(port, rows) for port in ports] for rows in parts)
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
-        alone, end = config.traced.alone, config.holdout_steps_fraction
-        # Each stage but the last has an equal share of the steps.
-        first = tuple(round(k * alone * config.steps) for k in range(1, len(self.stages)))
-        if first and config.patience and 0 < end * config.steps <= first[-1]:
-            share = f"{alone} of the steps" + (", twice," if len(first) > 1 else "")
-            text = f"{share} are not less than holdout_steps_fraction, {end}"
+        ends = self._stage_ends()
+        density = density_rounds(config.density, config.steps, max(ends, default=0))
+        return plan(config, train, everything, np.random.default_rng([config.seed, 1]), density, ends)
+
+    def _stage_ends(self) -> tuple[int, ...]:
+        """Steps after which stages end, but the last: each has an equal share (InputError: beyond the hold-out)."""
+        config = self.config
+        alone, holdout = config.traced.alone, config.holdout_steps_fraction
+        ends = tuple(round(k * alone * config.steps) for k in range(1, len(self.stages)))
+        if ends and config.patience and 0 < holdout * config.steps <= ends[-1]:
+            share = f"{alone} of the steps" + (", twice," if len(ends) > 1 else "")
+            text = f"{share} are not less than holdout_steps_fraction, {holdout}"
             raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
-        density = density_rounds(config.density, config.steps, first[-1] if first else 0)
-        return plan(config, train, everything, np.random.default_rng([config.seed, 1]), density, first)
+        return ends
 
     def ports(self, receiver: int) -> range:
         """Ports of a receiver."""

@@ -7,6 +7,7 @@ that power. A mesh alone gives the surfaces that can scatter.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -150,6 +151,18 @@ def initial_gaussians(
     return replace(start, opacity=config.opacity, signal=config.signal)
 
 
+def _gains(
+    plan: FitPlan, sides: Sequence[TracedField | None], values: Mapping[str, NDArray[np.float32]]
+) -> dict[str, NDArray[np.float32]]:
+    graph, gains = plan.graph, defaultdict[str, list[NDArray[np.float32]]](list)
+    for port, side in enumerate(sides):
+        if side is not None and side.gain_name in values and len(side):
+            observed = plan.targets.truth[port // graph.carriers, plan.known[port]]
+            # Ports of several carriers share the receiver's gain, which starts at their mean.
+            gains[side.gain_name].append(graph.match_gain(port, side, observed))
+    return {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
+
+
 def starting_values(
     plan: FitPlan, sides: Sequence[TracedField | None], places: Sequence[Place], initial: InitialGaussians | None
 ) -> dict[str, NDArray[np.float32]]:
@@ -157,7 +170,7 @@ def starting_values(
 
     ``sides`` and ``places`` are those of the ports; ``initial`` replaces the Gaussians of the settings.
     """
-    graph, config, targets = plan.graph, plan.config, plan.targets
+    graph, config = plan.graph, plan.config
     rng = np.random.default_rng([config.seed, 0])
     values: dict[str, NDArray[np.float32]] = {}
     if graph.field is not None:
@@ -165,13 +178,7 @@ def starting_values(
         start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
         values = graph.field.init(start, rng)
     values |= graph.parameters(sides) | graph.cover(sides)
-    gains: dict[str, list[NDArray[np.float32]]] = {}
-    for port, side in enumerate(sides):
-        if side is not None and side.gain_name in values and len(side):
-            observed = targets.truth[port // graph.carriers, plan.known[port]]
-            # Ports of several carriers share the receiver's gain, which starts at their mean.
-            gains.setdefault(side.gain_name, []).append(graph.match_gain(port, side, observed))
-    values |= {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
+    values |= _gains(plan, sides, values)
     if LEVEL in values:
         # A receiver has one level for all of its carriers: that of the first.
         ports = [plan.ports(receiver)[0] for receiver in range(len(plan.record.receivers))]

@@ -15,6 +15,7 @@ from drjit.opt import Adam
 from numpy.typing import NDArray
 
 from ..backend.device import to_float, to_tensor
+from ..core.array_files import keyed, under
 from ..gaussians.initial import DensityChange
 from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
@@ -130,30 +131,28 @@ class FitState:
     def arrays(self) -> Arrays:
         """All arrays, for a checkpoint."""
         best = {"best_score": np.asarray(self.best_score), "waited": np.asarray(self.waited)}
-        return self._now() | best | {f"best/{name}": values for name, values in (self.best or {}).items()}
+        return self._now() | best | keyed("best/", self.best or {})
 
     def _now(self) -> Arrays:
         """All arrays without the best state."""
         first, second, count = self.moments()
         groups = {"param": self.params(), "mean": self.mean_params(), "first": first, "second": second}
-        flat = {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
+        flat: Arrays = {}
+        for group, arrays in groups.items():
+            flat |= keyed(f"{group}/", arrays)
         attributes = {name: np.array(getattr(self, name)) for name in KEPT}
         return flat | attributes | {"adam_step": np.asarray(count)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], momentum: float = 0.9) -> FitState:
         """State from the arrays of a checkpoint, with Adam's decay of the first moment."""
-
-        def group(prefix: str) -> Arrays:
-            return {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
-
-        state = cls(group("param/"), momentum)
-        state.mean = {name: to_tensor(values) for name, values in group("mean/").items()}
-        state._set_moments(group("first/"), group("second/"), int(arrays["adam_step"]))
+        state = cls(under("param/", arrays), momentum)
+        state.mean = {name: to_tensor(values) for name, values in under("mean/", arrays).items()}
+        state._set_moments(under("first/", arrays), under("second/", arrays), int(arrays["adam_step"]))
         for name in KEPT:
             setattr(state, name, np.array(arrays[name]) if np.ndim(arrays[name]) else arrays[name].item())
         state.view_gradient_norm = to_float(arrays["view_gradient_norm"])
-        state.best = group("best/") or None
+        state.best = under("best/", arrays) or None
         state.best_score, state.waited = float(arrays["best_score"]), int(arrays.get("waited", 0))
         return state
 
@@ -179,6 +178,7 @@ class TrainingLoop(ABC):
     schedule: Schedule  # rows and learning rates of each step
     state: FitState  # state between two steps
     seconds: float = 0.0  # training time so far, resumed runs included
+    _origin_s: float  # reading of the clock at which ``seconds`` would have been 0
     label: str  # name of the validation score
     higher_is_better: bool  # direction of the validation score
 
@@ -219,48 +219,70 @@ class TrainingLoop(ABC):
                 unchanged; or parameters or moments are not finite, found before a score or checkpoint.
         """
         self.begin()
-        config, state, schedule = self.config, self.state, self.schedule
-        start, before = time.perf_counter(), self.seconds
-        losses, trouble = dr.zeros(mi.Float), NonFiniteReport.none(state.adam)
-        logged = steps = 0  # steps since the last line of the log, and in this sitting
-        while state.step < config.steps and not (steps and stop()):
-            loss, trouble = self.take_step(trouble)
-            # Summed on the device: a loss that is read waits for its step, and the next one could not be queued.
-            losses += loss
-            dr.eval(losses)
-            state = self.state
-            state.step, logged, steps = state.step + 1, logged + 1, steps + 1
-            if trouble.step[0]:  # one number, but reading it waits for the step
-                self._require_finite(trouble)
-            self.seconds = before + time.perf_counter() - start
-            last = state.step == config.steps
-            if state.step in schedule.density:
-                self.adapt()
-            # No state of the first stage is chosen before its end: paths converge within it, and a score costs a
-            # prediction of all held-out rows.
-            judged = state.step >= min(schedule.stages, default=0)
-            choosing = config.patience > 0 and judged and state.step <= schedule.joined and not state.chosen
-            scored = (state.step % config.validate_every == 0 and judged) or last
-            # The last state of a stage counts, too, wherever its end falls between two scores.
-            scored = scored or (choosing and state.step in (*schedule.stages, schedule.joined))
-            if state.step % config.log_every == 0 or scored:
-                self._require_finite(trouble)
-                score = self.validate() if scored else None
-                self.seconds = before + time.perf_counter() - start
-                left = (self.seconds - before) / steps * (config.steps - state.step)
-                of_state = state.step <= schedule.joined, state.gaussians
-                on_progress(Progress(state.step, self.seconds, losses[0] / logged, score, *of_state, left, self.label))
-                losses, logged = dr.zeros(mi.Float), 0
-                if score is not None and choosing and self.choose(score):
-                    state, schedule = self.state, self.schedule
-            if state.step % config.checkpoint_every == 0 and not last:
-                self._require_finite(trouble)
-                save()
+        self._origin_s = time.perf_counter() - self.seconds
+        trouble = self._sitting(on_progress, save, stop)
         dr.sync_thread()
-        self.seconds = before + time.perf_counter() - start
+        self.seconds = time.perf_counter() - self._origin_s
         self._require_finite(trouble)
         save()
-        return state.step == config.steps
+        return self.state.step == self.config.steps
+
+    def _sitting(
+        self, on_progress: Callable[[Progress], None], save: Callable[[], None], stop: Callable[[], bool]
+    ) -> NonFiniteReport:
+        """Steps to the last or until stopped (`run`); returns the report after them."""
+        config, before_s, trouble = self.config, self.seconds, NonFiniteReport.none(self.state.adam)
+        losses, logged, steps = dr.zeros(mi.Float), 0, 0  # steps since the last line of the log, and in this sitting
+        while self.state.step < config.steps:
+            losses, trouble = self._next(losses, trouble)
+            logged, steps, last = logged + 1, steps + 1, self.state.step == config.steps
+            self.seconds = time.perf_counter() - self._origin_s
+            scored, choosing = self._due()
+            if scored or self.state.step % config.log_every == 0:
+                self._require_finite(trouble)
+                progress = self._progress(losses[0] / logged, steps, before_s, scored)
+                on_progress(progress)
+                losses, logged = dr.zeros(mi.Float), 0
+                if choosing and progress.validation_score is not None:
+                    self.choose(progress.validation_score)
+            if self.state.step % config.checkpoint_every == 0 and not last:
+                self._require_finite(trouble)
+                save()
+            if stop():
+                break
+        return trouble
+
+    def _next(self, losses: Any, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+        """Take a step, and a round of density control where one is due; returns the sum of losses and the report."""
+        loss, trouble = self.take_step(trouble)
+        # Summed on the device: a loss that is read waits for its step, and the next one could not be queued.
+        losses += loss
+        dr.eval(losses)
+        self.state.step += 1
+        if trouble.step[0]:  # one number, but reading it waits for the step
+            self._require_finite(trouble)
+        if self.state.step in self.schedule.density:
+            self.adapt()
+        return losses, trouble
+
+    def _due(self) -> tuple[bool, bool]:
+        """Whether the state is scored at this step, and whether its score may choose it."""
+        step, stages, joined = self.state.step, self.schedule.stages, self.schedule.joined
+        # No state of the first stage is chosen before its end: paths converge within it, and a score costs a prediction
+        # of all held-out rows.
+        judged = step >= min(stages, default=0)
+        choosing = self.config.patience > 0 and judged and step <= joined and not self.state.chosen
+        # The last state of a stage counts, too, wherever its end falls between two scores.
+        at_end = step == self.config.steps or (choosing and step in (*stages, joined))
+        return at_end or (judged and step % self.config.validate_every == 0), choosing
+
+    def _progress(self, loss: float, steps: int, before_s: float, scored: bool) -> Progress:
+        """Progress with the mean loss since the last line, after so many steps in a sitting that began at a time."""
+        state, score = self.state, self.validate() if scored else None
+        self.seconds = time.perf_counter() - self._origin_s
+        left_s = (self.seconds - before_s) / steps * (self.config.steps - state.step)
+        of_state = state.step <= self.schedule.joined, state.gaussians
+        return Progress(state.step, self.seconds, loss, score, *of_state, left_s, self.label)
 
     def choose(self, score: float) -> bool:
         """Keep the best state; without improvement for ``patience`` scores go on from it. True: the fit went back."""

@@ -31,6 +31,17 @@ from .evaluator import OperatorReports, Request, evaluator_of
 SEARCHED = 512  # transmitters of a carrier whose paths are searched together: a search has a fixed cost
 
 
+def _checked_positions(tx_pos_m: ArrayLike) -> FloatArray:
+    positions = np.asarray(tx_pos_m, float)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
+    # Finite in single precision, in which they are evaluated.
+    bad = np.flatnonzero(~np.isfinite(positions.astype(np.float32)).all(axis=1))
+    if len(bad):
+        raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
+    return positions
+
+
 class Predictor:
     """Predicts the observations of transmitters at any receiver of a graph.
 
@@ -123,18 +134,8 @@ class Predictor:
         """
         index, form = receiver_index(self.receivers, receiver), self.graph.form
         if form.features:
-            # Antennas of an uplink are independent inputs, without positions and paths.
-            features, divisor = normalised_uplink(uplink)
-            reports = self._reported(np.asarray(features, float), index).reshape(*divisor.shape, -1)
-            channels = reports * divisor[..., None]
-            return (channels if len(form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
-        positions = np.asarray(tx_pos_m, float)
-        if positions.ndim != 2 or positions.shape[1] != 3:
-            raise InputError(f"transmitter positions: expected shape [m, 3], got {list(positions.shape)}")
-        # Finite in single precision, in which they are evaluated.
-        bad = np.flatnonzero(~np.isfinite(positions.astype(np.float32)).all(axis=1))
-        if len(bad):
-            raise InputError(f"transmitter positions, row {bad[0] + 1}: not a finite number")
+            return self._from_uplink(uplink, index)
+        positions = _checked_positions(tx_pos_m)
         headings = known_headings(tx_heading_rad, len(positions), form.headings)
         self.graph.check(positions)
         if form.carriers_hz is not None and carriers_hz is None:
@@ -149,6 +150,13 @@ class Predictor:
         # Groups come in the order of the search, which brings equal positions together.
         order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
         return reports[np.argsort(order)]
+
+    def _from_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
+        # Antennas of an uplink are independent inputs, without positions and paths.
+        features, divisor = normalised_uplink(uplink)
+        reports = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1)
+        channels = reports * divisor[..., None]
+        return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
         """Predictions [m, ...] for rows of a record at one receiver (`__call__`)."""

@@ -130,20 +130,24 @@ def hold_out(record: Record, split: Split) -> Split | None:
     """
     if split.held_receivers:
         return _without_receivers(record, split)
-    rows, positions = split.all_train, record.tx_pos_m[split.all_train]
-    if len(rows) < 3 or len(np.unique(positions, axis=0)) < 2:
+    rows = split.all_train
+    if len(rows) < 3 or len(np.unique(record.tx_pos_m[rows], axis=0)) < 2:
         return None
     carriers = record.carriers_hz
     if carriers is not None and len(split.test) and not np.isin(carriers[split.test], carriers[rows]).any():
         return _without_carrier(record.tx_pos_m, carriers, split)
-    groups = hold_out_groups(split, record.tx_pos_m)
-    out = groups.validation
-    if groups is split or len(out) < 2:
-        # Where rows are sparsest, as far from the others as rows to be predicted may be.
-        distance, _ = cKDTree(positions).query(positions, k=2)
-        out = np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
+    out = _clusters_or_farthest(split, record.tx_pos_m)
     fold = _fold(split, out, out)
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
+
+
+def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
+    groups, rows = hold_out_groups(split, tx_pos_m), split.all_train
+    if groups is not split and len(groups.validation) >= 2:
+        return groups.validation
+    # Where rows are sparsest, as far from the others as rows to be predicted may be.
+    distance, _ = cKDTree(tx_pos_m[rows]).query(tx_pos_m[rows], k=2)
+    return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
 
 
 def _fold(split: Split, gone: IntArray, test: IntArray) -> Split:

@@ -137,22 +137,25 @@ class Steps:
         graph, params = plan.graph, dict(state.adam.items())
         if side is not None and side.refresh(params):
             state.searched_m[port] = side.searched_at_m
-        stage = plan.stages[schedule.stage(state.chosen - 1 if state.chosen else state.step)]
-        # Gaussians of the field are evaluated in their stage alone, and no more once a reach of 0 is chosen.
-        learned = side is None or (stage == FIELD and not (state.chosen and state.reach_m == 0))
+        learned = side is None or self._in_field_stage(state, schedule)
         arrays = graph.arrays(port, side)
-        key = None if side is None and not arrays else (port, side and side.searches, learned, state.surface)
+        key = (None,) if side is None and not arrays else (port, side and side.searches, learned, state.surface)
         if key not in self.recorded:
             # Recordings of an earlier search hold its paths: they are dropped with them.
-            self.recorded = {k: v for k, v in self.recorded.items() if k is None or k[0] != port}
-            report = graph.report(port, side, learned, surface=state.surface)
-            read = None if key is None else partial(graph.arrays, port, side)
-            if read is not None:
+            self.recorded = {k: v for k, v in self.recorded.items() if k[0] != port}
+            report, read = graph.report(port, side, learned, surface=state.surface), None
+            if key != (None,):
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
                 first = plan.targets.condition[:, plan.targets.conditions(plan.known[port][:1])]
                 evaluated(report, params, first, self.places[port])
+                read = partial(graph.arrays, port, side)
             self.recorded[key] = self._recorded(report, self._rates(params), read)
         return self.recorded[key]
+
+    def _in_field_stage(self, state: FitState, schedule: Schedule) -> bool:
+        """Whether the field is evaluated beside paths: in its stage alone, and no more once a reach of 0 is chosen."""
+        stage = self._plan.stages[schedule.stage(state.chosen - 1 if state.chosen else state.step)]
+        return stage == FIELD and not (state.chosen and state.reach_m == 0)
 
     def _rates(self, names: Mapping[str, Any]) -> dict[str, float]:
         o, traced = self._plan.config.optimiser, self._plan.graph.traced

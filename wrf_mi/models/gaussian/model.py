@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...backend.device import release_memory
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split, receiver_arrays, stored_receivers
+from ...core.array_files import keyed, under
 from ...graph.graph import LEVEL, Graph
 from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
@@ -31,7 +32,7 @@ from ...training.initial import initial_gaussians
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
 from ...training.trainer import HeldOutReports, Trainer
-from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, keyed, under
+from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 
 Params = dict[str, NDArray[np.float32]]
 OF_RECEIVER = "receiver."  # prefix of the names of a receiver's parameters
@@ -61,22 +62,19 @@ def of_all_receivers(
     """
     if not new:
         return params, reach
-    trained = [number for number in range(len(receivers)) if number not in new]
-    of_all = dict(params)
+    trained, of_all = np.setdiff1d(np.arange(len(receivers)), new), dict(params)
     for kind in MEANS:
-        names = [f"{OF_RECEIVER}{receivers[number].name}.{kind}" for number in trained]
-        if values := [params[name] for name in names if name in params]:
-            mean = np.asarray(np.mean(values, axis=0, dtype=np.float32))
-            of_all |= {f"{OF_RECEIVER}{receivers[number].name}.{kind}": mean for number in new}
+        names = np.array([f"{OF_RECEIVER}{receiver.name}.{kind}" for receiver in receivers])
+        if values := [params[name] for name in names[trained] if name in params]:
+            of_all |= dict.fromkeys(names[[*new]].tolist(), np.asarray(np.mean(values, axis=0, dtype=np.float32)))
     if LEVEL in params:
         of_all[LEVEL] = np.full((1, len(receivers)), params[LEVEL].mean(), np.float32)
         of_all[LEVEL][:, trained] = params[LEVEL]
     if reach is None:
         return of_all, None
-    positions_m = [np.concatenate(reach.known_m)] * len(receivers)
-    for number, of_receiver in zip(trained, reach.known_m, strict=True):
-        positions_m[number] = of_receiver
-    return of_all, replace(reach, known_m=tuple(positions_m))
+    positions_m = dict.fromkeys(range(len(receivers)), np.concatenate(reach.known_m))
+    positions_m |= dict(zip(trained, reach.known_m, strict=True))
+    return of_all, replace(reach, known_m=tuple(positions_m.values()))
 
 
 logger = logging.getLogger(__name__)

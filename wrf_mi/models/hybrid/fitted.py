@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
+from ...core.array_files import keyed, under
 from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ...training.selection import RowDistance, rows_at_receiver
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
-from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, keyed, under
+from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
 from .scene_side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
@@ -174,8 +175,7 @@ class FittedHybrid(Fitted):
             totals[side, rows] += share[rows]
             if by_part.whole.std is not None:
                 size[rows] += _spread(share[rows], shape) * by_part.whole.std
-            if paths is None and by_part.paths is not None:
-                paths = by_part.paths.placed(rows, len(tx_pos_m))
+            paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
         if len(rows) and self.residuals is not None:
@@ -184,7 +184,7 @@ class FittedHybrid(Fitted):
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
-        if not (totals[0].any() and totals[1].any()):
+        if not totals.any(axis=1).all():
             return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
             learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))

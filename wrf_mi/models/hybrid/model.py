@@ -17,12 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from ...core import InputError, Prediction, Record, Split
+from ...core.array_files import under
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
 from ...training import by_distance
@@ -32,7 +33,7 @@ from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..few_rows import with_few_rows
 from ..held_out import fit_model, held_out_predictions, labelled
-from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions, under
+from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
 from .scene_side import FIELD, RESIDUAL, STAGES, InScene, Paths, SceneSide, StageReport, inside, stated_reports
 from .strengths import StrengthsInScene, TracedStrengths
@@ -72,22 +73,26 @@ def scene_side(record: Record) -> tuple[Model, Model]:
 
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
     """Entry and problem of each part that serves the data, the trusted one first (InputError: none does)."""
-    settings: HybridSettings = problem.settings
-    record, task, wanted = problem.record, task_of(problem.record), settings.wanted
     parts: dict[str, tuple[Model, Problem]] = {}
-    if record.uplink is not None:
-        names = (("r2f2-scene", True),) if problem.scene is not None else ()
-        for name, scene in (*names, *((name, False) for name in UPLINK_PARTS)):
-            _add(parts, name, problem, split, scene)
-    elif problem.scene is not None and task.receiver_with_scene and any(stage != RESIDUAL for stage in wanted):
-        _add(parts, PATHS, problem, split, True)
-    if problem.scene is None and settings.stages is not None and FIELD in wanted:
-        _add(parts, FIELD, problem, split, False)
-    if RESIDUAL in wanted or not parts:
+    for name, scene in _means(problem):
+        _add(parts, name, problem, split, scene)
+    if RESIDUAL in problem.settings.wanted or not parts:
         _add(parts, KRIGING, problem, split, False)
     if not parts:
-        raise InputError(f"{record.name}: no stage serves these data; choose another model")
+        raise InputError(f"{problem.record.name}: no stage serves these data; choose another model")
     return parts
+
+
+def _means(problem: Problem) -> list[tuple[str, bool]]:
+    """Names of the parts but for kriging, and whether they are given the scene."""
+    settings, with_scene, means = problem.settings, problem.scene is not None, list[tuple[str, bool]]()
+    if problem.record.uplink is not None:
+        means = [("r2f2-scene", True)] * with_scene + [(name, False) for name in UPLINK_PARTS]
+    elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} - {RESIDUAL}:
+        means = [(PATHS, True)]
+    if not with_scene and settings.stages is not None and FIELD in settings.wanted:
+        means.append((FIELD, False))
+    return means
 
 
 def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
@@ -140,29 +145,33 @@ class _Fit:
         for name in self.parts:
             self._judge(name)
         names = [*self.predictions] or [*self.parts]
-        form, sizes, intervals, scores = "alone", PREDICTED, None, dict[str, float]()
-        mixture = by_distance.constant(np.eye(len(names))[0])
-        if self.held_out is not None and len(self.held_out) and self.predictions:
-            form, mixture, scores = self._weights(self.held_out)
-            sizes, intervals = self._intervals(self.held_out, mixture)
+        mixture, intervals, chosen = self._mixture(len(names))
         used = _used(names, mixture)
         for name in set(self.parts) - set(used):
             shutil.rmtree(self.session.folder / FOLDER / name, ignore_errors=True)
         if KRIGING in names and len(names) > 1:
             # Strengths are kriged about the scene's in every case.
-            gained = self.task.in_decibel or KRIGING in used or RESIDUAL in used
+            gained = self.task.in_decibel or not {KRIGING, RESIDUAL}.isdisjoint(used)
             seconds = time.perf_counter() - self.begun - self.scene_seconds
-            self.reports.append(StageReport(RESIDUAL, gained, scores.get("hybrid"), seconds))
+            self.reports.append(StageReport(RESIDUAL, gained, chosen["held_out"].get("hybrid"), seconds))
         mixture = Mixture(mixture.distance_m, mixture.weights[:, [names.index(name) for name in used]])
         weights = [
             {"distance_m": float(distance), **dict(zip(used, map(float, row), strict=True))}
             for distance, row in zip(mixture.distance_m, mixture.weights, strict=True)
         ]
-        stated = {"stages": stated_reports(self.reports), "form": form, "sizes": sizes, "held_out": scores}
-        stated |= {"weights": weights}
+        stated = {"stages": stated_reports(self.reports), **chosen, "weights": weights}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
         return FittedHybrid(self.problem, self.problem.rows(self.split), parts, mixture, residuals, intervals, stated)
+
+    def _mixture(self, count: int) -> tuple[Mixture, Intervals | None, dict[str, Any]]:
+        """Weights of so many predictions, intervals, and how both were chosen; the first where no rows are held out."""
+        if self.held_out is None or not len(self.held_out) or not self.predictions:
+            chosen = {"form": "alone", "sizes": PREDICTED, "held_out": dict[str, float]()}
+            return by_distance.constant(np.eye(count)[0]), None, chosen
+        form, mixture, scores = self._weights(self.held_out)
+        sizes, intervals = self._intervals(self.held_out, mixture)
+        return mixture, intervals, {"form": form, "sizes": sizes, "held_out": scores}
 
     def _part(self, name: str) -> Fitted:
         if name not in self.fitted:
@@ -189,10 +198,14 @@ class _Fit:
             place = inside(self.session, FOLDER, name, "held")
             unseen = held_out_predictions(model, problem, self.fold, self.held_out, place, name)
         self.predictions[name] = unseen
+        if name == PATHS and self._kriges_residuals:
+            self._krige_residuals(self.fold, self.held_out)
+
+    @property
+    def _kriges_residuals(self) -> bool:
         # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
         one_carrier = self.record.carriers_hz is None
-        if name == PATHS and RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier:
-            self._krige_residuals(self.fold, self.held_out)
+        return RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier
 
     def _krige_residuals(self, fold: Split, held_out: HeldOut) -> None:
         """Residuals of the training rows, and predictions of held-out rows with those of the others.

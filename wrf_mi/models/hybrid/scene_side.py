@@ -111,25 +111,29 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
     if path.exists():
         return in_scene(problem, session.folder), [StageReport(**report) for report in json.loads(path.read_text())]
     reports: list[StageReport] = []
-    wanted = problem.settings.wanted
     # A correction changes materials, too: it contains the calibration.
-    if not {CALIBRATION, CORRECTED}.isdisjoint(wanted) and (split.held_receivers or not too_few(record, split)):
-        options = default_options(record)
-        if CORRECTED not in wanted:
-            options = replace(options, parts=tuple(part for part in options.parts if part not in OF_GEOMETRY))
-        assert problem.scene is not None
-        try:
-            correction = correct_scene(problem.scene, record, split, options, problem.material, session.report)
-        except InputError as error:
-            logger.warning("%s; the scene is used as it is stated", error)
-        else:
-            if correction.kept:
-                write_page(correction, session.folder / SCENE, replace=True)
-            reports = _reports(correction, task_of(record).higher_is_better)
-            del correction
-            release_memory()
+    wanted = not {CALIBRATION, CORRECTED}.isdisjoint(problem.settings.wanted)
+    if wanted and (split.held_receivers or not too_few(record, split)):
+        reports = _correct(problem, split, session)
+        release_memory()
     write_reports(session.folder, reports)
     return in_scene(problem, session.folder), reports
+
+
+def _correct(problem: Problem, split: Split, session: Session) -> list[StageReport]:
+    """Write the corrected scene where it gains; reports of its stages, none where it cannot be corrected."""
+    record, options = problem.record, default_options(problem.record)
+    if CORRECTED not in problem.settings.wanted:
+        options = replace(options, parts=tuple(part for part in options.parts if part not in OF_GEOMETRY))
+    assert problem.scene is not None
+    try:
+        correction = correct_scene(problem.scene, record, split, options, problem.material, session.report)
+    except InputError as error:
+        logger.warning("%s; the scene is used as it is stated", error)
+        return []
+    if correction.kept:
+        write_page(correction, session.folder / SCENE, replace=True)
+    return _reports(correction, task_of(record).higher_is_better)
 
 
 def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport]:
@@ -142,7 +146,7 @@ def _reports(correction: Correction, higher_is_better: bool) -> list[StageReport
         if judged:
             best = (max if higher_is_better else min)(judged.values())
             # What was not kept is reported by the best that it reached.
-            gains = bool(correction.kept) and (not geometry or of_geometry[correction.kept])
+            gains = bool(correction.kept) and of_geometry[correction.kept] >= geometry
             reports.append(StageReport(stage, gains, judged.get(correction.kept, best)))
     return [*reports[:-1], replace(reports[-1], seconds=correction.seconds)]
 
@@ -266,12 +270,16 @@ class Paths(InScene):
                     reports = [replace(report, kept=report.kept and report.stage == MEAN) for report in reports]
                     write_reports(session.folder, reports)
                     shutil.rmtree(session.folder / SCENE)
-        # A correction contains the calibration; parameters of paths are the graph's where it is not kept.
-        is_corrected = any(report.kept and report.stage != MEAN for report in reports)
-        reports = [report for report in reports if is_corrected or report.stage != CALIBRATION]
-        trained = [report for report in paths.stages if not (is_corrected and report.stage == CALIBRATION)]
-        paths.stages = tuple(sorted([*reports, *trained], key=lambda report: STAGES.index(report.stage)))
+        paths.stages = _joint_reports(reports, paths.stages)
         return paths
+
+
+def _joint_reports(of_scene: Sequence[StageReport], trained: Sequence[StageReport]) -> tuple[StageReport, ...]:
+    # A correction contains the calibration; parameters of paths are the graph's where it is not kept.
+    is_corrected = any(report.kept and report.stage != MEAN for report in of_scene)
+    first, calibrated = (of_scene, trained) if is_corrected else (trained, of_scene)
+    reports = [*first, *(report for report in calibrated if report.stage != CALIBRATION)]
+    return tuple(sorted(reports, key=lambda report: STAGES.index(report.stage)))
 
 
 def _held_out_score(paths: FittedPaths) -> float:

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
+from ...core.array_files import keyed, under
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, keyed, known_positions, under
+from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions
 
 # Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
 HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"

@@ -17,7 +17,8 @@ from scipy.spatial import KDTree
 
 from ...core import Prediction, Receiver
 from ...core.angles import FloatArray
-from ..model import Arrays, field_arrays, from_field_arrays, keyed, under
+from ...core.array_files import keyed, under
+from ..model import Arrays, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
 from .kriging import NEAREST_M, GenericKriging, UncertainKriged, kriged
 

@@ -30,13 +30,14 @@ from scipy.special import i0e, i1e
 
 from ...core import InputError, Prediction, Receiver
 from ...core.angles import FloatArray, pixel_directions
+from ...core.array_files import keyed
 from ...core.settings import Count
 from ...parallel.threads import one_blas_thread
 from ...receivers.array import Lags, array_response
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress
-from ..model import Arrays, field_arrays, from_field_arrays, keyed
+from ..model import Arrays, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
 from .kriging import GenericKriging, KrigingSettings, UncertainKriged, kriged
 from .kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight

@@ -148,16 +148,15 @@ def basis(
                 terms.append((wave(k * (bearing - poses.heading_rad)) * level, *(sd[3] / k)))
     for k in range(1, RX_HARMONICS + 1):
         terms += [(wave(k * bearing), 0, rx_sd_db / k) for wave in (np.cos, np.sin)]
-    columns: list[FloatArray] = []
-    deviations: list[float] = []
+    columns, deviations, count = list[FloatArray](), list[FloatArray](), len(receivers_m)
     for column, common, each in terms:
-        if common > 0:  # a deviation of 0 says that there is no such term
-            columns.append(column)
-            deviations.append(common)
-        if each > 0:
-            columns += [column if k == receiver else np.zeros(len(column)) for k in range(len(receivers_m))]
-            deviations += [each] * len(receivers_m)
-    return np.stack(columns, axis=1), np.array(deviations)
+        # The part common to all receivers, and that of each.
+        parts, deviation = np.zeros((1 + count, len(column))), np.array([common, *[each] * count])
+        parts[[0, 1 + receiver]] = column
+        columns.append(parts[deviation > 0])  # a deviation of 0 says that there is no such term
+        deviations.append(deviation[deviation > 0])
+    # Row by row in memory, by which products of matrices round.
+    return np.ascontiguousarray(np.concatenate(columns).T), np.concatenate(deviations)
 
 
 @dataclass(frozen=True)
@@ -205,19 +204,10 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     Fading that persists while the transmitter stands is common to them: a hundred reports of one stop say little more
     of the position than ten, and less than those of a second visit.
     """
-    position, heading, rows = measured.poses.position_m, measured.poses.heading_rad, measured.rows
-    value_dbm = measured.value_dbm
+    position, heading, value_dbm = measured.poses.position_m, measured.poses.heading_rad, measured.value_dbm
     weight = np.ones(value_dbm.shape) if measured.precision is None else measured.precision
-    number = np.zeros(len(rows), np.int64)
-    first = 0
-    for k in range(1, len(rows)):
-        # From the first row of the stop, not the previous one: a slow walk is many stops.
-        far = np.linalg.norm(position[k] - position[first]) > reach_m
-        turned = heading is not None and abs(np.angle(np.exp(1j * (heading[k] - heading[first])))) > turn_rad
-        if far or turned or k - first >= most or rows[k] - rows[k - 1] > GAP:
-            first = k
-        number[k] = number[k - 1] + (first == k)
-    count = int(number[-1]) + 1 if len(rows) else 0
+    number = _stop_numbers(measured, reach_m, turn_rad, most)
+    count = int(number.max(initial=-1)) + 1
     size = np.maximum(np.bincount(number, minlength=count), 1)
 
     def mean(values: FloatArray) -> FloatArray:
@@ -237,7 +227,20 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
                 # A median, as fades skew the reports of a stop.
                 share = weight[receiver, chunk][known]
                 value[receiver, stop], total[receiver, stop] = _median(reports[known], share), share.sum()
-    return Stops(Poses(centre, direction), value, total, mean(rows.astype(float)))
+    return Stops(Poses(centre, direction), value, total, mean(measured.rows.astype(float)))
+
+
+def _stop_numbers(measured: Measured, reach_m: float, turn_rad: float, most: int) -> IntArray:
+    position, heading, rows = measured.poses.position_m, measured.poses.heading_rad, measured.rows
+    number, first = np.zeros(len(rows), np.int64), 0
+    for k in range(1, len(rows)):
+        # From the first row of the stop, not the previous one: a slow walk is many stops.
+        far = np.linalg.norm(position[k] - position[first]) > reach_m
+        turned = heading is not None and abs(np.angle(np.exp(1j * (heading[k] - heading[first])))) > turn_rad
+        if far or turned or k - first >= most or rows[k] - rows[k - 1] > GAP:
+            first = k
+        number[k] = number[k - 1] + (first == k)
+    return number
 
 
 def _median(values: FloatArray, weight: FloatArray) -> float:

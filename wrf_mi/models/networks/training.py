@@ -18,13 +18,13 @@ from drjit.opt import Adam
 
 from ...backend.device import Recorded
 from ...core import InputError
+from ...core.array_files import keyed, under
 from ...core.types import IntArray
 from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, plan, rated_params
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.config import AdamConfig, LoopConfig
 from ...training.loop import FitState, Progress, TrainingLoop
 from ...training.session import FitSession
-from ..model import keyed
 from .layers import Module
 
 HOLD_OUT = 0.8  # share of the steps with a constant rate and validation rows kept out of training
@@ -137,7 +137,7 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     stored = read_checkpoint(folder) if folder is not None and (folder / CHECKPOINT).exists() else {}
     if f"{finished}/score" in stored:
         return network.module.on_device(stored, f"{finished}/mean/"), float(stored[f"{finished}/score"])
-    beside = {key: values for key, values in stored.items() if key.startswith(FINISHED)}
+    beside = keyed(FINISHED, under(FINISHED, stored))
     beside["network"] = np.asarray(network.name)
     # A checkpoint of another network of this fit says which have finished, and nothing of this one.
     begun = "network" in stored and str(stored["network"]) == network.name

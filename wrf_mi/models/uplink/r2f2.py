@@ -34,11 +34,12 @@ from numpy.typing import NDArray
 
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
+from ...core.array_files import keyed, under
 from ...core.settings import CheckedSettings, Count, Positive
 from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, keyed, slices, under
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
 from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
 from .uplink_waves import Bands, Complex, UplinkModel, Waves, bands_of, principal_axes, relative_error, waves_of
 
@@ -153,6 +154,20 @@ class PathSettings(SpecularOptions, CheckedSettings):
     rays: int = 1 << 17
 
 
+def _wave_models(record: Record, settings: PathSettings, has_elements: bool, directions: bool) -> list[str]:
+    """Wave models among which `choose` chooses (InputError: the stated one needs elements that are unknown)."""
+    if directions and (not has_elements or settings.wavefront == "free"):
+        text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
+        raise InputError(f"{record.name}: {text}; give them or omit the scene")
+    if not has_elements and settings.wavefront in ("spherical", "plane"):
+        text = "waves need the array's elements and the frequencies; give both or choose wavefront=free"
+        raise InputError(f"{record.name}: {settings.wavefront} {text}")
+    if not has_elements:
+        return ["free"]
+    every = ["spherical", "plane", *(["free"] * (not directions))]
+    return every if settings.wavefront == "auto" else [settings.wavefront]
+
+
 def choose(
     rows: tuple[IntArray, IntArray],
     record: Record,
@@ -170,14 +185,7 @@ def choose(
     """
     train, validation = rows
     first = bands_of(record, settings.spacing_hz)
-    if directions and (first.elements_m is None or settings.wavefront == "free"):
-        text = "paths of a scene need the array's elements, the frequencies, and another wavefront than free"
-        raise InputError(f"{record.name}: {text}; give them or omit the scene")
-    if first.elements_m is None and settings.wavefront in ("spherical", "plane"):
-        text = "waves need the array's elements and the frequencies; give both or choose wavefront=free"
-        raise InputError(f"{record.name}: {settings.wavefront} {text}")
-    every = ("spherical", "plane", "free") if settings.wavefront == "auto" else (settings.wavefront,)
-    kinds = [kind for kind in every if not directions or kind != "free"] if first.elements_m is not None else ["free"]
+    kinds = _wave_models(record, settings, first.elements_m is not None, directions)
     known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
     options = [(kind, bands) for bands in known for kind in kinds]
     if len(options) == 1:  # nothing to choose, and no row needs a downlink

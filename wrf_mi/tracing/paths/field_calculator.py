@@ -121,8 +121,8 @@ def evaluate_paths(
     # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity.
     world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
-    turned = [[row[k] for row in pose.to_world] for k in (2, 0, 1)]
-    received = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else turned)
+    x, y, z = map(list, zip(*pose.to_world, strict=True))
+    received = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else [z, x, y])
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length  # Friis
     gain = dot(received, real) * loss, dot(received, imaginary) * loss
     return gain, length, departure, pose.to_local(arrival)

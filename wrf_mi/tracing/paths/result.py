@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,23 +168,22 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
     first = parts[0]
     starts = np.cumsum([0, *(part.paths.n_tx for part in parts)])
     tx = np.concatenate([part.paths.tx + start for part, start in zip(parts, starts[:-1], strict=True)])
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([attrgetter(name)(part) for part in parts])
+
     # Stable: the paths of a pair of devices all come from one part and keep their order.
-    order = np.lexsort((tx, np.concatenate([part.paths.rx for part in parts])))
-
-    def joined(part_arrays: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        return np.concatenate(list(part_arrays))[order]
-
+    order = np.lexsort((tx, joined("paths.rx")))
     names = ("rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
-    arrays: dict[str, Any] = {name: joined(getattr(part.paths, name) for part in parts) for name in names}
-    carriers = None if first.carriers_hz is None else np.concatenate([cast(FloatArray, p.carriers_hz) for p in parts])
+    arrays: dict[str, Any] = {name: joined(f"paths.{name}")[order] for name in names}
     return replace(
         first,
         paths=replace(first.paths, tx=tx[order], n_tx=int(starts[-1]), **arrays),
-        tx_pos_m=np.concatenate([part.tx_pos_m for part in parts]),
-        primitives=joined(part.primitives for part in parts),
-        probability=joined(part.probability for part in parts),
-        wedge={name: joined(part.wedge[name] for part in parts) for name in first.wedge},
-        carriers_hz=carriers,
+        tx_pos_m=joined("tx_pos_m"),
+        primitives=joined("primitives")[order],
+        probability=joined("probability")[order],
+        wedge={name: np.concatenate([part.wedge[name] for part in parts])[order] for name in first.wedge},
+        carriers_hz=None if first.carriers_hz is None else joined("carriers_hz"),
     )
 
 

@@ -102,6 +102,18 @@ class Prepared:
         return ReflectionChains(plane, image, source)
 
 
+def _stated_devices(
+    tx_pos_m: ArrayLike, receivers: Receiver | Sequence[Receiver]
+) -> tuple[FloatArray, tuple[Receiver, ...]]:
+    positions = np.atleast_2d(np.asarray(tx_pos_m, float))
+    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
+        raise ValueError(f"trace_paths: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [n, 3]")
+    devices = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
+    if not len(positions) or not devices:
+        raise InputError(f"trace_paths: {len(positions)} transmitters and {len(devices)} receivers; give one at least")
+    return positions, devices
+
+
 def trace_paths(
     scene: Any,
     tx_pos_m: ArrayLike,
@@ -150,16 +162,11 @@ def trace_paths(
         ValueError: positions of another shape or not finite.
         InputError: no transmitter or no receiver, or an antenna inside a solid object.
     """
-    positions = np.atleast_2d(np.asarray(tx_pos_m, float))
-    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-        raise ValueError(f"trace_paths: tx_pos_m has shape {np.shape(tx_pos_m)}; give finite [n, 3]")
-    # Devices, checked and placed before the surfaces that they are on.
-    devices = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
-    if not len(positions) or not devices:
-        raise InputError(f"trace_paths: {len(positions)} transmitters and {len(devices)} receivers; give one at least")
+    positions, devices = _stated_devices(tx_pos_m, receivers)
     shared = prepared or Prepared(scene)
     if check:
         shared.check(positions, devices, first_row)
+    # Devices are placed before the surfaces that they are on.
     positions, devices = shared.placed(positions, devices)
     # Rays leave the receivers, as each takes a second; a heuristic of diffraction is not reciprocal.
     swap = search_from == "receivers" and not options.diffraction

@@ -85,12 +85,7 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
     for number, (name, shape) in enumerate(named_shapes(root)):
         plugin = shape.get("type", "")
         try:
-            if plugin in ("instance", "shapegroup"):
-                raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
-            if plugin in MESH_PLUGINS:
-                content = _mesh_content(shape)
-            else:
-                content = _placed_content(shape, root.get("version", ""), f"{path}: {name}")
+            content = _content(shape, root.get("version", ""), f"{path}: {name}")
         except InputError as error:
             raise InputError(f"{path}: {name}: {one_line(error)}") from None
         if content is None:
@@ -211,14 +206,19 @@ def placed_mesh(shape: Element, version: str) -> trimesh.Trimesh | None:
     return mesh
 
 
-def _placed_content(shape: Element, version: str, where: str) -> bytes | None:
-    """PLY of `placed_mesh` where Mitsuba has no triangles; the shape then loses its parameters."""
+def _content(shape: Element, version: str, where: str) -> bytes | None:
+    """PLY of a shape's triangles, None where Mitsuba has the same; one without a file then loses its parameters."""
     plugin = shape.get("type", "")
+    if plugin in ("instance", "shapegroup"):
+        raise InputError(f"Sionna RT has no {plugin}; write the shapes of the group in the instance's place")
+    if plugin in MESH_PLUGINS:
+        return _mesh_content(shape)
     placed = None if plugin == "cube" else placed_mesh(shape, version)
     if placed is None:
         return None
-    for child in [child for child in shape if child.tag in VALUES]:
-        shape.remove(child)
+    for child in list(shape):
+        if child.tag in VALUES:
+            shape.remove(child)
     if plugin != "rectangle":
         # Facets of a sphere lie off it by both the angle between meridians and that between parallels.
         round_axes, angles = (3, 2) if plugin == "sphere" else (2, 1)
@@ -332,12 +332,12 @@ def load_scene(
         ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
         raise InputError(f"{source}: no such scene file; give {ways}")
     mesh = path.suffix.lower() in MESHES
-    if mesh and material is None:
-        raise InputError(f"{source}: a mesh has no radio material; give one, such as concrete, or {PERFECT}")
-    if not mesh and material is not None:
-        raise InputError(f"{source}: has radio materials of its own; leave out the material {material}")
+    if mesh == (material is None):
+        text = f"a mesh has no radio material; give one, such as concrete, or {PERFECT}"
+        text = text if mesh else f"has radio materials of its own; leave out the material {material}"
+        raise InputError(f"{source}: {text}")
     try:
-        return _checked(path, source, material if mesh else None), stated_m, laws
+        return _checked(path, source, material), stated_m, laws
     except InputError as error:
         raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
 
