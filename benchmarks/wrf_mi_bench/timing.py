@@ -112,6 +112,17 @@ def ratio(ours_ms: ArrayLike, theirs_ms: ArrayLike) -> Interval:
     return bootstrap(ours / theirs)
 
 
+@dataclass(frozen=True)
+class Split:
+    """Shares of the time of a call, in ms."""
+
+    tracing: float  # Python, NumPy, recording of Dr.Jit's operations, and building of BVHs on the host: the remainder
+    code_generation: float  # generation of kernels that were not in the cache, with LLVM's or CUDA's compiler
+    execution: float  # execution of kernels; concurrent ones count in full, up to the time of the call
+    kernels: int  # number of launched kernels, reductions and sorts included
+    compiled: int  # number of compiled kernels among them
+
+
 def history_of(call: Call) -> tuple[float, list[dict[str, Any]]]:
     """Time of a call in ms, and Dr.Jit's history of its kernels."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -120,6 +131,16 @@ def history_of(call: Call) -> tuple[float, list[dict[str, Any]]]:
         dr.kernel_history_clear()
         total_ms = 1e3 * seconds(call)
         return total_ms, dr.kernel_history()
+
+
+def split(call: Call) -> Split:
+    """Shares of the time of a call, see `history_of`."""
+    total_ms, history = history_of(call)
+    generated = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
+    # Kernels may run concurrently with each other and with the recording of the next.
+    executed = min(sum(entry["execution_time"] for entry in history), max(total_ms - generated, 0.0))
+    compiled = sum(not entry.get("cache_hit", 1) for entry in history)
+    return Split(max(total_ms - generated - executed, 0.0), generated, executed, len(history), compiled)
 
 
 def memory_mb(call: Call) -> float:

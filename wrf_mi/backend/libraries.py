@@ -16,12 +16,17 @@ import sys
 import sysconfig
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import starmap
+from itertools import chain, starmap
 from pathlib import Path
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 CUDA_VARIABLE = "DRJIT_LIBCUDA_PATH"  # environment variables that name the libraries for Dr.Jit to load
 
+DARWIN_FOLDERS = ("/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib", "/opt/local/libexec/llvm-*/lib")
+LINUX_FOLDERS = (
+    *("/usr/lib64", "/usr/lib", "/usr/local/lib", "/usr/lib/llvm*/lib", "/usr/lib64/llvm*/lib", "/usr/lib/llvm*/lib64"),
+    *("/opt/llvm*/lib", "/home/linuxbrew/.linuxbrew/opt/llvm*/lib"),
+)
 READ_TIMEOUT_S = 60  # reading the linker's cache takes milliseconds; a cold network disk may need much longer
 
 _LLVM_NAME = re.compile(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.(?:so((?:\.\d+)*)|(?:(\d+(?:\.\d+)*)\.)?dylib)")
@@ -92,20 +97,16 @@ def _llvm_files() -> Iterator[Path]:
 
 def _library_folders() -> list[Path]:
     """Existing folders in which a system's package manager, Conda or Homebrew puts shared libraries."""
-    listed = [os.environ.get(f"{system}LD_LIBRARY_PATH", "").split(os.pathsep) for system in ("", "DY")]
-    roots = [sys.prefix, os.environ.get("CONDA_PREFIX", "")]
-    patterns = [folder for entries in listed for folder in entries if folder]
-    patterns += [f"{root}/lib" for root in roots if root]
+    listed = [os.environ.get(f"{system}LD_LIBRARY_PATH", "") for system in ("", "DY")]
+    roots = filter(None, (sys.prefix, os.environ.get("CONDA_PREFIX")))
+    patterns = [*filter(None, os.pathsep.join(listed).split(os.pathsep)), *(f"{root}/lib" for root in roots)]
     if sys.platform == "darwin":
-        patterns += ["/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib", "/opt/local/libexec/llvm-*/lib"]
-        patterns += ["/usr/local/lib"]
+        patterns += [*DARWIN_FOLDERS, "/usr/local/lib"]
     else:
         multiarch = sysconfig.get_config_var("MULTIARCH") or f"{os.uname().machine}-linux-gnu"
-        patterns += [f"/usr/lib/{multiarch}", "/usr/lib64", "/usr/lib", "/usr/local/lib"]
-        patterns += ["/usr/lib/llvm*/lib", "/usr/lib64/llvm*/lib", "/usr/lib/llvm*/lib64", "/opt/llvm*/lib"]
-        patterns += ["/home/linuxbrew/.linuxbrew/opt/llvm*/lib"]
-    folders = (Path(folder) for pattern in patterns for folder in glob.glob(pattern))
-    return list(dict.fromkeys(folder for folder in folders if folder.is_dir()))
+        patterns += [f"/usr/lib/{multiarch}", *LINUX_FOLDERS]
+    folders = map(Path, chain.from_iterable(map(glob.glob, patterns)))
+    return list(dict.fromkeys(filter(Path.is_dir, folders)))
 
 
 def _linker_cache(start: str) -> list[Path]:

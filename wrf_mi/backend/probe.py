@@ -28,13 +28,9 @@ from ..core.files import write_atomically
 from .libraries import CUDA_VARIABLE, LLVM_VARIABLE, LlvmLibrary
 
 VARIANTS = {"llvm": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}  # in which Sionna RT works
-
 OLDEST_TRIED = 17  # Dr.Jit 1.5 refuses LLVM 14; 15 and 16 end the process, as they lack minimum and maximum
-
 TRIAL_TIMEOUT_S = 180  # a trial takes about a second, with the first start of a CUDA driver up to a minute
-
 FAILURE_KEPT_S = 24 * 3600  # a failed library is tried again after a day: the GPU may have been busy
-
 _REASON_LENGTH = 160
 _SCRIPT = Path(__file__).with_name("trial.py")
 

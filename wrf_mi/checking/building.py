@@ -59,13 +59,14 @@ def building_file(source: str | Path) -> Path | None:
     That of a file is a mesh with its name; that of a folder is `LAYOUT`, the only scene folder, or the only mesh.
     """
     path = Path(source)
+    if path.is_file():
+        return next(filter(Path.is_file, map(path.with_suffix, SUFFIXES)), None)
     if not path.is_dir():
-        named = [path.with_suffix(suffix) for suffix in SUFFIXES]
-        return next((file for file in named if file.is_file()), None) if path.is_file() else None
+        return None
     if (path / LAYOUT).is_file():
         return path / LAYOUT
     scenes = [facts.parent for facts in sorted(path.glob(f"*/{FACTS_FILE}")) if (facts.parent / XML_FILE).is_file()]
-    candidates = scenes or [file for file in sorted(path.iterdir()) if has_faces(file)]
+    candidates = scenes or list(filter(has_faces, sorted(path.iterdir())))
     return candidates[0] if len(candidates) == 1 else None
 
 
@@ -75,18 +76,19 @@ def read_building(path: Path) -> Building:
         vertices = read_layout(path)
         walls = np.stack([vertices[:-1], vertices[1:]], axis=1)
         return Building(path, plan_surfaces(vertices, height_m=HEIGHT_M, name=str(path)), (), walls)
-    if path.is_dir():
-        # Surfaces of a scene together have the extent of a building; those of furniture are smaller than any room.
-        parts = [part for file in sorted((path / "meshes").glob("*.ply")) for part in mesh_parts(file)]
-        if not parts:
-            raise InputError(f"{path}: a scene folder without faces in meshes/*.ply; write the scene anew")
-        raw = sound_surfaces(parts, 1.0, path)
-    else:
-        raw = read_mesh(path)
+    raw = _scene_surfaces(path) if path.is_dir() else read_mesh(path)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in raw])
     closed = [body for body in bodies(corners) if body.closed and body.volume_m3]
     solids = [body.corners_m for body in closed if np.ptp(body.bounds_m, axis=0).min() <= THICKEST_SOLID_M]
     return Building(path, planes_of_mesh(raw), solids, np.empty((0, 2, 2)))
+
+
+def _scene_surfaces(folder: Path) -> Sequence[Surface]:
+    """Surfaces of a scene folder, whose extent together is a building's; pieces of furniture are smaller than rooms."""
+    parts = [part for file in sorted((folder / "meshes").glob("*.ply")) for part in mesh_parts(file)]
+    if not parts:
+        raise InputError(f"{folder}: a scene folder without faces in meshes/*.ply; write the scene anew")
+    return sound_surfaces(parts, 1.0, folder)
 
 
 def plan_against_walls(record: Record, building: Building) -> Found:

@@ -16,14 +16,7 @@ from ..synthetic import load_record
 from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
 from .plans import distance_law
-from .rows import (
-    constant_observations,
-    few_rows,
-    not_heard,
-    repeated_observations,
-    repeated_rows,
-    single_position,
-)
+from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
 from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
 logger = logging.getLogger(__name__)
@@ -182,15 +175,20 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     record, faults = collect_faults(read)
     if record is None:
         return DataReport(name, source, None, tuple(faults), ())
-    suspected = [suspicion for check in OF_VALUES for suspicion in check(record)]
-    wrong_unit = list(degrees(record)) or list(position_unit(record))
-    suspected += wrong_unit
-    if all(name in ignore for name, _ in wrong_unit):
-        suspected += [suspicion for check in OF_PLACES for suspicion in check(record)]
-        suspected += _of_building(record)
-    suspicions = tuple(Suspicion(name, text) for name, text in suspected if name not in ignore)
+    suspicions = tuple(Suspicion(name, text) for name, text in _suspected(record, ignore) if name not in ignore)
     note = far_from_origin(record)
     return DataReport(name, record.source, record, (), suspicions, () if note is None else (note,))
+
+
+def _suspected(record: Record, ignore: Collection[str]) -> Found:
+    """All suspicions; those about directions and distances only where the unit of positions is not one of them."""
+    wrong_unit = list(degrees(record)) or list(position_unit(record))
+    of_places = (*OF_PLACES, _of_building) if {name for name, _ in wrong_unit} <= set(ignore) else ()
+    for check in OF_VALUES:
+        yield from check(record)
+    yield from wrong_unit
+    for check in of_places:
+        yield from check(record)
 
 
 def warn_of_suspicions(record: Record) -> None:
@@ -211,7 +209,6 @@ def _path(dataset: str | Path) -> Path | None:
 
 
 def _of_building(record: Record) -> Found:
-    """Suspicions about positions in the building of the folder, if it shows one."""
     file = building_file(record.source) if record.source else None
     if file is None:
         return

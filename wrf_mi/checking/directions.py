@@ -87,18 +87,13 @@ def _line_of_sight(record: Record) -> Found:
     part = _thinned(replace(record, tx_pos_m=record.tx_pos_m[rows], observation=record.observation[:, rows]))
     if len(np.unique(part.tx_pos_m, axis=0)) < GROUPS:
         return
-    if behind := list(_behind(record)):
-        yield from behind
-        return
-    groups = _groups(part.tx_pos_m)
-    stated = brightness(part)
-    if stated.mean() > BRIGHTEST:
-        return
-    better = []
-    for name, what, remedy, reading in _readings(part):
-        shares = brightness(reading)
-        if shares.mean() >= BRIGHT and _is_brighter(shares, stated, groups) and _moves(reading, shares, groups):
-            better.append((name, what, remedy, shares))
+    yield from list(_behind(record)) or _best_reading(part)
+
+
+def _best_reading(record: Record) -> Found:
+    """The other reading in which spectra are brightest in the direction of the transmitter."""
+    stated, groups = brightness(record), _groups(record.tx_pos_m)
+    better = [] if stated.mean() > BRIGHTEST else list(_better_readings(record, stated, groups))
     if not better:
         return
     # Several readings may put transmitters where they are in the best one: the first of these is named.
@@ -109,6 +104,16 @@ def _line_of_sight(record: Record) -> Found:
     also = [text for other, text, *_ in others if other != name]
     hint = f" (or: {also[0]})" if also else ""
     yield name, f"{what}: {evidence}, as stated {stated.mean():.0%}; {remedy}{hint}"
+
+
+def _better_readings(
+    record: Record, stated: FloatArray, groups: IntArray
+) -> Iterator[tuple[str, str, str, FloatArray]]:
+    """Readings that are clearly brighter than the stated one: suspicion, what is wrong, remedy and brightness."""
+    for name, what, remedy, reading in _readings(record):
+        shares = brightness(reading)
+        if shares.mean() >= BRIGHT and _is_brighter(shares, stated, groups) and _moves(reading, shares, groups):
+            yield name, what, remedy, shares
 
 
 def _behind(record: Record) -> Found:

@@ -82,19 +82,12 @@ class MaterialRepair:
             material = itu_type(candidate)
             if material is not None:
                 return self._slab(candidate, material)
-            if (
-                candidate.get("type") in RADIO[::2]
-                and not is_itu(candidate.get("id", ""))
-                and self._is_sound(candidate)
-            ):
-                return candidate
+            is_stated = candidate.get("type") in RADIO[::2] and not is_itu(candidate.get("id", ""))
+            if is_stated and self.scene is not None:
+                kinds = {finding.kind for finding in bsdf_findings(self.scene, "", candidate)}
+                if "material-values" not in kinds:
+                    return candidate
         return None
-
-    def _is_sound(self, bsdf: Element) -> bool:
-        """Whether the constants of a radio material are those that Sionna RT takes."""
-        return self.scene is not None and all(
-            finding.kind != "material-values" for finding in bsdf_findings(self.scene, "", bsdf)
-        )
 
     def _slab(self, bsdf: Element, material: str) -> Element:
         """A material of ITU-R P.2040 with its thickness, colour and scattering."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,15 @@ FEWEST_STRENGTHS = 4
 """Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
 where a transmitter stands still."""
 SHOWN = 10  # number of rows that a text names
+BESIDE_OTHERS = (
+    "far more often than the strengths next to it: clipped at the sensitivity, or a number for 'not heard'",
+    "where nothing was heard, leave the field empty; clipped strengths are learned as measured",
+)
+APART = (
+    "apart from all other strengths: a number for 'not heard', which is learned as measured",
+    "leave the field empty where nothing was heard (NaN in a wrf_mi.Record, -100 in NeRF2's layout)",
+)
+"""What a suspicious strength is, and the remedy."""
 
 
 def not_heard(record: Record) -> Found:
@@ -39,27 +49,25 @@ def not_heard(record: Record) -> Found:
 
 
 def _strengths(record: Record) -> Found:
-    # Different values that are all positive are on another scale, which `strength_scale` reports.
-    observed = [values[np.isfinite(values)].astype(float) for values in record.observation]
-    observed = [values[:0] if is_above_0_dbm(values) and np.ptp(values) else values for values in observed]
-    by_receiver = [{value.dbm: value for value in suspicious_values(values)} for values in observed]
+    observed = list(map(_in_dbm, record.observation))
+    received = np.array(list(map(len, observed)))
+    by_receiver = list(map(suspicious_values, observed))
     # A number that each receiver has once or twice shows in all of them together.
-    pooled = suspicious_values(np.concatenate(observed))
-    suspects = {dbm: value for values in by_receiver for dbm, value in values.items()}
-    suspects |= {value.dbm: value for value in pooled if not value.adjoins}
+    pooled = [value for value in suspicious_values(np.concatenate(observed)) if not value.adjoins]
+    suspects = {value.dbm: value for value in (*chain.from_iterable(by_receiver), *pooled)}
     for dbm, value in sorted(suspects.items()):
         counts = np.array([np.count_nonzero(values == dbm) for values in observed])
+        what, remedy = APART
         if value.adjoins:  # other receivers may have measured it
-            counts = np.where([dbm in values for values in by_receiver], counts, 0)
-        where = _named_counts(record, counts, np.array([len(values) for values in observed]))
-        if value.adjoins:
-            what = "far more often than the strengths next to it: "
-            what += "clipped at the sensitivity, or a number for 'not heard'"
-            remedy = "where nothing was heard, leave the field empty; clipped strengths are learned as measured"
-        else:
-            what = "apart from all other strengths: a number for 'not heard', which is learned as measured"
-            remedy = "leave the field empty where nothing was heard (NaN in a wrf_mi.Record, -100 in NeRF2's layout)"
-        yield "not-heard", f"{dbm:g} dBm, {what}: {where}; {remedy}"
+            counts *= [any(each.dbm == dbm for each in values) for values in by_receiver]
+            what, remedy = BESIDE_OTHERS
+        yield "not-heard", f"{dbm:g} dBm, {what}: {_named_counts(record, counts, received)}; {remedy}"
+
+
+def _in_dbm(observed: NDArray[Any]) -> NDArray[Any]:
+    """Received strengths; none if they differ and are all positive: on a scale that `strength_scale` reports."""
+    values = observed[np.isfinite(observed)].astype(float)
+    return values[:0] if is_above_0_dbm(values) and np.ptp(values) else values
 
 
 def _named_counts(record: Record, counts: IntArray, received: IntArray) -> str:
@@ -108,12 +116,10 @@ def named_rows(rows: IntArray) -> str:
 def repeated_rows(record: Record) -> Found:
     """Rows with position, conditions and observation of an earlier row, and test rows among the training rows."""
     received = _received_values(record) >= (FEWEST_STRENGTHS if record.task == "rssi" else 1)
-    parts = [part for part in (record.tx_pos_m, record.tx_heading_rad, record.carriers_hz) if part is not None]
-    per_receiver = [part for part in (record.observation, record.n_readings, record.std) if part is not None]
-    per_row = [*parts, *(np.moveaxis(part, 1, 0) for part in per_receiver)]
-    if record.uplink is not None:
-        per_row.append(record.uplink)
-    first = _first_equal(per_row)
+    per_receiver = (record.observation, record.n_readings, record.std)
+    parts = [np.moveaxis(part, 1, 0) for part in per_receiver if part is not None]
+    per_row = (record.tx_pos_m, record.tx_heading_rad, record.carriers_hz, record.uplink)
+    first = _first_equal([*(part for part in per_row if part is not None), *parts])
     repeated = np.flatnonzero((first != np.arange(len(record))) & received)
     if record.official is not None:
         train, test = record.official

@@ -203,7 +203,6 @@ def locate(source: str | Path) -> Source:
 
 
 def _folder(folder: Path) -> Source:
-    """A scene folder, or a folder with a single XML."""
     if not (folder / FACTS_FILE).is_file():
         files = sorted(folder.glob("*.xml"))
         if len(files) != 1:
@@ -349,7 +348,6 @@ def _devices(parts: Sequence[Part], path: Path, record: Record) -> Iterator[Find
 
 
 def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
-    """Findings about a scan."""
     try:
         points = read_points(path, frame.units, frame.up)
     except InputError as error:

@@ -175,20 +175,9 @@ def _numbers(text: str, count: int | None = None) -> FloatArray:
 def read_triangles(part: Part, plugin: str) -> Iterator[Part | Finding]:
     """A part with the triangles of its PLY or OBJ file in the file's frame, and findings about its polygons."""
     file, name = part.file, part.name
-    try:
-        require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
-        polygons = POLYGON_READERS[file.suffix.lower()](file)
-    except Exception as error:  # NumPy raises a dozen kinds on damaged files
-        text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
-        yield Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
-        return
-    if not len(polygons.sizes):
-        yield Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
-        return
-    bad = np.flatnonzero(~np.isfinite(polygons.vertices).all(axis=1))
-    if len(bad):
-        text = f"{len(bad)} vertices are not finite, first vertex {bad[0] + 1}"
-        yield Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
+    polygons = _polygons(file, name)
+    if isinstance(polygons, Finding):
+        yield polygons
         return
     try:
         if polygons.sizes.max() > MOST_CORNERS:
@@ -207,6 +196,23 @@ def read_triangles(part: Part, plugin: str) -> Iterator[Part | Finding]:
             text += f", {many} faces have more than three corners" if many else ""
             yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
     yield replace(part, corners_m=corners)
+
+
+def _polygons(file: Path, name: str) -> Polygons | Finding:
+    """Polygons of a PLY or OBJ file, or why it has none."""
+    try:
+        require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
+        polygons = POLYGON_READERS[file.suffix.lower()](file)
+    except Exception as error:  # NumPy raises a dozen kinds on damaged files
+        text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
+        return Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
+    if not len(polygons.sizes):
+        return Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
+    bad = np.flatnonzero(~np.isfinite(polygons.vertices).all(axis=1))
+    if len(bad):
+        text = f"{len(bad)} vertices are not finite, first vertex {bad[0] + 1}"
+        return Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
+    return polygons
 
 
 def _may_differ(polygons: Polygons, file: Path) -> bool:

@@ -169,7 +169,6 @@ def _renamed(names: Mapping[Part, str]) -> list[str]:
 
 
 def _routine(before: Checked) -> list[str]:
-    """What is done about findings that need no choice."""
     findings = [finding for finding in before.report.findings if finding.kind in DONE]
     return [f"{finding.shape or finding.file.name}: {DONE[finding.kind]}" for finding in findings]
 
@@ -180,8 +179,8 @@ def _unrepaired(before: Checked) -> list[Finding]:
     unrepaired = [each for each in faults if each.kind in UNREPAIRED or (each.kind in LOST and each.shape in lost)]
     named = {each.shape for each in faults if each.kind in (*UNREPAIRED, *LOST, "empty-mesh")}
     text, remedy = "its triangles are not read", "write it as a PLY mesh"
-    others = [name for name in lost if name not in named]
-    return unrepaired + [Finding("unsupported-shape", before.source.path, name, text, remedy) for name in others]
+    form = "unsupported-shape", before.source.path
+    return unrepaired + [Finding(*form, name, text, remedy) for name in lost if name not in named]
 
 
 def _without_triangles(before: Checked) -> list[str]:

@@ -94,16 +94,12 @@ class SceneXml:
         return [
             (child.get("id", ""), self.bsdfs.get(child.get("id", "")) if child.tag == "ref" else child)
             for child in shape
-            if child.tag == "bsdf" or (child.tag == "ref" and self.is_bsdf(child.get("id", "")))
+            if child.tag == "bsdf" or (child.tag == "ref" and child.get("id", "") not in self._others)
         ]
 
     @cached_property
     def _others(self) -> set[str]:
         return {element.get("id", "") for element in self.root if element.tag not in ("bsdf", "shape")}
-
-    def is_bsdf(self, identifier: str) -> bool:
-        """Whether a reference to an id is one to a BSDF, or to nothing."""
-        return identifier not in self._others
 
     def file_of(self, shape: Element) -> str | None:
         """Name of a shape's file as the scene file states it."""
@@ -211,7 +207,6 @@ def similar_file(folder: Path, stated: str) -> Path | None:
 
 
 def _ids(scene: SceneXml) -> Iterator[Finding]:
-    """Ids, and names that Sionna RT makes of them, that come twice."""
     used = {identifier for _, shape in scene.shapes for identifier, _ in scene.materials(shape)}
     first: dict[str, Element] = {}
     short: dict[str, str] = {}
@@ -318,7 +313,6 @@ def number(text: str) -> float | None:
 
 
 def _shape(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
-    """Type and parameters of a shape."""
     path, plugin = scene.path, shape.get("type", "")
     if plugin not in PARAMETERS:
         remedy = f"write it as a PLY mesh; opened are {', '.join(PARAMETERS)}"
@@ -350,7 +344,6 @@ def _parameters(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]
 
 
 def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
-    """The BSDF of a shape."""
     path, materials = scene.path, scene.materials(shape)
     for inline in shape.findall("bsdf"):
         yield from bsdf_findings(scene, name, inline)

@@ -68,7 +68,6 @@ def _one_plane(parts: list[Part]) -> list[Part]:
 
 
 def _in_plane(corners_m: FloatArray, triangle_m: FloatArray) -> FloatArray:
-    """Corners [f, 3, 3] projected onto the plane of a triangle [3, 3]."""
     normal = np.cross(triangle_m[1] - triangle_m[0], triangle_m[2] - triangle_m[0])
     normal /= np.linalg.norm(normal)
     return np.asarray(corners_m - ((corners_m - triangle_m[0]) @ normal)[..., None] * normal)

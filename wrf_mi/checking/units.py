@@ -121,18 +121,7 @@ def position_unit(record: Record) -> Found:
 def degrees(record: Record) -> Found:
     """Positions in longitude and latitude, in either order, of receivers, of transmitters or of both."""
     receivers = np.stack([receiver.position_m for receiver in record.receivers])[:, :2]
-    groups = {"receivers": receivers, "transmitters": record.tx_pos_m[:, :2]}
-    known = {what: np.unique(xy[np.isfinite(xy).all(axis=1)], axis=0) for what, xy in groups.items()}
-    known = {what: xy for what, xy in known.items() if len(xy)}
-    if not known:
-        return
-    both = np.concatenate(list(known.values()))
-    in_degrees = ["receivers and transmitters"] if len(known) == 2 and _is_in_degrees(both) else []
-    middles = [np.median(xy, axis=0) for xy in known.values()]
-    if not in_degrees and (len(known) == 1 or np.linalg.norm(middles[0] - middles[1]) >= APART_M):
-        in_degrees = [what for what, xy in known.items() if _is_in_degrees(xy)]
-    for what in in_degrees:
-        xy = known.get(what, both)
+    for what, xy in _in_degrees(receivers, record.tx_pos_m[:, :2]).items():
         low, high = xy.min(axis=0), xy.max(axis=0)
         order = "longitude, latitude" if np.abs(high[1]) <= LATITUDE else "latitude, longitude"
         if np.abs(high).max() <= LATITUDE:
@@ -141,6 +130,20 @@ def degrees(record: Record) -> Found:
         text = f"{what} have x from {low[0]:.6f} to {high[0]:.6f} and y from {low[1]:.6f} to {high[1]:.6f}"
         remedy = "project them to metres, of a local origin or UTM (pyproj), receivers and transmitters alike"
         yield "degrees", f"{text}: {order} in degrees, of a place some {extent_m:.2g} m wide; {remedy}"
+
+
+def _in_degrees(receivers: FloatArray, transmitters: FloatArray) -> dict[str, FloatArray]:
+    """Distinct coordinates [n, 2] that are in degrees, of both together or of the ones where both are apart."""
+    groups = {"receivers": receivers, "transmitters": transmitters}
+    groups = {what: np.unique(xy[np.isfinite(xy).all(axis=1)], axis=0) for what, xy in groups.items()}
+    if all(map(len, groups.values())):
+        both = np.concatenate(list(groups.values()))
+        if _is_in_degrees(both):
+            return {"receivers and transmitters": both}
+        first, second = (np.median(xy, axis=0) for xy in groups.values())
+        if np.linalg.norm(first - second) < APART_M:
+            return {}
+    return {what: xy for what, xy in groups.items() if _is_in_degrees(xy)}
 
 
 def _is_in_degrees(xy: FloatArray) -> bool:

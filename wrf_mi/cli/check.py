@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .options import Arguments, add_command
-from .output import show
+from .output import exit_status, show
 
 
 def add_parser(commands: Any) -> None:
@@ -32,22 +32,27 @@ def check_command(a: Arguments) -> int:
     from ..checking import check_scene, repair_scene
     from ..core import InputError
 
-    if a.repair is None and (a.material or a.replace):
-        raise InputError("check: --material and --replace belong to --repair OUT; give a folder, or omit them")
-    if a.repair is None:
-        report = check_scene(a.scene, data=a.data, frequency_hz=a.frequency, units=a.units, up=a.up)
-        show(a.json, report.as_dict(), "\n".join(report.lines()))
-        return 1 if report.ok and a.strict and report.of_level("warning") else 0 if report.ok else 2
-    if a.data or a.strict:
-        raise InputError("check --repair: --data and --strict belong to a check; omit them, then check the new folder")
     form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
-    of_shapes = dict(text.rsplit("=", 1) for text in a.material if "=" in text)
-    others = [text for text in a.material if "=" not in text]
+    if a.repair is not None:
+        if a.data or a.strict:
+            text = "--data and --strict belong to a check; omit them, then check the new folder"
+            raise InputError(f"check --repair: {text}")
+        repair = repair_scene(a.scene, a.repair, **_materials(a.material), overwrite=a.replace, **form)
+        show(a.json, repair.as_dict(), "\n".join(repair.lines()))
+        return 2 if repair.unrepaired else 0
+    if a.material or a.replace:
+        raise InputError("check: --material and --replace belong to --repair OUT; give a folder, or omit them")
+    report = check_scene(a.scene, data=a.data, **form)
+    show(a.json, report.as_dict(), "\n".join(report.lines()))
+    return exit_status(report.ok, a.strict and report.of_level("warning"))
+
+
+def _materials(stated: list[str]) -> dict[str, Any]:
+    """Material of shapes that have none, and those of single shapes."""
+    from ..core import InputError
+
+    others = [text for text in stated if "=" not in text]
     if len(others) > 1:
-        raise InputError(
-            f"check: --material {' and '.join(others)}; give one of them, and SHAPE=NAME for single shapes"
-        )
-    material = others[0] if others else None
-    repair = repair_scene(a.scene, a.repair, material=material, shape_materials=of_shapes, overwrite=a.replace, **form)
-    show(a.json, repair.as_dict(), "\n".join(repair.lines()))
-    return 2 if repair.unrepaired else 0
+        raise InputError(f"check: --material {' and '.join(others)}; give one, and SHAPE=NAME for single shapes")
+    of_shapes = dict(text.rsplit("=", 1) for text in stated if "=" in text)
+    return {"material": others[0] if others else None, "shape_materials": of_shapes}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..core.carriers import carriers_text
 from ..core.files import one_line
 from ..datasets.tables.options import AVERAGES
 from .options import DATASET, Arguments, add_command
-from .output import show
+from .output import exit_status, show
 
 SHOWN_CARRIERS = 8
 
@@ -38,7 +39,6 @@ def add_parser(commands: Any) -> None:
 
 
 def _add_import(data: Any) -> None:
-    """Add ``import``."""
     text = "make a data set from tables of signal strengths: CSV, Parquet, Excel (docs/howto/own-data.md)"
     parser = add_command(data, "import", import_command, text)
     add = parser.add_argument
@@ -130,7 +130,6 @@ def import_command(a: Arguments) -> int:
 
 
 def _where(text: str) -> tuple[str, str]:
-    """Column and text of ``--where``."""
     column, equals, wanted = text.partition("=")
     if not equals:
         raise InputError(f"--where {one_line(text)}: give COLUMN=TEXT")
@@ -159,9 +158,7 @@ def check_command(a: Arguments) -> int:
 
     report = check_data(a.dataset, a.ignore, progress=True)
     show(a.json, report.as_dict(), "\n".join(report.lines()))
-    if not report.ok:
-        return 2
-    return 1 if a.strict and report.suspicions else 0
+    return exit_status(report.ok, a.strict and report.suspicions)
 
 
 def summary(record: Record) -> dict[str, Any]:
@@ -179,14 +176,7 @@ def summary(record: Record) -> dict[str, Any]:
 
     check_parts(record)
     received = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))
-    carriers = None
-    if record.carriers_hz is not None:
-        hz, rows = np.unique(record.carriers_hz, return_counts=True)
-        carriers = dict(zip(hz.tolist(), rows.tolist(), strict=True))
-    runs, hz_of = None, record.receiver_carriers_hz
-    if record.runs is not None:
-        names, first, rows = np.unique(record.runs, return_index=True, return_counts=True)
-        runs = {str(names[k]): int(rows[k]) for k in np.argsort(first)}
+    hz_of = record.receiver_carriers_hz
     return {
         "name": record.name,
         "task": record.task,
@@ -196,11 +186,11 @@ def summary(record: Record) -> dict[str, Any]:
         "observation": list(record.observation.shape[2:]),
         "official": None if record.official is None else [len(part) for part in record.official],
         "frequencies_hz": None if record.frequencies_hz is None else record.frequencies_hz.tolist(),
-        "carriers_hz": carriers,
+        "carriers_hz": _counts(record.carriers_hz),
         "receiver_carriers_hz": None if hz_of is None else {r.name: r.frequency_hz for r in record.receivers},
         "folds": None if record.folds is None else np.bincount(record.folds).tolist(),
         "antennas": sorted({f"{r.antenna.pattern} {r.antenna.polarization}" for r in record.receivers}),
-        "runs": runs,
+        "runs": _counts(record.runs),
         "n_readings": _range(record.n_readings, received),
         "std_db": _range(record.std, received),
         "positions": record.has_positions,
@@ -213,40 +203,54 @@ def summary(record: Record) -> dict[str, Any]:
 def render(facts: dict[str, Any]) -> str:
     """`summary` as text."""
     shape = " x ".join(map(str, facts["observation"])) or "one number"
-    received = ", ".join(f"{name} {count}" for name, count in facts["receivers"].items())
     official = "{} training rows, {} test rows".format(*facts["official"]) if facts["official"] else "not stated"
     if facts["folds"]:
         official += f"; {len(facts['folds'])} spatial folds of {', '.join(map(str, facts['folds']))} rows"
-    carriers, frequencies = facts["carriers_hz"], facts["frequencies_hz"]
-    if facts["receiver_carriers_hz"]:
-        carrier = ", ".join(f"{name} {hz:.10g} Hz" for name, hz in facts["receiver_carriers_hz"].items())
-    elif carriers is not None:
-        carrier = carriers_text(np.array(list(carriers)))
-        if len(carriers) <= SHOWN_CARRIERS:
-            carrier = ", ".join(f"{hz:.10g} Hz in {rows} rows" for hz, rows in carriers.items())
-    elif frequencies is None:
-        carrier = "not stated"
-    else:
-        band = f"{min(frequencies):.10g} to {max(frequencies):.10g} Hz, {len(frequencies)} subcarriers"
-        carrier = f"{frequencies[0]:.10g} Hz" if len(frequencies) == 1 else band
-    known = [name for name in ("positions", "headings", "uplink", "truth") if facts[name]]
     lines = {
         "data set": f"{facts['name']}, {facts['task']}, {facts['source']}",
         "rows": f"{facts['rows']}, each {shape}",
-        "received": received,
+        "received": _named(facts["receivers"]),
         "official split": official,
-        "carrier": carrier,
+        "carrier": _carrier(facts["receiver_carriers_hz"], facts["carriers_hz"], facts["frequencies_hz"]),
         "antennas": ", ".join(facts["antennas"]),
-        "runs": "not stated" if facts["runs"] is None else ", ".join(f"{k} {n}" for k, n in facts["runs"].items()),
+        "runs": "not stated" if facts["runs"] is None else _named(facts["runs"]),
         "readings per row": _shown(facts["n_readings"], ""),
         "noise": _shown(facts["std_db"], " dB"),
-        "known": ", ".join(known) or "observations alone",
+        "known": ", ".join(filter(facts.get, ("positions", "headings", "uplink", "truth"))) or "observations alone",
     }
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 
 
+def _named(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _carrier(
+    of_receivers: dict[str, float] | None, of_rows: dict[float, int] | None, frequencies_hz: list[float] | None
+) -> str:
+    """Carriers in words: of the receivers, of the rows, or of the record with its subcarriers."""
+    if of_receivers:
+        return ", ".join(f"{name} {hz:.10g} Hz" for name, hz in of_receivers.items())
+    if of_rows is not None and len(of_rows) > SHOWN_CARRIERS:
+        return carriers_text(np.array(list(of_rows)))
+    if of_rows is not None:
+        return ", ".join(f"{hz:.10g} Hz in {rows} rows" for hz, rows in of_rows.items())
+    match frequencies_hz:
+        case None:
+            return "not stated"
+        case [hz]:
+            return f"{hz:.10g} Hz"
+    return f"{min(frequencies_hz):.10g} to {max(frequencies_hz):.10g} Hz, {len(frequencies_hz)} subcarriers"
+
+
+def _counts(values: NDArray[Any] | None) -> dict[Any, int] | None:
+    """Number of rows of each value: of numbers in their order, of names in that in which they come first."""
+    if values is None:
+        return None
+    return dict(Counter(np.sort(values).tolist() if values.dtype.kind == "f" else map(str, values)))
+
+
 def _range(values: NDArray[Any] | None, received: NDArray[np.bool_]) -> list[float] | None:
-    """Minimum, median and maximum where something was received."""
     if values is None or not received.any():
         return None
     return [float(value) for value in np.percentile(values[received], [0, 50, 100])]

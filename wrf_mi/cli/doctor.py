@@ -102,12 +102,14 @@ def install_llvm() -> None:
         return
     except BackendError as error:
         # A library that the variable names is the user's choice: no package replaces it.
-        if os.environ.get("DRJIT_LIBLLVM_PATH") or not install_commands():
-            raise
-        prefix = _privilege()
-        if prefix is None:
+        if os.environ.get("DRJIT_LIBLLVM_PATH") or not install_commands() or (prefix := _privilege()) is None:
             raise
         reason = error
+    _install(prefix, reason)
+
+
+def _install(prefix: list[str], reason: BackendError) -> None:
+    """Install packages until one of them works; ``reason`` is why LLVM does not work before."""
     # The second round is for package lists that are empty or outdated.
     for refresh in (False, True):
         if refresh and package_manager() == "apt-get":

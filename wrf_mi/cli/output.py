@@ -28,6 +28,11 @@ def show(as_json: bool, value: Any, text: str) -> int:
     return 0
 
 
+def exit_status(ok: bool, refused: object) -> int:
+    """Exit status of a check: 2 for a fault, 1 for a lesser finding that the user refuses."""
+    return 2 if not ok else 1 if refused else 0
+
+
 def summary_table(title: str, blocks: Mapping[str, Mapping[str, float] | None], digits: int) -> str:
     """Table of the summaries of quantities by name; None leaves one out."""
     lines = [f"{title:<36}" + "".join(f"{key:>8}" for key in QUANTITIES)]
@@ -50,15 +55,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
     if metrics.get("stages"):
         _show_stages(metrics["stages"], task.label)
-    if metrics.get("n_not_scored"):
-        print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
-    for key, what in (("receivers_with_few_rows", "few training rows"), ("receivers_left_out", "too few, left out")):
-        if key in metrics:
-            named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
-            print(f"receivers with {what} (number): {named}")
-    for name, place in metrics.get("receiver_places", {}).items():
-        axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
-        print(f"{name} estimated at " + ", ".join(f"{axis} {value:.1f} +- {std:.1f} m" for axis, value, std in axes))
+    _show_receivers(metrics)
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
         print(f"{share}, CRPS {metrics['crps']:.3g}")
@@ -76,6 +73,19 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if folder is not None:
         print(f"results: {folder}")
     return 0
+
+
+def _show_receivers(metrics: dict[str, Any]) -> None:
+    """Print what was not scored, the receivers with few rows, and the positions that were estimated."""
+    if metrics.get("n_not_scored"):
+        print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
+    for key, what in (("receivers_with_few_rows", "few training rows"), ("receivers_left_out", "too few, left out")):
+        if key in metrics:
+            named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
+            print(f"receivers with {what} (number): {named}")
+    for name, place in metrics.get("receiver_places", {}).items():
+        axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
+        print(f"{name} estimated at " + ", ".join(f"{axis} {value:.1f} +- {std:.1f} m" for axis, value, std in axes))
 
 
 def _show_stages(reports: list[dict[str, Any]], label: str) -> None:

@@ -13,6 +13,8 @@ from .options import DATASET, Arguments, add_command, add_n_train
 from .output import Watch, show
 
 if TYPE_CHECKING:
+    from ..core import Record, Split
+    from ..correction.options import CorrectionOptions
     from ..scene.edit import Move
 
 
@@ -102,33 +104,16 @@ def _add_correct(commands: Any) -> None:
 def correct_command(a: Arguments) -> int:
     """Correct a scene, and write its page."""
     from ..checking import warn_of_suspicions
-    from ..core.settings import with_settings
-    from ..correction import correct_scene, default_options, write_page
-    from ..correction.options import FRAME, PLANES
-    from ..datasets import make_splits
-    from ..datasets.splits import NONE, default_split
+    from ..correction import correct_scene, write_page
     from ..synthetic import load_record
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
     record = load_record(a.dataset, progress=sys.stderr.isatty())
-    options = default_options(record)
-    if a.fit is not None:
-        options = replace(options, parts=tuple(a.fit.split(",")))
-    names = ("depth", "reflections", "rows", "rays")
-    stated = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
-    options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
-    if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
-        raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
-    name = default_split(record) if a.split is None else a.split
-    splits = make_splits(record, name, a.seed, a.n_train)
-    if name == NONE:
-        splits = splits[-1:]
-    if len(splits) > 1:
-        raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
+    options, split = _correction_options(a, record), _single_split(a, record)
     warn_of_suspicions(record)
     with Watch() as watch:
-        correction = correct_scene(a.scene, record, splits[0], options, a.material, watch.on_progress)
+        correction = correct_scene(a.scene, record, split, options, a.material, watch.on_progress)
         facts = write_page(correction, a.out, a.replace)
     what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
     lines = [f"{facts['score']} of {facts['held_out']} {what}   median    mean"]
@@ -139,6 +124,33 @@ def correct_command(a: Arguments) -> int:
     lines.append(f"scene: {a.out}\npage: {a.out}/correction.md")
     shown = {"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}}
     return show(a.json, shown, "\n".join(lines))
+
+
+def _correction_options(a: Arguments, record: Record) -> CorrectionOptions:
+    from ..core.settings import with_settings
+    from ..correction import default_options
+    from ..correction.options import FRAME, PLANES
+
+    options = default_options(record)
+    if a.fit is not None:
+        options = replace(options, parts=tuple(a.fit.split(",")))
+    names = ("depth", "reflections", "rows", "rays")
+    stated = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
+    options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
+    if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
+        raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
+    return options
+
+
+def _single_split(a: Arguments, record: Record) -> Split:
+    from ..datasets import make_splits
+    from ..datasets.splits import NONE, default_split
+
+    name = default_split(record) if a.split is None else a.split
+    splits = make_splits(record, name, a.seed, a.n_train)
+    if len(splits) > 1 and name != NONE:
+        raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
+    return splits[-1]
 
 
 def _add_edit(commands: Any) -> None:
@@ -155,7 +167,7 @@ def _add_edit(commands: Any) -> None:
 
 def edit_command(a: Arguments) -> int:
     """Edit a scene, or list its parts."""
-    from ..scene.edit import box_of, edit_scene, read_surfaces
+    from ..scene.edit import edit_scene
 
     if a.out is not None:
         removed = [name for names in a.remove for name in names]
@@ -163,21 +175,23 @@ def edit_command(a: Arguments) -> int:
         return show(a.json, {"scene": str(folder)}, f"scene: {folder}\npicture: {folder / 'preview.png'}")
     if a.move or a.remove or a.replace:
         raise InputError("edit: give the folder of the edited scene (--out)")
-    surfaces, materials = read_surfaces(a.scene)
-    rows = [
-        {
-            "part": surface.name,
-            "material": materials.of(surface.name, surface.kind),
-            "box_m": box_of([surface]).round(3).tolist(),
-        }
-        for surface in surfaces
-    ]
-    width = max(len(row["part"]) for row in rows) + 2
-    lines = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"]
-    for row in rows:
-        low, high = (" ".join(f"{value:7.2f}" for value in corner) for corner in row["box_m"])
-        lines.append(f"{row['part']:<{width}}{row['material']:<24}{low:<24}{high}")
+    rows, lines = _parts(a.scene)
     return show(a.json, {"scene": a.scene, "parts": rows}, "\n".join(lines))
+
+
+def _parts(scene: str) -> tuple[list[dict[str, Any]], list[str]]:
+    """Name, material and box of each part of a scene, as values and as lines of a table."""
+    from ..scene.edit import box_of, read_surfaces
+
+    surfaces, materials = read_surfaces(scene)
+    width = max(len(surface.name) for surface in surfaces) + 2
+    lines, rows = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"], []
+    for surface in surfaces:
+        material, box_m = materials.of(surface.name, surface.kind), box_of([surface]).round(3)
+        rows.append({"part": surface.name, "material": material, "box_m": box_m.tolist()})
+        low, high = (" ".join(f"{value:7.2f}" for value in corner) for corner in box_m)
+        lines.append(f"{surface.name:<{width}}{material:<24}{low:<24}{high}")
+    return rows, lines
 
 
 def _names(text: str) -> tuple[str, ...]:

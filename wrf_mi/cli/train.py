@@ -22,6 +22,7 @@ HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
 BESIDE_RESUME = ("resume", "json", "help_settings", "call")  # arguments that ``--resume`` does not refuse
+UNSTATED = ("None", "False", "[]")  # arguments that the command line does not state, in Python's notation
 
 
 def add_parser(commands: Any) -> None:
@@ -43,8 +44,7 @@ def train_command(a: Arguments) -> int:
     if a.help_settings:
         return _show_settings()
     if a.resume:
-        values = (value for name, value in vars(a).items() if name not in BESIDE_RESUME)
-        if any(value is not None and value is not False and value != [] for value in values):
+        if any(repr(value) not in UNSTATED for name, value in vars(a).items() if name not in BESIDE_RESUME):
             raise InputError("--resume RUN goes on with the settings of RUN: omit data set and settings")
         return _resume(a)
     if not a.dataset or not a.out:
@@ -81,16 +81,7 @@ def training_request(a: Arguments) -> RunRequest:
     from ..runs.folder import RunRequest
 
     model = a.model or HYBRID
-    settings = [*a.set]
-    if getattr(a, "stages", None) is not None or getattr(a, "fast", False):  # trace has neither
-        settings = [*_stages(a, model), *settings]
-    if model == RAY_TRACING:
-        settings = [*_tracing_settings(a), *settings]
-    elif any(getattr(a, name) is not None for name in TRACING):
-        listed = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate"
-        raise InputError(f"{listed} belong to --model {RAY_TRACING}")
-    if a.preset is not None:
-        settings = [*_preset(a, model), *settings]
+    settings = [*_preset(a, model), *_tracing_settings(a, model), *_stages(a, model), *a.set]
     names = ("scene", "material", "receiver", "evaluation", "n_train", "min_rows", "deterministic", "intervals")
     stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
     antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
@@ -98,19 +89,25 @@ def training_request(a: Arguments) -> RunRequest:
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
+    """Setting of ``--stages`` or ``--fast``, neither of which trace has."""
     from ..models.hybrid.scene_side import FAST
 
+    stages, fast = getattr(a, "stages", None), getattr(a, "fast", False)
+    if stages is None and not fast:
+        return []
     if model != HYBRID:
         raise InputError(f"--stages and --fast belong to --model {HYBRID}, not to {model}")
-    if a.stages is not None and a.fast:
+    if stages is not None and fast:
         raise InputError("--fast limits the stages, too: give one of --stages and --fast")
-    return [f"stages={a.stages or ','.join(FAST)}"]
+    return [f"stages={stages or ','.join(FAST)}"]
 
 
 def _preset(a: Arguments, model: str) -> tuple[str, ...]:
     from ..datasets.registry import stated_task
     from ..models import known_model
 
+    if a.preset is None:
+        return ()
     # A data set that is neither a path nor known is refused when it is read.
     presets = known_model(model).serving(stated_task(a.dataset) or "spectrum", a.scene is not None).presets
     if a.preset not in presets:
@@ -118,32 +115,42 @@ def _preset(a: Arguments, model: str) -> tuple[str, ...]:
     return presets[a.preset]
 
 
-def _tracing_settings(a: Arguments) -> list[str]:
-    from ..tracing.convergence import CHOSEN_KINDS
+def _tracing_settings(a: Arguments, model: str) -> list[str]:
     from ..tracing.options import stated_kinds
 
-    target = getattr(a, "target_error", None)  # an option of trace
-    for name in ("depth", "rays"):
-        if target is not None and getattr(a, name) is not None:
-            raise InputError(f"trace: --target-error chooses what --{name} states; give one of them")
+    if model != RAY_TRACING:
+        if any(getattr(a, name) is not None for name in TRACING):
+            listed = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate"
+            raise InputError(f"{listed} belong to --model {RAY_TRACING}")
+        return []
     # Trained paths are searched with the default seed; --seed is that of training and split.
     seed = None if a.calibrate is not None else a.seed
-    numbers = {"depth": a.depth, "reflections": a.reflections, "rays": a.rays, "seed": seed}
-    numbers["phase_error"] = a.phase_error
-    stated: dict[str, Any] = {key: value for key, value in numbers.items() if value is not None}
-    if a.rays is not None and a.rays != "auto":
-        if not a.rays.isdecimal():
-            raise InputError(f'rays {a.rays!r}: give a whole number, or "auto"')
-        stated["rays"] = int(a.rays)
-    if a.paths is not None:
-        stated |= stated_kinds(a.paths)
-    if target is not None:
-        # A kind in --paths is permitted, and switched on where it contributes.
-        kinds = [kind for kind in CHOSEN_KINDS if a.paths is None or stated[kind]]
-        stated |= {**dict.fromkeys(CHOSEN_KINDS, False), "target_error_db": target, "target_kinds": ",".join(kinds)}
-    if a.calibrate is not None:
-        stated["calibration"] = a.calibrate
-    return [f"{key}={json.dumps(value)}" for key, value in stated.items()]
+    kinds = {} if a.paths is None else stated_kinds(a.paths)
+    stated = {"depth": a.depth, "reflections": a.reflections, "rays": _rays(a.rays), "seed": seed}
+    stated |= {"phase_error": a.phase_error, **kinds}
+    if (target := getattr(a, "target_error", None)) is not None:  # an option of trace
+        stated |= _target_settings(a, target, kinds)
+    stated["calibration"] = a.calibrate
+    return [f"{key}={json.dumps(value)}" for key, value in stated.items() if value is not None]
+
+
+def _rays(text: str | None) -> int | str | None:
+    if text in (None, "auto"):
+        return text
+    if not text.isdecimal():
+        raise InputError(f'rays {text!r}: give a whole number, or "auto"')
+    return int(text)
+
+
+def _target_settings(a: Arguments, target_db: float, kinds: dict[str, bool]) -> dict[str, Any]:
+    """Settings of ``--target-error``: a kind in ``--paths`` is permitted, and switched on where it contributes."""
+    from ..tracing.convergence import CHOSEN_KINDS
+
+    for name in ("depth", "rays"):
+        if getattr(a, name) is not None:
+            raise InputError(f"trace: --target-error chooses what --{name} states; give one of them")
+    permitted = ",".join(kind for kind in CHOSEN_KINDS if kinds.get(kind, not kinds))
+    return {**dict.fromkeys(CHOSEN_KINDS, False), "target_error_db": target_db, "target_kinds": permitted}
 
 
 def _show_settings() -> int:

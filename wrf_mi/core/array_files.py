@@ -55,14 +55,10 @@ def stored_arrays(path: Path, names: Collection[str] | None = None) -> dict[str,
     Call it within `wrf_mi.core.files.readable`: a damaged file raises a dozen kinds of error. `InputError` for arrays
     that do not fit into memory.
     """
-    size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        chosen = {name: info for name, info in members.items() if names is None or name in names}
-        for name, info in chosen.items():
-            if info.file_size > RATIOS.get(info.compress_type, 0) * min(info.compress_size, size):
-                raise ValueError(f"array {name} states more content than it has")
-        require_memory(sum(info.file_size for info in chosen.values()), f"{path}: its content", REMEDY)
+        chosen = members if names is None else {name: info for name, info in members.items() if name in names}
+        _check_sizes(path, chosen)
         arrays = {}
         for name, info in chosen.items():
             with archive.open(info) as member:
@@ -70,6 +66,15 @@ def stored_arrays(path: Path, names: Collection[str] | None = None) -> dict[str,
     if names is None and CHECKSUM in arrays and str(arrays.pop(CHECKSUM)) != content_digest(arrays):
         raise ValueError("its content has changed since it was written: another checksum")
     return arrays
+
+
+def _check_sizes(path: Path, members: Mapping[str, zipfile.ZipInfo]) -> None:
+    """Refuse members of an archive that state more content than they can have, or than memory has room for."""
+    size = path.stat().st_size
+    for name, info in members.items():
+        if info.file_size > RATIOS.get(info.compress_type, 0) * min(info.compress_size, size):
+            raise ValueError(f"array {name} states more content than it has")
+    require_memory(sum(info.file_size for info in members.values()), f"{path}: its content", REMEDY)
 
 
 def stored_names(path: Path) -> set[str]:

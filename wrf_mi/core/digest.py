@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from itertools import chain
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -32,23 +34,24 @@ def _add(digest: Any, value: Any) -> None:
     elif isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype.str} {value.shape}\n".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
-    elif is_dataclass(value) and not isinstance(value, type):
-        digest.update(f"{type(value).__name__}\n".encode())
-        _add(digest, {field.name: getattr(value, field.name) for field in fields(value) if field.compare})
+    elif is_dataclass(type(value)):
+        content = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
+        _add_all(digest, type(value).__name__, (content,))
     elif isinstance(value, Mapping):
-        digest.update(f"mapping {len(value)}\n".encode())
-        for key in sorted(value):
-            _add(digest, key)
-            _add(digest, value[key])
+        _add_all(digest, f"mapping {len(value)}", chain.from_iterable(sorted(value.items())))
     elif isinstance(value, (tuple, list)):
-        digest.update(f"sequence {len(value)}\n".encode())
-        for item in value:
-            _add(digest, item)
-    elif value is None or isinstance(value, (str, int, float, np.generic)):
+        _add_all(digest, f"sequence {len(value)}", value)
+    elif isinstance(value, (str, int, float, np.generic, NoneType)):
         digest.update(f"{value!r}\n".encode())
     else:
         text = f"content_digest: {type(value).__name__} has no digest"
         raise TypeError(f"{text}; give arrays, data classes or plain values")
+
+
+def _add_all(digest: Any, kind: str, values: Iterable[Any]) -> None:
+    digest.update(f"{kind}\n".encode())
+    for value in values:
+        _add(digest, value)
 
 
 def _add_files(digest: Any, path: Path) -> None:

@@ -121,23 +121,25 @@ def remove_leftovers(folder: Path, name: str | None = None) -> None:
     """
     for path in folder.glob(".*.*") if name is not None else folder.rglob(".*.*"):
         leftover = LEFTOVER.fullmatch(path.name)
-        if leftover is None:
-            continue
         # Files of this process count: it makes each temporary file once.
-        if (process := int(leftover[2])) != os.getpid() and psutil.pid_exists(process):
+        if leftover is None or ((process := int(leftover[2])) != os.getpid() and psutil.pid_exists(process)):
             continue
         last = leftover[1]
         while inner := LEFTOVER.fullmatch(last):  # a temporary folder that is written atomically itself
             last = inner[1]
-        if name is not None and last != name:
-            continue
-        with suppress(OSError):
-            if leftover[3] == "old" and last == leftover[1] and not path.with_name(last).exists():
-                os.replace(path, path.with_name(leftover[1]))
-            elif path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink()
+        if name in (None, last):
+            with suppress(OSError):
+                _remove_leftover(path, path.with_name(last) if (last, "old") == leftover.group(1, 3) else None)
+
+
+def _remove_leftover(path: Path, former: Path | None) -> None:
+    """Give a replaced folder its former name, if it is free; remove all else."""
+    if former is not None and not former.exists():
+        os.replace(path, former)
+    elif path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink()
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from .types import Receiver
 SHOWN = 20  # largest number of names in an error message
 UNKNOWN = -1  # stored number of elements of a receiver without a known array
 CARRIERS = "receiver_frequency_hz"
+STORED = operator.attrgetter("name", "position_m", "orientation_xyzw", "antenna", "frequency_hz", "array_m")
 
 
 def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
@@ -52,13 +53,13 @@ def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
     Shapes, in the order below: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of
     each array; [all, 3] positions of all elements in the receivers' frames, metres; [n] carriers in Hz, if stated.
     """
-    arrays = [receiver.array_m for receiver in receivers]
-    carriers = np.array([np.nan if receiver.frequency_hz is None else receiver.frequency_hz for receiver in receivers])
+    names, positions_m, orientations, antennas, frequencies, arrays = zip(*map(STORED, receivers), strict=True)
+    carriers = np.array(frequencies, float)  # NaN in place of None
     return {
-        "receiver_name": np.array([receiver.name for receiver in receivers]),
-        "receiver_position_m": np.stack([receiver.position_m for receiver in receivers]),
-        "receiver_orientation_xyzw": np.stack([receiver.orientation_xyzw for receiver in receivers]),
-        "receiver_antenna": np.array([astuple(receiver.antenna) for receiver in receivers]),
+        "receiver_name": np.array(names),
+        "receiver_position_m": np.stack(positions_m),
+        "receiver_orientation_xyzw": np.stack(orientations),
+        "receiver_antenna": np.array(list(map(astuple, antennas))),
         "receiver_elements": np.array([UNKNOWN if array is None else len(array) for array in arrays]),
         "receiver_elements_m": np.concatenate([np.zeros((0, 3)), *(array for array in arrays if array is not None)]),
         **({} if np.isnan(carriers).all() else {CARRIERS: carriers}),

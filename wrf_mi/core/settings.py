@@ -11,7 +11,8 @@ import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, reduce
+from operator import getitem
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
@@ -108,8 +109,7 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
-        convert = _build if dataclasses.is_dataclass(hints[key]) else _convert
-        arguments[key] = convert(hints[key], value, source, f"{name}." if convert is _build else name)
+        arguments[key] = _convert(hints[key], value, source, name)
     return kind(**arguments)
 
 
@@ -121,7 +121,9 @@ def _number(value: Any) -> Any:
 
 
 def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
-    """A value of the type ``hint``."""
+    """A value of the type ``hint``, or settings of a dataclass."""
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, source, f"{name}.")
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
@@ -129,15 +131,19 @@ def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
         text = json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
         return _adapter(hint).validate_json(text, strict=True)
     except ValidationError as error:
-        first = error.errors()[0]
-    text = f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
+        raise InputError(f"{source}, setting {name}: {_mismatch(hint, value, error)}") from None
+
+
+def _mismatch(hint: Any, value: Any, error: ValidationError) -> str:
+    first: Any = error.errors()[0]
     if first["type"] == "literal_error":
-        text = f"{value!r}; choose from " + first["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
-    elif first["type"] in ("tuple_type", "missing", "too_long", "too_short"):
+        listed = first["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
+        return f"{value!r}; choose from {listed}"
+    if first["type"] in ("tuple_type", "missing", "too_long", "too_short"):
         parts = typing.get_args(hint) if typing.get_origin(hint) is tuple else (Ellipsis,)
         count = "" if Ellipsis in parts else f"{len(parts)} "
-        text = f"expected a list of {count}values, got {value!r}"
-    raise InputError(f"{source}, setting {name}: {text}")
+        return f"expected a list of {count}values, got {value!r}"
+    return f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
@@ -162,11 +168,8 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
             remedy = f"{meant}All are listed by `wrf-mi train --help-settings`"
             raise InputError(f"--set {setting}: unknown setting {key}; {remedy}")
         *parents, last = key.split(".")
-        node = values
-        for parent in parents:
-            node = node[parent]
         try:
-            node[last] = yaml.safe_load(text) if text.strip() else ""
+            reduce(getitem, parents, values)[last] = yaml.safe_load(text) if text.strip() else ""
         except (yaml.YAMLError, ValueError):  # the latter from text that looks like a date
             raise InputError(f"--set {setting}: {text!r} is no YAML value; put text in quotes") from None
     return settings_from(type(config), values, "--set")

@@ -151,7 +151,6 @@ def _places(
 
 
 def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float | None) -> dict[str, Any]:
-    """Attributes of the whole dataset."""
     config, headings, name = run.config, conditions.headings_rad, run.problem.record.name
     absolute = task.level_kind != "relative"
     attributes: dict[str, Any] = {"title": f"Radio map of {name} by {config.model}"}

@@ -101,12 +101,9 @@ def map_dataset(
         coordinates["axis"] = "axis", list("xyz")
         corners = places.triangles_m.astype(np.float32)
         data["triangle"] = ("point", "corner", "axis"), corners, _metres("corners of the triangle around each point")
-    for name, (units, long_name) in VARIABLES.items():
+    for name in VARIABLES:
         if name in values:
-            described = {"units": units, "long_name": long_name}
-            if name in LEVELS and level_unit != units:
-                described = {"units": level_unit, "long_name": f"{long_name}, relative to full scale"}
-            data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), described
+            data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), _described(name, level_unit)
     power = values[POWER]
     known = np.where(np.isfinite(power), power, -np.inf)
     best = np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
@@ -118,6 +115,13 @@ def map_dataset(
     }
     data[BEST] = dims, best.reshape(shape), flags
     return xr.Dataset(data, coordinates, {"Conventions": CONVENTIONS, **attributes})
+
+
+def _described(name: str, level_unit: str) -> dict[str, str]:
+    units, long_name = VARIABLES[name]
+    if name in LEVELS and level_unit != units:
+        return {"units": level_unit, "long_name": f"{long_name}, relative to full scale"}
+    return {"units": units, "long_name": long_name}
 
 
 def _metres(long_name: str) -> dict[str, str]:

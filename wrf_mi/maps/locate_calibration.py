@@ -190,22 +190,35 @@ def choose(
     plain, *others = scored(shared)
     gains = [0.0, *(_clear_gain(other - plain) for other in others)]
     best = shared[int(np.argmax(gains))]
-    silences = [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
+    silences = _silences_of_others(record, parts)
     if (silence := fit_silence(record, parts)) is not None:
         # Each fold is scored by the probability of the other folds, so that it cannot describe itself.
         gain = score([replace(best, silence=others) for others in silences]) - score([best] * len(parts))
         scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
         if _clear_gain(gain) > 0:
             best = replace(best, silence=silence)
-    errors, inside = [], []
+    errors_m, inside = _located(record, parts, candidates, best)
+    report(1.0)
+    return Calibration(best, None, len(errors_m), float(np.mean(errors_m)), float(np.mean(inside)), scores=scores)
+
+
+def _silences_of_others(record: Record, parts: Sequence[Located]) -> list[Silence | None]:
+    """Probability of receiving nothing for each fold, fitted to the others; to the only one where there are none."""
+    return [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
+
+
+def _located(
+    record: Record, parts: Sequence[Located], candidates: Candidates, form: Likelihood
+) -> tuple[list[float], list[bool]]:
+    """Horizontal errors of held-out rows in metres, and whether the region holds their position."""
+    errors_m, inside = [], []
     for part in parts:
         for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
-            probability = softmax(best.log(_strengths(record, part, row), *part.predicted))
+            probability = softmax(form.log(_strengths(record, part, row), *part.predicted))
             estimate, _, region = region_of(probability, candidates.distance_m, LEVEL)
-            errors.append(np.linalg.norm((candidates.positions_m[estimate] - place)[:2]))
-            inside.append(region[truth])
-    report(1.0)
-    return Calibration(best, None, len(errors), float(np.mean(errors)), float(np.mean(inside)), scores=scores)
+            errors_m.append(float(np.linalg.norm((candidates.positions_m[estimate] - place)[:2])))
+            inside.append(bool(region[truth]))
+    return errors_m, inside
 
 
 def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelihood:

@@ -44,14 +44,7 @@ def read_observations(
     field that is no number, or a row without any strength.
     """
     table = read_csv(Path(path), skip_blank=True)
-    names = [receiver.name for receiver in receivers]
-    columns = [_column(table, name) for name in names]
-    ignored = [column for name in left_out for column in _able(name)]
-    for column in table.header:
-        if column not in [*columns, *ignored] and (column.endswith(DBM) or column.startswith(RSSI)):
-            listed = ", ".join(names[:SHOWN_NAMES]) + (", ..." if len(names) > SHOWN_NAMES else "")
-            text = f"column {one_line(column)} names no receiver of the run ({one_line(listed)})"
-            raise DataFault(table.path, f"{text}; rename or remove it", line=1)
+    columns = _columns(table, [receiver.name for receiver in receivers], left_out)
     values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
     silent = np.flatnonzero(~np.isfinite(values).any(axis=0))
     if len(silent):
@@ -63,6 +56,18 @@ def read_observations(
     return values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None
 
 
+def _columns(table: CsvTable, names: Sequence[str], left_out: Collection[str]) -> list[str]:
+    """Columns of the receivers; `DataFault`: there is one of an unknown receiver."""
+    columns = [_column(table, name) for name in names]
+    ignored = [column for name in left_out for column in _able(name)]
+    strengths = [column for column in table.header if column.endswith(DBM) or column.startswith(RSSI)]
+    for column in [column for column in strengths if column not in (*columns, *ignored)]:
+        listed = ", ".join(names[:SHOWN_NAMES]) + (", ..." if len(names) > SHOWN_NAMES else "")
+        text = f"column {one_line(column)} names no receiver of the run ({one_line(listed)})"
+        raise DataFault(table.path, f"{text}; rename or remove it", line=1)
+    return columns
+
+
 def _able(name: str) -> list[str]:
     """Names that the column of a receiver may have."""
     number = name.removeprefix(ANCHOR)
@@ -70,7 +75,6 @@ def _able(name: str) -> list[str]:
 
 
 def _column(table: CsvTable, name: str) -> str:
-    """Column of a receiver."""
     able = _able(name)
     stated = [column for column in able if column in table.header]
     if not stated:

@@ -76,16 +76,15 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     walls = scene_cuts(run, float(dataset["height"])) if flat else []
     strongest = np.fmax.reduce(power, axis=0)
     for place, (axes, (name, number)) in enumerate(zip(grid.flat, panels, strict=False)):
-        values = strongest if number is None else power[number]
-        _draw_plan(axes, dataset, values, colours, walls) if flat else _draw_mesh(axes, dataset, values, colours)
-        _draw_points(axes, dataset, None if number is None else measured[number], number, colours)
+        values, rows = (strongest, None) if number is None else (power[number], measured[number])
+        if flat:
+            _draw_plan(axes, dataset, values, colours, walls)
+            _label_metres(axes, lowest=place + columns >= len(panels), leftmost=place % columns == 0)
+        else:
+            _draw_mesh(axes, dataset, values, colours)
+        _draw_points(axes, dataset, rows, number, colours)
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=6)
-        if flat:
-            lowest, leftmost = place + columns >= len(panels), place % columns == 0
-            axes.set_xlabel("x (m)" if lowest else "", fontsize=7)
-            axes.set_ylabel("y (m)" if leftmost else "", fontsize=7)
-            axes.tick_params(labelbottom=lowest, labelleft=leftmost)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     bar = figure.colorbar(colours, ax=list(grid.flat), shrink=0.8, extend="both", pad=0.02 if flat else 0.12)
@@ -131,6 +130,12 @@ def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
     """Lines [n, 2, 2] in which a height cuts each surface of a run's scene, metres; empty without a scene."""
     scene = run.problem.opened_scene
     return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
+
+
+def _label_metres(axes: Any, lowest: bool, leftmost: bool) -> None:
+    axes.set_xlabel("x (m)" if lowest else "", fontsize=7)
+    axes.set_ylabel("y (m)" if leftmost else "", fontsize=7)
+    axes.tick_params(labelbottom=lowest, labelleft=leftmost)
 
 
 def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:

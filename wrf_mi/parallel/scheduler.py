@@ -221,9 +221,7 @@ def open_scheduler(text: str | None) -> Scheduler:
     except ImportError:
         raise InputError("--scheduler: needs Dask; install it with: pip install 'wrf-mi[cluster]'") from None
     worker_environment()  # fails before anything is started where nothing can compute
-    # Lost and restarted workers show in the progress, or in the error that ends the command.
-    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    _silence_dask()
     if count is None:
         try:
             return Scheduler(Client(address, timeout=CONNECT_S, set_as_default=False))
@@ -241,6 +239,12 @@ def open_scheduler(text: str | None) -> Scheduler:
         silence_logs=logging.CRITICAL,
     )
     return Scheduler(Client(cluster, set_as_default=False), cluster)
+
+
+def _silence_dask() -> None:
+    """Lost and restarted workers show in the progress, or in the error that ends the command."""
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def _local_workers(text: str) -> int | None:

@@ -55,9 +55,7 @@ from ..datasets import make_splits
 from ..datasets.observations import LEAST_ROWS, check_observations, fitted_receivers, place_of, warn_of_left_out
 from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
-from ..models.calibrated import WithIntervals
 from ..models.checks import check_held_receivers, check_record
-from ..models.few_rows import with_few_rows
 from ..models.model import default_settings
 from ..models.receiver_places import check_surveyed, placed_problem, write_places
 from ..parallel import Scheduler
@@ -92,22 +90,13 @@ def plan_run(
 ) -> tuple[Problem, RunConfig, list[Split]]:
     """Problem, configuration and splits of a run; errors as those of `train`. Nothing is written."""
     scene = None if request.scene is None else str(request.scene)
-    entry = known_model(request.model)
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
-    check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
-    model = entry.serving(record.task, scene is not None)
-    for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
-        if getattr(request, option) is not None and option not in model.train_arguments:
-            able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
-            raise InputError(f"--{option} belongs to {data} ({able}), not to {request.model}")
+    model = _serving_model(record, request)
     _check_scene(model, record, scene, request)
     settings, seed, deterministic = _settings_of(model, request), request.seed, request.deterministic
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
-    split = default_split(record) if request.split is None else request.split
-    if request.split is None and split == NONE:
-        text = "%s: no official split, so --split none: scores are of folds held out in space, the model of all rows"
-        logger.warning(text, place_of(record))
+    split = _split_of(record, request)
     record, splits, left_out = _split_rows(record, split, seed, request.n_train, _least_rows(record, request))
     if scene is not None:
         check_surveyed(record)
@@ -115,17 +104,38 @@ def plan_run(
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
     problem = Problem(record, settings, seed, scene, request.material, request.antennas)
-    few = with_few_rows(model, record.task)
-    checked = WithIntervals(few) if request.intervals else few
-    checked.check(placed_problem(problem.seen(splits[0]), splits[0].all_train), splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
-    return problem, RunConfig(request.model, source, record.task, name, request.n_train, *options), splits
+    config = RunConfig(request.model, source, record.task, name, request.n_train, *options)
+    config.entry.check(placed_problem(problem.seen(splits[0]), splits[0].all_train), splits)
+    return problem, config, splits
+
+
+def _serving_model(record: Record, request: RunRequest) -> Model:
+    """Registry entry that serves a record; `InputError`: none does, or arguments belong to other models."""
+    entry = known_model(request.model)
+    check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
+    model = entry.serving(record.task, request.scene is not None)
+    for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
+        if getattr(request, option) is not None and option not in model.train_arguments:
+            able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
+            raise InputError(f"--{option} belongs to {data} ({able}), not to {request.model}")
+    return model
+
+
+def _split_of(record: Record, request: RunRequest) -> str | Split:
+    """Stated split, else the official one, or `NONE` with a warning."""
+    if request.split is not None:
+        return request.split
+    split = default_split(record)
+    if split == NONE:
+        text = "%s: no official split, so --split none: scores are of folds held out in space, the model of all rows"
+        logger.warning(text, place_of(record))
+    return split
 
 
 def _settings_of(model: Model, request: RunRequest) -> Any:
-    """All settings of a model."""
     kind: Any = model.settings
     stated = request.settings
     if is_dataclass(stated) and not isinstance(stated, type):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,7 +28,7 @@ from .scene_view import scene_view
 INDEX = "index.html"
 QUANTILES = (0.1, 0.5, 0.9)  # quantiles of the first run's score at which spectra of test rows are shown
 
-Picture = tuple[str, str, Figure]  # file name, heading, figure
+Picture = tuple[str, str, Figure]  # name, heading, figure
 
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProgress = quiet) -> Path:
@@ -62,15 +64,18 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             drawn += shown
             files = [(folder / name, title) for name, title, _ in shown]
             sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
-        tables = {"compare": (COLUMNS, [row for section in sections for row in section.scores])}
-        changes = [row for section in sections for row in difference_rows(section.differences)]
-        for name, (columns, rows) in (tables | {"differences": (DIFFERENCES, changes)}).items():
-            write_csv(folder / f"{name}.csv", columns, ([row[key] for key in columns] for row in rows))
+        _write_table(folder / "compare.csv", COLUMNS, (section.scores for section in sections))
+        changes = (difference_rows(section.differences) for section in sections)
+        _write_table(folder / "differences.csv", DIFFERENCES, changes)
         for done, (name, _, figure) in enumerate(drawn):
             on_progress("drawing", done / len(drawn))
             write_figure(folder / name, figures.without_formulas(figure))
         write_atomically(folder / INDEX, page(sections, out))
     return out / INDEX
+
+
+def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Mapping[str, Any]]]) -> None:
+    write_csv(path, columns, ([row[key] for key in columns] for row in chain.from_iterable(rows)))
 
 
 def _is_comparison(folder: Path) -> bool:
@@ -100,41 +105,58 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     task = TASKS[runs[0].task]
     of_references = {name: run.reference_scores[key] for name, (run, key) in references(runs).items()}
     cdf = figures.score_cdf({run.name: run.score for run in runs}, of_references, task.label)
-    samples = _spectra(runs) if task.image else _maps(runs)
-    drawn: list[Picture] = [(f"{slug}-cdf.png", f"{task.label} over test rows", cdf), (f"{slug}-samples.png", *samples)]
+    drawn: list[tuple[str, str, Figure | None]] = [
+        ("cdf", f"{task.label} over test rows", cdf),
+        ("samples", *(_spectra(runs) if task.image else _maps(runs))),
+        ("time", "Time against error", _times(runs)),
+        ("stages", "What each stage contributes", _stages(runs)),
+        *_error_maps(runs),
+        ("scene", "Mesh, traced paths and the strongest Gaussians of the field", _scene(runs)),
+        ("training", "Training", _training(runs)),
+    ]
+    return [(f"{slug}-{name}.png", heading, figure) for name, heading, figure in drawn if figure is not None]
+
+
+def _times(runs: Sequence[Results]) -> Figure:
+    """Median scores over the times of a prediction and of the training."""
+    task = TASKS[runs[0].task]
     better = "higher" if task.higher_is_better else "lower"
     medians = {run.name: run.metrics[task.block]["median"] for run in runs}
     times = {"ms per sample": "ms_per_sample", "training time (s)": "train_seconds"}
     panels = {words: {run.name: float(run.metrics[key]) for run in runs} for words, key in times.items()}
-    scatter = figures.time_scatter(panels, medians, f"median {task.label}\n({better} is better)")
-    drawn.append((f"{slug}-time.png", "Time against error", scatter))
-    if staged := {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}:
-        drawn.append((f"{slug}-stages.png", "What each stage contributes", figures.stage_steps(staged, task.label)))
-    if np.isfinite(runs[0].tx_pos_m).all():
-        drawn += _error_maps(slug, runs)
-    if (view := _scene(runs)) is not None:
-        drawn.append((f"{slug}-scene.png", "Mesh, traced paths and the strongest Gaussians of the field", view))
-    if curves := {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}:
-        drawn.append((f"{slug}-training.png", "Training", figures.training_curves(curves, task.label)))
-    return drawn
+    return figures.time_scatter(panels, medians, f"median {task.label}\n({better} is better)")
 
 
-def _error_maps(slug: str, runs: Sequence[Results]) -> list[Picture]:
-    """Scores over the first run's test positions, and the best run at each that several predict."""
+def _stages(runs: Sequence[Results]) -> Figure | None:
+    """What the stages of fits in stages contribute; None without such a fit."""
+    stages = {run.name: run.metrics["stages"] for run in runs if run.metrics.get("stages")}
+    return figures.stage_steps(stages, TASKS[runs[0].task].label) if stages else None
+
+
+def _training(runs: Sequence[Results]) -> Figure | None:
+    """Scores on validation rows over the time of training; None where no run has stored any."""
+    curves = {f"{run.name} {fold}".strip(): points for run in runs for fold, points in run.validation.items()}
+    return figures.training_curves(curves, TASKS[runs[0].task].label) if curves else None
+
+
+def _error_maps(runs: Sequence[Results]) -> list[Picture]:
+    """Scores over the first run's test positions, and the best run at each that several predict; none without them."""
     first, task = runs[0], TASKS[runs[0].task]
+    if not np.isfinite(first.tx_pos_m).all():
+        return []
     scores = np.stack([_score_at(run, where) for run, where in zip(runs, indices(runs), strict=True)])
     shown: list[FloatArray | None] = [None if np.isnan(of_run).all() else of_run for of_run in scores]
     names = [run.name for run in runs]
     where = "over receivers, " if len(first.receivers) > 1 else ""
     table = figures.position_table([("", shown)], names, first.tx_pos_m, task.label)
     heading = f"{task.label} at the test positions of {first.name} (mean {where}seen from above)"
-    maps: list[Picture] = [(f"{slug}-errors.png", heading, table)]
+    maps: list[Picture] = [("errors", heading, table)]
     several = (~np.isnan(scores)).sum(axis=0) > 1
     if several.any():
         ranked = np.where(np.isnan(scores), -np.inf, scores if task.higher_is_better else -scores)
         best = np.where(several, ranked.argmax(axis=0), -1)
         figure = figures.choice_map(best, names, first.tx_pos_m)
-        maps.append((f"{slug}-best.png", "Best run at each test position that several runs predict", figure))
+        maps.append(("best", "Best run at each test position that several runs predict", figure))
     return maps
 
 

@@ -8,7 +8,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from importlib.resources import files
@@ -109,28 +109,31 @@ def _better(run: Results) -> str:
 
 
 def _facts(runs: Sequence[Results]) -> str:
-    """What was compared, on which rows."""
     first, task = runs[0], TASKS[runs[0].task]
-    known = {dataset.name: dataset for dataset in KNOWN}.get(first.dataset)
-    origin = f"{first.dataset or 'unknown'}" + ("" if known is None else f" ({known.licence}; {known.origin})")
+    origins = {known.name: f" ({known.licence}; {known.origin})" for known in KNOWN}
+    origin = (first.dataset or "unknown") + origins.get(first.dataset, "")
     form = "{split}: {n_train} training rows, {n_test} test rows"
-    count = len(first.receivers)
-    receivers = f"{count} receivers" if count > 1 else "1 receiver"
+    receivers = f"{len(first.receivers)} receiver{'s' if len(first.receivers) > 1 else ''}"
     facts = {"data": origin, "task": f"{task.heading}, {receivers}"}
     facts["score"] = f"{task.label}, {_better(first)}. {task.note}"
-    facts["rows"] = "; ".join(dict.fromkeys(form.format_map(run.metrics) for run in runs))
+    facts["rows"] = _distinct(form.format_map(run.metrics) for run in runs)
     if len(runs) > 1:
         count = len({row for _, row in common(runs)})
         text = "; pairs are compared on the rows that both have" if count else ", so means differ in rows"
         facts["common"] = f"{count} test rows are common to all runs{text}"
-    facts["reference"] = "; ".join(dict.fromkeys(run.reference_name for run in runs)) + " (of the same training rows)"
-    if scenes := dict.fromkeys(str(run.metrics["scene"]) for run in runs if run.metrics.get("scene")):
-        facts["scene"] = "; ".join(scenes)
+    facts["reference"] = _distinct(run.reference_name for run in runs) + " (of the same training rows)"
+    facts["scene"] = _distinct(str(run.metrics.get("scene") or "") for run in runs)
     return _definitions(facts)
 
 
+def _distinct(texts: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(filter(None, texts)))
+
+
 def _definitions(facts: Mapping[str, str]) -> str:
-    return "<dl>" + "".join(f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items()) + "</dl>"
+    """Facts as a list of definitions; empty ones are left out."""
+    terms = (f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items() if words)
+    return f"<dl>{''.join(terms)}</dl>"
 
 
 def _models(runs: Sequence[Results]) -> str:
@@ -208,22 +211,25 @@ def changed_settings(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value != standard[name]}
 
 
+def _options(config: RunConfig) -> dict[str, Any]:
+    """Options of `train` that a run was made with; None for those that were not stated."""
+    options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
+    options |= {field.name: getattr(config.antennas, field.name) for field in fields(AntennaOptions)}
+    standard = default_settings(config.entry, (), {})
+    for name in ("receiver", "evaluation"):
+        if name in config.entry.train_arguments and getattr(config.settings, name) != getattr(standard, name):
+            options[name] = getattr(config.settings, name)
+    return options | {"seed": config.seed or None}
+
+
 def command(config: RunConfig, folder: Path) -> str:
     """The line that repeats a run; data sets passed as objects are named by their folder, rows by their split."""
     entry, settings = config.entry, config.settings
-    options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
-    options |= {field.name: getattr(config.antennas, field.name) for field in fields(AntennaOptions)}
-    for name in ("receiver", "evaluation"):
-        value = getattr(settings, name) if name in entry.train_arguments else None
-        if value is not None and value != getattr(default_settings(entry, (), {}), name):
-            options[name] = value
     changed = changed_settings(config)
-    if config.seed:
-        options["seed"] = config.seed
-        if "seed" not in entry.train_arguments and hasattr(settings, "seed"):
-            changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
+    if config.seed and "seed" not in entry.train_arguments and hasattr(settings, "seed"):
+        changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
     words = ["wrf-mi", "train", config.dataset, "--model", config.model, "--split", config.split]
-    for name, value in options.items():
+    for name, value in _options(config).items():
         words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
     words += [f"--{name}" for name in ("deterministic", "intervals") if getattr(config, name)]
     for name, value in changed.items():

@@ -91,18 +91,11 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
             received no training row.
     """
     rows = split.test
-    if len(rows) == 0:
-        raise InputError(f"split {split.name}: no test rows to score; use another split")
-    truth, broken = scorable(record.scored[:, rows])
-    scored = split.held_receivers or tuple(range(len(truth)))
-    trained = np.setdiff1d(np.arange(len(truth)), scored)
-    truth[trained] = np.nan
-    if np.isnan(truth).all():
-        raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
-    predicted = [predict(rows, receiver) for receiver in scored]
+    truth, broken, scored = _truth(record, split)
+    predicted = (predict(rows, receiver) for receiver in scored)
     stated = [p if isinstance(p, Prediction) else Prediction(p) for p in predicted]
     prediction = np.full((len(truth), *stated[0].mean.shape), np.nan, truth.dtype)
-    prediction[list(scored)] = [p.mean for p in stated]
+    prediction[scored] = [p.mean for p in stated]
     arrays = {
         "row": rows,
         "prediction": prediction,
@@ -115,24 +108,36 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     }
     if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
-        arrays["std"][list(scored)] = [p.stated_std for p in stated]
-    few = _few_rows(record, split)
+        arrays["std"][scored] = [p.stated_std for p in stated]
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
-        **({FEW: few} if few else {}),
+        **_few_rows(record, split),
         "n_train": len(split.all_train),
         "ms_per_sample": _milliseconds_per_sample(single or predict, rows, scored[0]),
     }
     return metrics, arrays
 
 
-def _few_rows(record: Record, split: Split) -> dict[str, int]:
-    """Receivers of signal strengths with fewer than `FEW_ROWS` training rows that a split trains, and their rows."""
+def _truth(record: Record, split: Split) -> tuple[NDArray[Any], int, list[int]]:
+    """Test rows' observations, NaN where they are not scored, the number of broken ones, and scored receivers."""
+    if len(split.test) == 0:
+        raise InputError(f"split {split.name}: no test rows to score; use another split")
+    truth, broken = scorable(record.scored[:, split.test])
+    scored = list(split.held_receivers or range(len(truth)))
+    truth[np.setdiff1d(np.arange(len(truth)), scored)] = np.nan
+    if np.isnan(truth).all():
+        raise InputError(f"{record.name}, split {split.name}: no test row to score is finite; use another split")
+    return truth, broken, scored
+
+
+def _few_rows(record: Record, split: Split) -> dict[str, dict[str, int]]:
+    """Block of the receivers of signal strengths with fewer than `FEW_ROWS` training rows that a split trains."""
     if not TASKS[record.task].in_decibel:
         return {}
     counts = rows_received(record, split.all_train)
     trained = np.setdiff1d(np.flatnonzero(counts < FEW_ROWS), split.held_receivers)
-    return {record.receivers[number].name: int(counts[number]) for number in trained}
+    few = {record.receivers[number].name: int(counts[number]) for number in trained}
+    return {FEW: few} if few else {}
 
 
 def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
@@ -294,10 +299,16 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
     deviation of the same shape, real.
     """
-    single = len(arrays["receiver_name"]) == 1
-    written = {k: v[0] if single and k not in SHARED else v for k, v in arrays.items()}
+    written = without_single_axis(arrays)
     write_arrays(path, written, compressed=True)
     return written
+
+
+def without_single_axis(arrays: dict[str, Any]) -> dict[str, Any]:
+    """Arrays without their first axis where there is one receiver."""
+    if len(arrays["receiver_name"]) > 1:
+        return arrays
+    return {key: values if key in SHARED else values[0] for key, values in arrays.items()}
 
 
 def stored_metrics(folder: Path) -> dict[str, Any]:
@@ -326,26 +337,32 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
     if record.uplink is not None and task.from_uplink:
         predictions[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers))
     if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
-        alone = split.held_receivers and not len(split.left)
-        key, entry = (LAW, MRI) if alone else (task.reference, IDW)
-        plain = replace(split, train=split.all_train, validation=split.validation[:0])
-        problem = Problem(record, default_settings(entry, (), {})).seen(split)
-        fitted = with_few_rows(entry, record.task).fit(problem, plain, Session(Path(), Path()))  # writes no file
-
-        def of_all(inputs: Inputs) -> NDArray[Any]:
-            return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])
-
-        inputs = inputs_of(record, rows)
-        predictions[key] = of_all(inputs)
-        if record.carriers_hz is not None and inputs.carriers_hz is not None:
-            known = np.unique(record.carriers_hz[split.all_train])
-            nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
-            if (nearest != inputs.carriers_hz).any():
-                predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
+        predictions |= _interpolated(record, split)
     if not predictions:
         lacking = "positions" + (" and uplink" if task.from_uplink else "")
         raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
     return {key: values.astype(kind) for key, values in predictions.items()}
+
+
+def _interpolated(record: Record, split: Split) -> dict[str, NDArray[Any]]:
+    """References [n_rx, m, ...] that are computed from the positions of training rows."""
+    alone = split.held_receivers and not len(split.left)
+    key, entry = (LAW, MRI) if alone else (TASKS[record.task].reference, IDW)
+    plain = replace(split, train=split.all_train, validation=split.validation[:0])
+    problem = Problem(record, default_settings(entry, (), {})).seen(split)
+    fitted = with_few_rows(entry, record.task).fit(problem, plain, Session(Path(), Path()))  # writes no file
+
+    def of_all(inputs: Inputs) -> NDArray[Any]:
+        return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])
+
+    inputs = inputs_of(record, split.test)
+    predictions = {key: of_all(inputs)}
+    if record.carriers_hz is not None and inputs.carriers_hz is not None:
+        known = np.unique(record.carriers_hz[split.all_train])
+        nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
+        if (nearest != inputs.carriers_hz).any():
+            predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
+    return predictions
 
 
 def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:

@@ -46,7 +46,6 @@ def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
 
 
 def _sky(axes: Axes, title: str, ring_labels: str) -> None:
-    """Rings of elevation and spokes of azimuth."""
     axes.set_rlim(0, 90)  # type: ignore[attr-defined]
     axes.set_yticks([30, 60, 90], ["60°", "30°", ""], fontsize=6, color=ring_labels)
     axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"], fontsize=6)
@@ -198,25 +197,28 @@ def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = 
     order = sorted(names, key=[*STAGES, *names].index)
     figure = Figure(figsize=(1.2 * len(order) + 3.5, 4), layout="constrained")
     axes = figure.subplots()
-    for name, reports in stages.items():
-        used, color = [report for report in reports if report["kept"]], None
+    for number, (name, reports) in enumerate(stages.items()):
+        color, used = f"C{number}", [report for report in reports if report["kept"]]
         for key, style, what in (("held_out", "-", "held-out rows"), ("test", "--", "test rows")):
-            places, scores = _scored(used, key, order)
-            (line,) = axes.plot(places, scores, style, marker="o", color=color, label=f"{name}, {what}")
-            color = line.get_color()
+            axes.plot(*_scored(used, key, order), style, marker="o", color=color, label=f"{name}, {what}")
         rejected = _scored([report for report in reports if not report["kept"]], "held_out", order)
         axes.scatter(*rejected, facecolors="none", edgecolors=color, zorder=3)
-        for report in reports:
-            costs = [f"{report[key]:.3g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if report.get(key)]
-            score = report["held_out"] if report["held_out"] is not None else report.get("test")
-            if costs and score is not None:
-                at, text = (order.index(report["stage"]), score), ", ".join(costs)
-                axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
+        _annotate_costs(axes, reports, order, color)
     axes.set_xticks(range(len(order)), order)
     axes.set(xlim=(-0.2, len(order) - 0.5), ylabel=f"mean {label}")  # the last label lies beside its point
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure
+
+
+def _annotate_costs(axes: Axes, reports: Sequence[Mapping[str, Any]], order: Sequence[str], color: str) -> None:
+    """Write seconds and milliseconds of stages beside their scores."""
+    for report in reports:
+        costs = [f"{report[key]:.3g} {unit}" for key, unit in (("seconds", "s"), ("ms", "ms")) if report.get(key)]
+        score = report["held_out"] if report["held_out"] is not None else report.get("test")
+        if costs and score is not None:
+            at, text = (order.index(report["stage"]), score), ", ".join(costs)
+            axes.annotate(text, at, (4, -10), textcoords="offset points", fontsize=7, color=color)
 
 
 def _scored(reports: Sequence[Mapping[str, Any]], key: str, order: Sequence[str]) -> tuple[list[int], list[float]]:
@@ -226,7 +228,6 @@ def _scored(reports: Sequence[Mapping[str, Any]], key: str, order: Sequence[str]
 
 
 def _style(number: int) -> dict[str, Any]:
-    """Marker and colour of one of many series."""
     return {"marker": MARKERS[number // COLOURS % len(MARKERS)], "color": f"C{number % COLOURS}", "linestyle": "none"}
 
 

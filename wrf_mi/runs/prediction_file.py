@@ -22,7 +22,7 @@ from ..core.files import one_line, write_csv
 from ..datasets.folder_files import read_csv
 from ..models.model import Inputs
 from ..tasks import TASKS
-from .evaluate import stored_metrics, write_predictions
+from .evaluate import stored_metrics, without_single_axis, write_predictions
 from .folder import METRICS
 
 NPZ, CSV = ".npz", ".csv"
@@ -53,17 +53,21 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
     return inputs
 
 
+def _check_uplink(path: Path, uplink: NDArray[Any], positions: int) -> None:
+    if uplink.ndim != 3 or uplink.dtype.kind != "c":
+        text = f"uplink has shape {list(uplink.shape)} of {uplink.dtype}"
+        raise InputError(f"{path}: {text}; store complex numbers [m, antennas, subcarriers]")
+    if len(uplink) != positions:
+        raise InputError(f"{path}: {len(uplink)} rows of uplink and {positions} positions; give one each")
+    bad = np.flatnonzero(~np.isfinite(uplink).all(axis=(1, 2)))
+    if len(bad):
+        raise InputError(f"{path}, row {bad[0] + 1}: uplink is not finite; correct or remove the row")
+
+
 def _check_finite(path: Path, inputs: Inputs) -> None:
-    positions, uplink = inputs.tx_pos_m, inputs.uplink
-    if uplink is not None:
-        if uplink.ndim != 3 or uplink.dtype.kind != "c":
-            text = f"uplink has shape {list(uplink.shape)} of {uplink.dtype}"
-            raise InputError(f"{path}: {text}; store complex numbers [m, antennas, subcarriers]")
-        if len(uplink) != len(positions):
-            raise InputError(f"{path}: {len(uplink)} rows of uplink and {len(positions)} positions; give one each")
-        bad = np.flatnonzero(~np.isfinite(uplink).all(axis=(1, 2)))
-        if len(bad):
-            raise InputError(f"{path}, row {bad[0] + 1}: uplink is not finite; correct or remove the row")
+    positions = inputs.tx_pos_m
+    if inputs.uplink is not None:
+        _check_uplink(path, inputs.uplink, len(positions))
         if np.isnan(positions).all() and len(positions):
             return
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
@@ -136,6 +140,8 @@ def write_prediction_file(
     Returns:
         The arrays as an ``.npz`` file has them.
     """
+    optional = ((HEADING, inputs.tx_heading_rad), (FREQUENCY, inputs.carriers_hz))
+    stated = [(name, values) for name, values in optional if values is not None]
     arrays: dict[str, Any] = {"row": np.arange(len(inputs)), "tx_pos": inputs.tx_pos_m}
     arrays["receiver_name"] = np.asarray(receivers)
     if inputs.carriers_hz is not None:
@@ -143,12 +149,10 @@ def write_prediction_file(
     if out.suffix.lower() == NPZ:
         return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
-    columns: list[tuple[str, Any]] = list(zip("xyz", inputs.tx_pos_m.T, strict=True))
-    for name, values in ((HEADING, inputs.tx_heading_rad), (FREQUENCY, inputs.carriers_hz)):
-        columns += [] if values is None else [(name, values)]
+    columns: list[tuple[str, Any]] = [*zip("xyz", inputs.tx_pos_m.T, strict=True), *stated]
     for key, suffix in (("prediction", "dbm"), ("std", "std_db")):
         if key in observations:
             columns += [(f"{name}_{suffix}", v) for name, v in zip(receivers, observations[key], strict=True)]
-    write_csv(out, [name for name, _ in columns], zip(*(values for _, values in columns), strict=True))
-    single = len(receivers) == 1
-    return arrays | {key: values[0] if single else values for key, values in observations.items()}
+    names, values = zip(*columns, strict=True)
+    write_csv(out, names, zip(*values, strict=True))
+    return without_single_axis(arrays | observations)

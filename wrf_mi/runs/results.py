@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -105,8 +105,6 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
     task = TASKS[metrics["task"]]
     references = [key for key in task.references if key in metrics["reference"]]
     arrays = _read_predictions(folder / PREDICTIONS, task, references)
-    parts = [folder, *sorted(p for p in folder.glob("fold*") if p.is_dir())]
-    curves = {p.name if p != folder else "": _read_log(p / LOG) for p in parts}
     return Results(
         path=folder,
         name=name or folder.resolve().name,
@@ -121,7 +119,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
         truth=arrays["truth"],
         references={key: arrays[reference_key(key)] for key in references},
         std=arrays.get("std"),
-        validation={fold: points for fold, points in curves.items() if points},
+        validation=_read_logs(folder),
     )
 
 
@@ -147,8 +145,7 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     with readable(path, missing, REMEDY):
         metrics = json.loads(path.read_text())
     needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
-    if absent := [key for key in needed if key not in metrics]:
-        raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
+    _require(path, metrics, needed)
     if metrics["task"] not in TASKS:
         raise InputError(f"{path}: task {metrics['task']!r}; known are {', '.join(TASKS)}")
     task, stored = TASKS[metrics["task"]], metrics.get("reference")
@@ -161,24 +158,39 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     return dict(metrics)
 
 
+def _require(path: Path, stored: Collection[str], keys: Iterable[str]) -> None:
+    if absent := [key for key in keys if key not in stored]:
+        raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
+
+
 def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict[str, Any]:
     observed = ["prediction", "truth", *map(reference_key, references)]
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
-    if absent := [key for key in ("row", "tx_pos", "receiver_name", *observed) if key not in stored]:
-        raise InputError(f"{path}: no {', '.join(absent)}; {REMEDY}")
-    observed += ["std"] if "std" in stored else []
+    _require(path, stored, ("row", "tx_pos", "receiver_name", *observed))
+    observed += {"std"} & stored.keys()
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
     names = stored["receiver_name"]
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())
     if len(names) == 1:
         arrays |= {key: arrays[key][None] for key in observed}
     shape, rows = arrays["truth"].shape, len(arrays["row"])
-    fits = 0 <= len(shape) - 2 - task.axes <= task.more_axes
-    fits = fits and shape[:2] == (len(names), rows) and arrays["tx_pos"].shape == (rows, 3)
-    if not fits or any(arrays[key].shape != shape for key in observed):
+    fits = (
+        {arrays[key].shape for key in observed} == {shape},
+        shape[:2] == (len(names), rows),
+        0 <= len(shape) - 2 - task.axes <= task.more_axes,
+        arrays["tx_pos"].shape == (rows, 3),
+    )
+    if not all(fits):
         raise InputError(f"{path}: shapes do not fit together ({shapes}); {REMEDY}")
     return arrays | {"receiver_name": names}
+
+
+def _read_logs(run: Path) -> dict[str, list[tuple[float, float]]]:
+    """Content of the logs of a run and of its folds that are not empty, by the fold's name."""
+    folds = {fold.name: fold for fold in sorted(run.glob("fold*"))}
+    curves = {name: _read_log(folder / LOG) for name, folder in {"": run, **folds}.items()}
+    return {name: points for name, points in curves.items() if points}
 
 
 def _read_log(path: Path) -> list[tuple[float, float]]:

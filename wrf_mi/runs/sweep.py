@@ -15,7 +15,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +27,7 @@ from defusedxml.ElementTree import parse
 
 from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
-from ..core.files import one_line, write_atomically, write_csv
+from ..core.files import one_line, readable, write_atomically, write_csv
 from ..datasets.registry import locate
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
@@ -102,39 +102,55 @@ def plan_sweep(
     Raises:
         InputError: nothing varies, a key or value is given twice, or two runs would have the same name.
     """
-    choices: dict[str, list[str]] = {}
     fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
-    fixed |= {flag.removeprefix("--") for flag in flags}
-    for text in vary:
-        key, equals, listed = (part.strip() for part in text.partition("="))
-        values = [value.strip() for value in listed.split(";" if ";" in listed else ",")]
-        if not key or not equals or not all(values):
-            raise InputError(f"--vary {text}: expected KEY=VALUE,VALUE,..., such as seed=0,1,2")
-        if key in choices or key in fixed:
-            raise InputError(f"--vary {text}: {key} is given already; give it once")
-        if len(set(values)) < len(values):
-            raise InputError(f"--vary {text}: a value is given twice; leave it out")
-        if key in FLAGS and not set(values) <= {"true", "false"}:
-            raise InputError(f"--vary {text}: {key} is on or off; give true, false")
-        choices[key] = values
-    if not choices:
-        raise InputError("sweep: nothing varies; give --vary KEY=VALUE,VALUE,... once or more")
+    choices = _choices(vary, fixed | {flag.removeprefix("--") for flag in flags})
     runs: dict[str, SweepRun] = {}
     for chosen in itertools.product(*choices.values()):
         varied = dict(zip(choices, chosen, strict=True))
-        words = {key: re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-" for key, value in varied.items()}
-        name = ",".join(f"{key}={word}" for key, word in words.items())
+        words = (re.sub(r"[^\w.+-]+", "-", value).strip("-") or "-" for value in chosen)
+        name = ",".join(map("=".join, zip(choices, words, strict=True)))
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        stated_options = {**options, **{key: value for key, value in varied.items() if key in OPTIONS}}
-        dataset = [stated_options.pop("dataset")] if "dataset" in stated_options else []
-        arguments = [part for key, value in stated_options.items() for part in (f"--{key}", value)]
-        switched = [f"--{key}" for key, value in varied.items() if key in FLAGS and value == "true"]
-        stated = [*settings, *(f"{key}={value}" for key, value in varied.items() if key not in (*OPTIONS, *FLAGS))]
-        set_all = [part for setting in stated for part in ("--set", setting)]
-        runs[name] = SweepRun(Path(out) / name, varied, ("train", *dataset, *arguments, *flags, *switched, *set_all))
+        runs[name] = SweepRun(Path(out) / name, varied, _arguments({**options, **varied}, settings, flags))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
     return Sweep(Path(out), shared, tuple(runs.values()))
+
+
+def _choices(vary: Sequence[str], fixed: Collection[str]) -> dict[str, list[str]]:
+    """Values of each varied key, none of which may be one of the fixed ones."""
+    choices: dict[str, list[str]] = {}
+    for text in vary:
+        key, equals, listed = (part.strip() for part in text.partition("="))
+        values = [value.strip() for value in listed.split(";" if ";" in listed else ",")]
+        faults = (
+            (not all((key, equals, *values)), "expected KEY=VALUE,VALUE,..., such as seed=0,1,2"),
+            (key in {*choices, *fixed}, f"{key} is given already; give it once"),
+            (len(set(values)) < len(values), "a value is given twice; leave it out"),
+            (key in FLAGS and not set(values) <= {"true", "false"}, f"{key} is on or off; give true, false"),
+        )
+        for is_fault, fault in faults:
+            if is_fault:
+                raise InputError(f"--vary {text}: {fault}")
+        choices[key] = values
+    if not choices:
+        raise InputError("sweep: nothing varies; give --vary KEY=VALUE,VALUE,... once or more")
+    return choices
+
+
+def _arguments(stated: Mapping[str, str], settings: Sequence[str], flags: Sequence[str]) -> tuple[str, ...]:
+    """Arguments of ``wrf-mi`` that state the options, flags and settings of a run, besides those of all runs."""
+    dataset, options, switched, changed = [], [], list(flags), list(settings)
+    for key, value in stated.items():
+        if key == "dataset":
+            dataset = [value]
+        elif key in OPTIONS:
+            options += [f"--{key}", value]
+        elif key not in FLAGS:
+            changed.append(f"{key}={value}")
+        elif value == "true":
+            switched.append(f"--{key}")
+    set_all = itertools.chain.from_iterable(("--set", setting) for setting in changed)
+    return ("train", *dataset, *options, *switched, *set_all)
 
 
 def check_run(dataset: str, request: RunRequest) -> None:
@@ -182,25 +198,30 @@ def _claim(sweep: Sweep) -> None:
     folder, path = sweep.folder, sweep.folder / SHARED
     content = {name: content_digest(paths) for name, paths in _files(sweep).items()}
     current: dict[str, dict[str, str]] = {"versions": package_versions(), "content": content}
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; choose another --out")
     if path.exists():
-        try:
-            before = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: not readable ({one_line(error)}); choose another --out") from None
-        if not isinstance(before, dict) or {key: before.get(key) for key in sweep.shared} != sweep.shared:
-            raise InputError(f"{folder}: holds a sweep with other settings than this one; choose another --out")
-        for key, text in (("versions", "by other versions of"), ("content", "with other content of")):
-            known = before.get(key, {})
-            changed = [name for name, now in current[key].items() if known.get(name, now) != now]
-            if changed or key not in before:
-                named = ", ".join(changed or ["what it does not state"])
-                raise InputError(f"{folder}: holds a sweep {text} {named}; choose another --out")
-            current[key] = known | current[key]
-    elif folder.exists() and any(folder.iterdir()):
+        current = _with_stored(sweep, path, current)
+    elif folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: exists, is not empty and holds no sweep; choose another --out")
+    elif folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; choose another --out")
     write_atomically(path, json.dumps({**sweep.shared, **current}, indent=1) + "\n")
+
+
+def _with_stored(sweep: Sweep, path: Path, current: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Versions and content, with those that ``sweep.json`` states in addition; `InputError`: it states others."""
+    with readable(path, f"{path}: missing; choose another --out", "choose another --out"):
+        before = json.loads(path.read_text())
+    if not isinstance(before, dict) or {key: before.get(key) for key in sweep.shared} != sweep.shared:
+        raise InputError(f"{sweep.folder}: holds a sweep with other settings than this one; choose another --out")
+    merged: dict[str, dict[str, str]] = {}
+    for key, text in (("versions", "by other versions of"), ("content", "with other content of")):
+        known, now = before.get(key, {}), current[key]
+        changed = [name for name in now if known.get(name, now[name]) != now[name]]
+        changed += [] if key in before else ["what it does not state"]
+        if changed:
+            raise InputError(f"{sweep.folder}: holds a sweep {text} {', '.join(changed)}; choose another --out")
+        merged[key] = known | now
+    return merged
 
 
 def _files(sweep: Sweep) -> dict[str, list[Path]]:

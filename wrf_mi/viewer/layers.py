@@ -79,16 +79,18 @@ def scene_content(
     # Names of radio materials without the prefix of ITU-R P.2040's.
     labels = np.array([re.sub("^itu[_-]", "", materials[surface.name]).replace("_", " ") for surface in surfaces])
     meshes = []
-    for label in sorted(set(labels)):
-        for above in (False, True):
-            chosen = np.flatnonzero(drawn & (labels[number] == label) & (ceiling == above))
-            if len(chosen):
-                used, index = np.unique(number[chosen], return_inverse=True)
-                names = tuple(surfaces[k].name for k in used)
-                meshes.append(MaterialMesh(str(label), above, corners[chosen], index, names))
+    for label, above in sorted(set(zip(labels[number[drawn]].tolist(), ceiling[drawn].tolist(), strict=True))):
+        chosen = np.flatnonzero(drawn & (labels[number] == label) & (ceiling == above))
+        used, index = np.unique(number[chosen], return_inverse=True)
+        names = tuple(surfaces[k].name for k in used)
+        meshes.append(MaterialMesh(label, above, corners[chosen], index, names))
+    return SceneContent(tuple(meshes), _longest_edges(surfaces)), note
+
+
+def _longest_edges(surfaces: Sequence[Surface]) -> FloatArray:
     edges = np.concatenate([free_edges(surface, creases=True) for surface in surfaces if surface.kind != "ceiling"])
     length = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=-1)
-    return SceneContent(tuple(meshes), edges[np.argsort(-length, kind="stable")[:MOST_EDGES]]), note
+    return np.asarray(edges[np.argsort(-length, kind="stable")[:MOST_EDGES]])
 
 
 def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | None, list[str]]:
@@ -165,13 +167,9 @@ def gaussians_content(
     run: Run, tx_pos_m: FloatArray, options: ViewOptions, on_stage: OnStage
 ) -> tuple[GaussiansContent | None, list[str]]:
     """The strongest Gaussians of a run for some transmitters [t, 3], and notes; None where it has none."""
-    if not run.metrics.get("gaussians"):
-        return None, []
-    if not (run.folder / SPLIT).exists():
-        return None, [f"Gaussians: one field for each fold; view one of them, such as {run.folder / 'fold0'}."]
-    fitted = run.fitted
-    if not isinstance(fitted, FittedField) or fitted.form.features:
-        return None, ["Gaussians: their signals depend on the uplink, not on a transmitter's position."]
+    if (obstacle := _no_gaussians(run)) is not None:
+        return None, obstacle
+    fitted: Any = run.fitted
     clouds = []
     for index, position in enumerate(tx_pos_m):
         on_stage("evaluating Gaussians", index / len(tx_pos_m))
@@ -187,6 +185,17 @@ def gaussians_content(
         text = f"the {len(order)} of {total} of the largest mean power over the stored transmitters"
         notes.append(f"Gaussians: {text} (option --gaussians).")
     return GaussiansContent(clouds[0].position_m[order], log_scale, rotation, strength[:, order], total), notes
+
+
+def _no_gaussians(run: Run) -> list[str] | None:
+    """Notes about a run whose Gaussians cannot be shown; None: they can."""
+    if not run.metrics.get("gaussians"):
+        return []
+    if not (run.folder / SPLIT).exists():
+        return [f"Gaussians: one field for each fold; view one of them, such as {run.folder / 'fold0'}."]
+    if not isinstance(run.fitted, FittedField) or run.fitted.form.features:
+        return ["Gaussians: their signals depend on the uplink, not on a transmitter's position."]
+    return None
 
 
 def run_scene(run: Run, frequency_hz: float) -> Any | None:

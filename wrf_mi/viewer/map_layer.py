@@ -64,11 +64,21 @@ def read_map(source: str | Path | Any) -> tuple[MapContent, list[str]]:
 
 def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
     """A map of an ``xarray.Dataset``, see `read_map`."""
-    points = POINT in dataset.dims
-    needed = ("x", "y", "z") if points else ("x", "y", "height")
-    if lacking := [axis for axis in needed if axis not in dataset.coords]:
+    plane, needed = ((POINT,), ("x", "y", "z")) if POINT in dataset.dims else (("y", "x"), ("x", "y", "height"))
+    if lacking := sorted(set(needed) - set(dataset.coords), key=needed.index):
         raise InputError(f"{name}: no coordinate {', '.join(lacking)}, so no map of wrf-mi map; give one")
-    plane = (POINT,) if points else ("y", "x")
+    values, labels, skipped = _variables(dataset, plane)
+    if not values:
+        raise InputError(f"{name}: no numbers over {' and '.join(plane)} in it; give a map made by wrf-mi map")
+    receivers = tuple(map(str, dataset[RECEIVER].values)) if RECEIVER in dataset.coords else ()
+    x_m, y_m, third = (np.asarray(dataset[axis], float) for axis in needed)
+    z_m, height_m = (None, float(third)) if "height" in needed else (third, None)
+    notes = [f"Map {name}: {', '.join(skipped)} not shown, no numbers over {' and '.join(plane)}."] if skipped else []
+    return MapContent(name, height_m, x_m, y_m, z_m, receivers, values, labels), notes
+
+
+def _variables(dataset: Any, plane: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str], list[str]]:
+    """Values with an axis of receivers before the plane's, labels, and the names of variables that are no maps."""
     values, labels, skipped = {}, {}, []
     for key, variable in dataset.data_vars.items():
         if variable.dtype.kind not in "fiub" or set(variable.dims) not in (set(plane), {RECEIVER, *plane}):
@@ -79,14 +89,7 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
         units = str(variable.attrs.get("units", ""))
         words = str(variable.attrs.get("long_name", key)).replace("_", " ")
         labels[str(key)] = f"{words} ({units})" if units not in ("", "1") else words
-    if not values:
-        raise InputError(f"{name}: no numbers over {' and '.join(plane)} in it; give a map made by wrf-mi map")
-    receivers = tuple(str(name) for name in dataset[RECEIVER].values) if RECEIVER in dataset.coords else ()
-    x_m, y_m = (np.asarray(dataset[axis], float) for axis in "xy")
-    z_m = np.asarray(dataset["z"], float) if points else None
-    height_m = None if points else float(dataset["height"])
-    notes = [f"Map {name}: {', '.join(skipped)} not shown, no numbers over {' and '.join(plane)}."] if skipped else []
-    return MapContent(name, height_m, x_m, y_m, z_m, receivers, values, labels), notes
+    return values, labels, skipped
 
 
 def thinned(maps: Sequence[MapContent], most: int = MAP_NUMBERS) -> tuple[list[MapContent], list[str]]:

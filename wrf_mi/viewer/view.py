@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from wrf_mi_scenes import scenes
 
-from ..core import InputError
+from ..core import InputError, Record
 from ..core.angles import FloatArray
 from ..core.files import write_atomically
 from ..core.types import IntArray
@@ -122,9 +122,7 @@ class _Gathered:
             return
         stored = content.rows.stored
         numbers, positions = content.rows.row[stored], content.rows.tx_pos_m[stored]
-        same = [receiver.name for receiver in record.receivers] == list(content.receivers)
-        same = same and numbers.max() < len(record) and np.array_equal(record.tx_pos_m[numbers], positions)
-        if not first and not same:
+        if not first and not _has_rows(record, content.receivers, numbers, positions):
             content.notes.append(f"{results.name}: of other data than the first run; only its scene is shown.")
             return
         if content.gaussians is None:
@@ -140,6 +138,28 @@ class _Gathered:
         except InputError as error:  # a transmitter inside a solid, for example, hides paths but nothing else
             notes = [f"Paths: not traced, {error}"]
         self.content.notes += notes
+
+    def finished(self) -> ViewContent:
+        """Content of all sources; `InputError`: there is nothing to show."""
+        content = self.content
+        if self.scenes:
+            content.scene, note = layers.scene_content(*self.scenes[0])
+            content.notes += [note] if note else []
+        content.maps, notes = thinned(content.maps)
+        content.notes += notes
+        content.title = "; ".join(self.titles)
+        if not content.receivers:
+            content.receivers = tuple(dict.fromkeys(name for shown in content.maps for name in shown.receivers))
+            content.receivers_m = np.full((len(content.receivers), 3), np.nan)
+        if content.scene is None and content.rows is None and not content.maps:
+            raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")
+        return content
+
+
+def _has_rows(record: Record, receivers: Sequence[str], rows: IntArray, positions_m: FloatArray) -> bool:
+    """Whether a record has these receivers, and these positions [t, 3] in its rows."""
+    same = [receiver.name for receiver in record.receivers] == list(receivers)
+    return same and rows.max() < len(record) and np.array_equal(record.tx_pos_m[rows], positions_m)
 
 
 def view(
@@ -182,16 +202,4 @@ def view(
         gathered.add(source)
     if material is not None and not gathered.material_used:
         raise InputError(f"material {material}: of a bare mesh, and no source is one; omit it")
-    content = gathered.content
-    if gathered.scenes:
-        content.scene, note = layers.scene_content(*gathered.scenes[0])
-        content.notes += [note] if note else []
-    content.maps, notes = thinned(content.maps)
-    content.notes += notes
-    content.title = "; ".join(gathered.titles)
-    if not content.receivers:
-        content.receivers = tuple(dict.fromkeys(name for shown in content.maps for name in shown.receivers))
-        content.receivers_m = np.full((len(content.receivers), 3), np.nan)
-    if content.scene is None and content.rows is None and not content.maps:
-        raise InputError(f"{content.title}: neither scene nor positions are known; there is nothing to show")
-    return View(content)
+    return View(gathered.finished())
