@@ -162,7 +162,10 @@ class _Source:
         """The surfaces, those of a scan after the search for its planes, which takes minutes for large ones."""
         if self.scan is None:
             return self.parts
-        surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        try:
+            surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        except InputError as error:
+            raise InputError(f"{self.file}: {error}") from None
         if up is None and not _has_floor(surfaces):
             with suppress(InputError):
                 turned = surfaces_from_points(trimesh.transform_points(self.scan.points_m, Y_UP.T))
