@@ -28,6 +28,7 @@ from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
+from .scan.las_units import require_stated_metres
 from .scan.points import Scan, read_scan
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
@@ -61,7 +62,8 @@ def make_scene(
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m.
+        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m,
+            which is refused for a LAS or LAZ whose header states another one.
         up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
             coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
@@ -189,6 +191,9 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
     scan = read_scan(files, units, up)
+    if units is None:
+        for each in files:
+            require_stated_metres(each)
     check_extent(scan.points_m, file)
     require_fine(scan.points_m, file)
     require_up(scan.points_m, file, up)
