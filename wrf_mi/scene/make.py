@@ -191,9 +191,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
     scan = read_scan(files, units, up)
-    if units is None:
-        for each in files:
-            require_stated_metres(each)
+    require_stated_metres(files, units)
     check_extent(scan.points_m, file)
     require_fine(scan.points_m, file)
     require_up(scan.points_m, file, up)

@@ -201,10 +201,11 @@ PCD_HEADER = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 0\nHEIGHT 
     [
         ("header.pcd", PCD_HEADER, "no points in it"),
         ("comment.xyz", "# x y z\n", "no points in it"),
+        ("rows.pts", "1.5 2.5 0.5\n1.5 2.5 0.6\n", "call it .xyz"),
         ("blank.pts", f"1\n{9 * ' '}\n", "states 1 points and ends after 0"),
     ],
 )
-def test_texts_without_rows_are_refused_without_warnings_of_numpy(
+def test_texts_without_rows_or_their_number_are_refused_without_warnings_of_numpy(
     name: str, text: str, message: str, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ...core import InputError
@@ -55,10 +55,11 @@ def _wkt_units(record: object) -> Iterator[str]:
         yield from lengths[-1:]
 
 
-def require_stated_metres(file: Path) -> None:
-    """Refuse (`InputError`) a file whose header states other units than metres."""
-    if (units := stated_units(file)) and units != ["m"]:
-        raise InputError(f"{file}: {units_text(units)}; {units_remedy(units)}")
+def require_stated_metres(files: Sequence[Path], units: str | None) -> None:
+    """Refuse (`InputError`) scans for which no units are given and whose headers state others than metres."""
+    for file in files if units is None else ():
+        if (stated := stated_units(file)) and stated != ["m"]:
+            raise InputError(f"{file}: {units_text(stated)}; {units_remedy(stated)}")
 
 
 def units_text(units: list[str]) -> str:

@@ -244,6 +244,8 @@ def _read_blocks(file: Path) -> Iterator[Part]:
     with file.open(encoding="utf-8-sig") as stream:
         while line := next((line for line in stream if line.strip()), ""):
             pose = None
+            if not line.strip().isdecimal():
+                raise ValueError("no number of points in the line before them; call it .xyz if all lines are points")
             count = int(line)
             if file.suffix.lower() == ".ptx":
                 count *= int(next(stream, ""))
