@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -30,6 +31,8 @@ from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
 from .scan.las_units import require_stated_metres
 from .scan.points import Scan, read_scan
+
+logger = logging.getLogger(__name__)
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -175,6 +178,8 @@ class _Source:
                     surfaces = turned
             if _has_floor(surfaces):
                 raise _other_up(self.file)
+        if all(surface.kind == "other" for surface in surfaces):
+            logger.warning("%s: no floor, ceiling or wall among its planes; mesh needs the scan of a room", self.file)
         return surfaces
 
 

@@ -217,3 +217,12 @@ def test_scan_without_planes_is_refused_by_name(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "noise.xyz", np.random.default_rng(1).uniform(0, 5, (200, 3)))
     with pytest.raises(InputError, match=r"noise\.xyz: no plane was found in 200 points"):
         make_scene(tmp_path / "noise.xyz", tmp_path / "scene")
+
+
+def test_planes_that_make_no_room_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(1)
+    slope = rng.uniform(0, 3, (6000, 3))
+    slope[:, 2] = 0.9 * slope[:, 0] + rng.normal(0, 0.003, len(slope))
+    np.savetxt(tmp_path / "slope.xyz", slope)
+    make_scene(tmp_path / "slope.xyz", tmp_path / "scene", up="z")
+    assert "slope.xyz: no floor, ceiling or wall" in caplog.text
