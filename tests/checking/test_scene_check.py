@@ -20,6 +20,7 @@ from wrf_mi.checking.scene_geometry import Part, scene_parts
 from wrf_mi.checking.scene_xml_faults import SceneXml, read_xml
 from wrf_mi.checking.triangle_faults import FARTHEST_M
 from wrf_mi.core import InputError
+from wrf_mi.scene.make import make_scene
 
 SHARE = 3  # part of the damaged scenes that is checked in every run
 SECONDS = 60.0  # bound of the time that hostile files take on a busy machine
@@ -221,6 +222,11 @@ def test_scan_is_judged_by_its_points(tmp_path: Path) -> None:
     assert alarms(check_scene(file, units="mm")) == []
     np.savetxt(file, points + np.array([7e5, 4e6, 0]))
     assert [f.kind for f in check_scene(file).of_level("warning")] == ["far-scan"]
+    for wrong, kind in ((points * [100, 150, 50], "units"), (np.round(points * 2) / 2, "coarse-steps")):
+        np.savetxt(file, wrong + np.array([7e5, 4e6, 0]))
+        assert [f.kind for f in check_scene(file).of_level("fault")] == [kind]
+        with pytest.raises(InputError):
+            make_scene(file, tmp_path / "scene")
     points[7, 1] = np.nan
     np.savetxt(file, points)
     assert [f.kind for f in check_scene(file).of_level("fault")] == ["not-finite"]

@@ -67,6 +67,12 @@ def faces_drawn(figure):
     return sum(len(c.get_facecolor()) for c in slant.collections if isinstance(c, Poly3DCollection))
 
 
+def test_plan_states_the_height_of_its_cut_far_above_sea_level():
+    high = [Surface(s.name, s.kind, s.vertices_m + np.array([0, 0, 412.0]), s.faces) for s in room()]
+    title = draw_scene(high).axes[1].get_title()
+    assert 412.0 < float(title.split()[-2]) < 414.5
+
+
 def test_ceiling_is_taken_off_and_floor_stays():
     surfaces = room()
     walls = [s for s in surfaces if s.kind == "wall"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +23,10 @@ from ..scene.coordinates import (
     UNITS_M,
     Y_UP,
     Up,
+    check_extent,
     extent,
     looks_y_up,
+    require_fine,
     turned,
     up_of,
 )
@@ -33,6 +35,7 @@ from ..scene.make import has_faces
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.materials import read_materials, thicknesses
 from ..scene.mesh.surfaces import bodies, sampled
+from ..scene.scan.las_units import stated_units, units_remedy, units_text
 from ..scene.scan.points import read_points
 from ..synthetic import load_record
 from ..tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
@@ -358,14 +361,39 @@ def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
     if len(points) < FEWEST_POINTS:
         text = f"{len(points)} points, and planes need some hundred each"
         findings.append(Finding("few-points", path, "", text, "give a denser scan"))
-    far = float(np.abs(points).max())
-    if far >= FARTHEST_M:
-        text = f"coordinates up to {far:.0f} m"
-        findings.append(Finding("far-scan", path, "", text, "give wrf-mi mesh --origin X,Y,Z"))
-    else:
-        findings += list(_units(points, path, BUILDING)) or ([] if frame.up else _up(points, path))
+    findings += _of_points(points, path, frame)
     if path.suffix.lower() not in VIEWPOINTS:
         text = "does not state where the scanner stood"
         remedy = "nothing to do; E57, PCD and PTX state it"
         findings.append(Finding("no-viewpoint", path, "", text, remedy))
     return SceneReport(name, tuple(findings), points=len(points))
+
+
+def _of_points(points: FloatArray, path: Path, frame: Frame) -> Iterator[Finding]:
+    """Findings about units, the axis that is up, and steps of points [n, 3]; with all for which a scene is refused."""
+    if (far := float(np.abs(points).max())) >= FARTHEST_M:
+        remedy = "wrf-mi mesh subtracts an origin; state it by --origin X,Y,Z where measurements have the same frame"
+        yield Finding("far-scan", path, "", f"coordinates up to {far:.0f} m", remedy)
+    stated = stated_units(path)
+    if other := set(stated) - {frame.units}:
+        text = f"{units_text(stated)}, and is read in {frame.units}"
+        yield Finding("stated-units", path, "", text, units_remedy(stated))
+    doubts = list(_units(points, path, BUILDING))
+    if not doubts or "units" not in {doubt.kind for doubt in doubts}:
+        doubts = [*_refused(check_extent, "units", points, path)] or doubts
+    if not other:  # the extent follows from them
+        yield from doubts
+    yield from _refused(require_fine, "coarse-steps", points, path)
+    if not (doubts or frame.up):
+        yield from _up(points, path)
+
+
+def _refused(
+    require: Callable[[FloatArray, Path], None], kind: str, points: FloatArray, path: Path
+) -> Iterator[Finding]:
+    """Finding about points [n, 3] that the making of a scene refuses."""
+    try:
+        require(points, path)
+    except InputError as error:
+        text, _, remedy = one_line(error).removeprefix(f"{path}: ").rpartition("; ")
+        yield Finding(kind, path, "", text, remedy)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -29,7 +30,10 @@ from .plan.storey import layout_walls, plan_surfaces
 from .positions import check_positions, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
+from .scan.las_units import require_stated_metres
 from .scan.points import Scan, read_scan
+
+logger = logging.getLogger(__name__)
 
 PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
 PREVIEW_POINTS = 20_000
@@ -63,7 +67,8 @@ def make_scene(
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m.
+        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m,
+            which is refused for a LAS or LAZ whose header states another one.
         up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
             coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
@@ -170,7 +175,10 @@ class _Source:
         """The surfaces, those of a scan after the search for its planes, which takes minutes for large ones."""
         if self.scan is None:
             return self.parts
-        surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        try:
+            surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+        except InputError as error:
+            raise InputError(f"{self.file}: {error}") from None
         if up is None and not _has_floor(surfaces):
             with suppress(InputError):
                 turned = surfaces_from_points(trimesh.transform_points(self.scan.points_m, Y_UP.T))
@@ -178,6 +186,8 @@ class _Source:
                     surfaces = turned
             if _has_floor(surfaces):
                 raise _other_up(self.file)
+        if all(surface.kind == "other" for surface in surfaces):
+            logger.warning("%s: no floor, ceiling or wall among its planes; mesh needs the scan of a room", self.file)
         return surfaces
 
     def sample(self, motion: FloatArray) -> dict[str, Any]:
@@ -201,6 +211,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
     scan = read_scan(files, units, up)
+    require_stated_metres(files, units)
     check_extent(scan.points_m, file)
     require_fine(scan.points_m, file)
     require_up(scan.points_m, file, up)

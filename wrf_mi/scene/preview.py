@@ -281,7 +281,7 @@ def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: F
     axes.set_xlabel("x (m)", fontsize=8)
     axes.set_ylabel("y (m)", fontsize=8)
     axes.tick_params(labelsize=7)
-    axes.set_title(f"plan, cut at z = {level:.2g} m", fontsize=9)
+    axes.set_title(f"plan, cut at z = {level:.1f} m", fontsize=9)
     bar = max((b for b in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if b <= size[0] / 3), default=0.1)
     corner = low[0], low[1] - 1.35 * margin
     axes.add_patch(Rectangle(corner, bar, 0.25 * margin, color="black", zorder=9))

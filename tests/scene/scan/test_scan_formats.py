@@ -16,6 +16,7 @@ from made_rooms import by_kind, closed_box, sampled
 
 from wrf_mi.core import InputError
 from wrf_mi.scene.coordinates import Y_UP
+from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.scene.scan.cloud import surfaces_from_points
 from wrf_mi.scene.scan.points import read_scan
@@ -190,3 +191,38 @@ def test_places_without_a_return_in_a_pcd_are_no_points(points: np.ndarray, tmp_
     scan = read_scan([tmp_path / "grid.pcd"])
     np.testing.assert_allclose(scan.points_m, points[:100][np.arange(100) % 4 > 0], atol=ROUNDING_M)
     np.testing.assert_allclose(scan.viewpoints_m, [[1, 2, 1.5]])
+
+
+PCD_HEADER = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 0\nHEIGHT 1\nPOINTS 0\nDATA ascii\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("header.pcd", PCD_HEADER, "no points in it"),
+        ("comment.xyz", "# x y z\n", "no points in it"),
+        ("rows.pts", "1.5 2.5 0.5\n1.5 2.5 0.6\n", "call it .xyz"),
+        ("blank.pts", f"1\n{9 * ' '}\n", "states 1 points and ends after 0"),
+    ],
+)
+def test_texts_without_rows_or_their_number_are_refused_without_warnings_of_numpy(
+    name: str, text: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=rf"{name}: .*{message}"):
+        read_scan([tmp_path / name])
+
+
+def test_scan_without_planes_is_refused_by_name(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "noise.xyz", np.random.default_rng(1).uniform(0, 5, (200, 3)))
+    with pytest.raises(InputError, match=r"noise\.xyz: no plane was found in 200 points"):
+        make_scene(tmp_path / "noise.xyz", tmp_path / "scene")
+
+
+def test_planes_that_make_no_room_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(1)
+    slope = rng.uniform(0, 3, (6000, 3))
+    slope[:, 2] = 0.9 * slope[:, 0] + rng.normal(0, 0.003, len(slope))
+    np.savetxt(tmp_path / "slope.xyz", slope)
+    make_scene(tmp_path / "slope.xyz", tmp_path / "scene", up="z")
+    assert "slope.xyz: no floor, ceiling or wall" in caplog.text

@@ -78,7 +78,7 @@ def surfaces_from_points(
     scan = _Scan(points.astype(np.float32), cloud, noise, sights_of(points, places, numbers, -shift))
     pieces, roles = scan.room(planes)
     if not pieces:
-        raise InputError("no plane was found; give a denser scan of a room")
+        raise InputError(f"no plane was found in {len(points_m)} points; give a denser scan of a room")
     areas = scan.closed(pieces, roles)
     logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
     order = sorted(range(len(pieces)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -124,8 +125,15 @@ def _read_npz(file: Path) -> list[Part]:
 def _read_text(file: Path) -> list[Part]:
     with file.open(encoding="utf-8-sig") as text:
         commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
-    delimiter = "," if commas else None
-    return [(np.loadtxt(file, usecols=(0, 1, 2), delimiter=delimiter, ndmin=2, encoding="utf-8-sig"), None)]
+        text.seek(0)
+        return [(_text_rows(text, delimiter="," if commas else None), None)]
+
+
+def _text_rows(rows: Iterable[str], columns: Sequence[int] = (0, 1, 2), delimiter: str | None = None) -> FloatArray:
+    """Points [n, 3] of rows of text; none, and no warning of NumPy's, where there are no rows."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+        return np.loadtxt(rows, usecols=columns, delimiter=delimiter, ndmin=2)
 
 
 def _read_vertices(file: Path) -> list[Part]:
@@ -204,7 +212,7 @@ def _read_pcd(file: Path) -> list[Part]:
     if kind == "ascii":  # Open3D fills what a file lacks with whatever is in memory
         columns = [sum(lengths[: fields.index(axis)]) for axis in "xyz"]
         with file.open(encoding="ascii") as text:
-            points = np.loadtxt(islice(text, lines, lines + count), usecols=columns, ndmin=2)
+            points = _text_rows(islice(text, lines, lines + count), columns)
     else:
         ((points, _),) = _read_apart(file, count * max(record, 24))
     if len(points) != count:
@@ -233,13 +241,15 @@ def _read_blocks(file: Path) -> Iterator[Part]:
     with file.open(encoding="utf-8-sig") as stream:
         while line := next((line for line in stream if line.strip()), ""):
             pose = None
+            if not line.strip().isdecimal():
+                raise ValueError("no number of points in the line before them; call it .xyz if all lines are points")
             count = int(line)
             if file.suffix.lower() == ".ptx":
                 count *= int(next(stream, ""))
                 pose = _ptx_pose(stream)
             if count < 0 or count * LEAST_ROW > file.stat().st_size:
                 raise ValueError(f"states {count} points, and has {file.stat().st_size} bytes")
-            points = np.loadtxt(islice(stream, count), usecols=(0, 1, 2), ndmin=2) if count else np.empty((0, 3))
+            points = _text_rows(islice(stream, count))
             if len(points) != count:
                 raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off")
             if pose is None:
