@@ -226,3 +226,9 @@ def test_planes_that_make_no_room_are_warned_of(tmp_path: Path, caplog: pytest.L
     np.savetxt(tmp_path / "slope.xyz", slope)
     make_scene(tmp_path / "slope.xyz", tmp_path / "scene", up="z")
     assert "slope.xyz: no floor, ceiling or wall" in caplog.text
+
+
+@pytest.mark.parametrize("text", ["//X Y Z\n1 2 3\n", "//X,Y,Z\n1,2,3\n", "# made by, hand\n1 2 3\n"])
+def test_names_of_columns_behind_slashes_or_a_hash_are_no_points(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scan.xyz").write_text(text)
+    assert read_scan([tmp_path / "scan.xyz"]).points_m.tolist() == [[1, 2, 3]]

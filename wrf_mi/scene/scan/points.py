@@ -38,6 +38,7 @@ LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
 CHILD_BYTES, CHILD_S, CHILD_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads a file beside its points, and the time that it has."""
 PCD_HEADER = 1 << 16  # bytes in which the header of a PCD has to end
+COMMENTS = ("#", "//")  # CloudCompare begins the line of the columns' names with slashes
 PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
 
 Part = tuple[FloatArray, FloatArray | None]
@@ -124,7 +125,7 @@ def _read_npz(file: Path) -> list[Part]:
 
 def _read_text(file: Path) -> list[Part]:
     with file.open(encoding="utf-8-sig") as text:
-        commas = "," in next((line for line in text if line.strip() and not line.startswith("#")), "")
+        commas = "," in next((line for line in text if line.strip() and not line.startswith(COMMENTS)), "")
         text.seek(0)
         return [(_text_rows(text, delimiter="," if commas else None), None)]
 
@@ -133,7 +134,7 @@ def _text_rows(rows: Iterable[str], columns: Sequence[int] = (0, 1, 2), delimite
     """Points [n, 3] of rows of text; none, and no warning of NumPy's, where there are no rows."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-        return np.loadtxt(rows, usecols=columns, delimiter=delimiter, ndmin=2)
+        return np.loadtxt(rows, usecols=columns, delimiter=delimiter, ndmin=2, comments=COMMENTS)
 
 
 def _read_vertices(file: Path) -> list[Part]:
