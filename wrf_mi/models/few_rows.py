@@ -97,9 +97,9 @@ class SharedLaw:
         within, between = _variances(np.where(received, residual - mean[:, None], 0.0), mean, counts)
         often = counts >= min(FEW_ROWS, int(counts.max()))
         centre = float(mean[often].mean())  # each receiver counts once, however many rows it received
-        own = counts[number] * between / (counts[number] * between + within)
-        shift = centre + own * (mean[number] - centre)
-        return cls(number, positions_m[number], law, level, shift, np.sqrt(within + (1 - own) * between), carrier_hz)
+        trust = counts[number] * between / (counts[number] * between + within)
+        shift = centre + trust * (mean[number] - centre)
+        return cls(number, positions_m[number], law, level, shift, np.sqrt(within + (1 - trust) * between), carrier_hz)
 
     def __call__(self, inputs: Inputs, receiver: int) -> Prediction:
         """Power in dBm and its standard deviation, [m] each, at a receiver of a number."""

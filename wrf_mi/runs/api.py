@@ -330,9 +330,9 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                seen = placed_problem(problem.seen(rows), rows.all_train)
-                fitted = config.entry.fit(seen, rows, replace(session, folder=part))
-            write_places(part, seen.record)
+                placed = placed_problem(problem.seen(rows), rows.all_train)
+                fitted = config.entry.fit(placed, rows, replace(session, folder=part))
+            write_places(part, placed.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time

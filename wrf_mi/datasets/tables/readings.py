@@ -223,7 +223,7 @@ def further_columns(
             numbers, unit = numbers * METRES.get(unit_of(name), 1.0), "_m"
             notes += [f"{number:g} is no {quantity}: empty fields" for number in mark]
         means = {receiver: _means(numbers, place)} if receiver else _by_receiver(numbers, readings, place)
-        values |= {f"{quantity}_{normal_id(one)}{unit}": column for one, column in means.items()}
+        values |= {f"{quantity}_{normal_id(receiver_id)}{unit}": column for receiver_id, column in means.items()}
     values |= {one_line(name): _of_places(table, name, place) for name in columns.kept}
     if values:
         notes.append(f"kept as columns that no model uses: {listed(list(values))}")

@@ -115,9 +115,9 @@ class Raster:
         # Cells of the area that the added ones touch would leave a seam.
         cells = _boxes(mask | inside, self.low_m, self.cell_m)
         seam = shapely.intersection(shapely.buffer(added, 2 * self.cell_m, join_style="mitre"), cells)
-        whole = shapely.union_all([area, added, seam], grid_size=GRID_M)
-        whole = shapely.union_all([whole, *(hole for hole in _holes(whole) if hole.area < SMALL_HOLE_M2)])
-        parts = [_rectangle(part, GROWN_SHARE) or part.simplify(1.2 * self.cell_m) for part in polygons(whole)]
+        grown = shapely.union_all([area, added, seam], grid_size=GRID_M)
+        grown = shapely.union_all([grown, *(hole for hole in _holes(grown) if hole.area < SMALL_HOLE_M2)])
+        parts = [_rectangle(part, GROWN_SHARE) or part.simplify(1.2 * self.cell_m) for part in polygons(grown)]
         return shapely.union_all(parts)
 
 

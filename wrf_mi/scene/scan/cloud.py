@@ -196,9 +196,9 @@ class _Scan:
         """Pieces with their roles, walls with their parts behind things; without sparse planes that are no walls."""
         middle_m = float(np.median(self.cloud.points_m[:, 2]))
         short: dict[Face, Kind] = dict(zip(pieces, kinds(pieces, middle_m), strict=True))
-        whole = [self._up_to_levels(piece, short) for piece in pieces]
-        chosen, roles = list[_Piece](), kinds(whole, middle_m)
-        for piece, longer, role in zip(pieces, whole, roles, strict=True):
+        completed = [self._up_to_levels(piece, short) for piece in pieces]
+        chosen, roles = list[_Piece](), kinds(completed, middle_m)
+        for piece, longer, role in zip(pieces, completed, roles, strict=True):
             filled = longer.area.area / shapely.envelope(longer.area).area
             if not piece.plane.sparse or (role == "wall" and filled >= LEAST_FILLED):
                 chosen.append(longer if role == "wall" else piece)

@@ -225,10 +225,13 @@ def _read_pcd(file: Path) -> list[Part]:
 def _pcd_header(file: Path) -> tuple[dict[str, list[str]], int]:
     """Words of the lines of a PCD file's header by their first, and their number."""
     with file.open("rb") as stream:
-        head, found, rest = stream.read(PCD_HEADER).partition(b"\nDATA ")
-    lines = [*head.decode("ascii", "replace").split("\n"), "DATA " + rest.split(b"\n")[0].decode("ascii", "replace")]
+        head, data_line, remainder = stream.read(PCD_HEADER).partition(b"\nDATA ")
+    lines = [
+        *head.decode("ascii", "replace").split("\n"),
+        "DATA " + remainder.split(b"\n")[0].decode("ascii", "replace"),
+    ]
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
-    if not found or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not {"POINTS", "SIZE"} <= set(header):
+    if not data_line or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not {"POINTS", "SIZE"} <= set(header):
         raise ValueError("no header of a PCD file with x, y, z, SIZE and POINTS")
     return header, len(lines)
 
