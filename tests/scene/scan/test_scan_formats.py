@@ -228,7 +228,13 @@ def test_planes_that_make_no_room_are_warned_of(tmp_path: Path, caplog: pytest.L
     assert "slope.xyz: no floor, ceiling or wall" in caplog.text
 
 
-@pytest.mark.parametrize("text", ["//X Y Z\n1 2 3\n", "//X,Y,Z\n1,2,3\n", "# made by, hand\n1 2 3\n"])
-def test_names_of_columns_behind_slashes_or_a_hash_are_no_points(text: str, tmp_path: Path) -> None:
+TEXTS = (
+    *("//X Y Z\n1 2 3\n", "//X,Y,Z\n1,2,3\n", "# made by, hand\n1 2 3\n", "1;2;3;0,5\n", "x y z i\n1 2 3 9\n"),
+    *('"X","Y","Z"\n1,2,3\n', "time;Z;X;Y\n0;3,0;1,0;2,0\n", "\ufeffx\ty\tz\n1\t2\t3\n"),
+)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_names_of_columns_are_no_points(text: str, tmp_path: Path) -> None:
     (tmp_path / "scan.xyz").write_text(text)
     assert read_scan([tmp_path / "scan.xyz"]).points_m.tolist() == [[1, 2, 3]]

@@ -124,10 +124,18 @@ def _read_npz(file: Path) -> list[Part]:
 
 
 def _read_text(file: Path) -> list[Part]:
+    """Points of lines of text, whose columns a first line may name; between commas, semicolons or blanks."""
     with file.open(encoding="utf-8-sig") as text:
-        commas = "," in next((line for line in text if line.strip() and not line.startswith(COMMENTS)), "")
-        text.seek(0)
-        return [(_text_rows(text, delimiter="," if commas else None), None)]
+        first = next((line for line in text if line.strip() and not line.startswith(COMMENTS)), "")
+        delimiter = next((mark for mark in ";," if mark in first), None)
+        names = [name.strip(" \t\r\n\"'").lower() for name in first.split(delimiter)]
+        named = set(names) >= set("xyz")
+        columns = [names.index(axis) for axis in "xyz"] if named else [0, 1, 2]
+        if not named:
+            text.seek(0)
+        # Where semicolons separate fields, a comma is the decimal mark.
+        rows: Iterable[str] = text if delimiter != ";" else (line.replace(",", ".") for line in text)
+        return [(_text_rows(rows, columns, delimiter), None)]
 
 
 def _text_rows(rows: Iterable[str], columns: Sequence[int] = (0, 1, 2), delimiter: str | None = None) -> FloatArray:
