@@ -155,12 +155,14 @@ def stored_places(folder: Path) -> dict[str, dict[str, list[float]]]:
 
 def stored_problem(problem: Problem, folder: Path) -> Problem:
     """The problem with the positions that a run in a folder has estimated."""
-    receivers, places = list(problem.record.receivers), stored_places(folder)
+    if not (places := stored_places(folder)):
+        return problem  # whose data need not be on this machine
+    receivers = list(problem.record.receivers)
     for number, receiver in enumerate(receivers):
         if place := places.get(receiver.name):
             position_m, std_m = np.array(place["position_m"]), np.array(place["std_m"])
             receivers[number] = replace(receiver, position_m=position_m, position_std_m=std_m)
-    return _with_record(problem, replace(problem.record, receivers=tuple(receivers)) if places else problem.record)
+    return _with_record(problem, replace(problem.record, receivers=tuple(receivers)))
 
 
 def check_surveyed(record: Record) -> None:

@@ -212,7 +212,7 @@ class TrainingLoop(ABC):
         Args:
             on_progress: called every ``log_every`` steps and at the end.
             save: writes a checkpoint; called every ``checkpoint_every`` steps, when stopped and at the end.
-            stop: stop condition, called after each step.
+            stop: stop condition, called after each step but the last.
 
         Raises:
             NumericsError: a loss or gradient is not finite, raised right after that step, which leaves the parameters
@@ -233,7 +233,7 @@ class TrainingLoop(ABC):
         """Steps to the last or until stopped (`run`); returns the report after them."""
         config, before_s, trouble = self.config, self.seconds, NonFiniteReport.none(self.state.adam)
         losses, logged, steps = dr.zeros(mi.Float), 0, 0  # steps since the last line of the log, and in this sitting
-        while self.state.step < config.steps:
+        while self.state.step < config.steps and not (steps and stop()):
             losses, trouble = self._next(losses, trouble)
             logged, steps, last = logged + 1, steps + 1, self.state.step == config.steps
             self.seconds = time.perf_counter() - self._origin_s
@@ -248,8 +248,6 @@ class TrainingLoop(ABC):
             if self.state.step % config.checkpoint_every == 0 and not last:
                 self._require_finite(trouble)
                 save()
-            if stop():
-                break
         return trouble
 
     def _next(self, losses: Any, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
