@@ -45,6 +45,21 @@ def refused(arguments: list[Any], message: str, capsys: pytest.CaptureFixture[st
     assert re.search(message, err), err
 
 
+def strength_commands(run: Path, folder: Path, heard: dict[str, str], tx: str = "x,y,z\n1,2,1.3\n") -> list[list[Any]]:
+    """Commands on a run of signal strengths; ``heard``: strengths at one place by the ids of receivers."""
+    (folder / "tx.csv").write_text(tx)
+    names = ",".join(f"rssi_{name}" for name in heard)
+    (folder / "heard.csv").write_text(f"{names}\n{','.join(heard.values())}\n")
+    return [
+        ["evaluate", run],
+        ["predict", run, "--tx", folder / "tx.csv", "--out", folder / "powers.csv"],
+        ["map", run, "--step", "1", "--out", folder / "map.nc"],
+        ["locate", run, "--step", "1", "--input", folder / "heard.csv", "--out", folder / "positions.csv"],
+        ["compare", run, "--out", folder / "page"],
+        ["view", run, "--out", folder / "view.html"],
+    ]
+
+
 def stored(run: Path) -> dict[str, np.ndarray]:
     """Content of ``predictions.npz`` of a run."""
     with np.load(run / "predictions.npz", allow_pickle=False) as arrays:

@@ -158,6 +158,11 @@ WRONG: dict[str, tuple[Change, str, str]] = {  # each is refused, see test_fault
     "anchor of pandas without an id": (text("anchors.csv", "^1", "nan"), "anchors.csv", "row 2: id 'nan' is pandas"),
     "anchor with a tab in it": (text("anchors.csv", "^1", "a\tb"), "anchors.csv", "row 2: id .* does not go into one"),
     "no ids": (text("anchors.csv", "id", "number"), "anchors.csv", "has no column id"),
+    "anchor without y": (
+        text("anchors.csv", "-1", "nan"),
+        "anchors.csv",
+        "row 2: y is empty; give x and y",
+    ),
 }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import SMALL, call
+from calling import SMALL, call, strength_commands
 from made_building import PLACES_M, TRAINED, building
 
 from wrf_mi.core import InputError, Record
@@ -137,20 +137,12 @@ def test_min_rows_leaves_receivers_out(tmp_path: Path) -> None:
 
 def test_commands_take_a_run_with_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     office = write_ble_folder(tmp_path / "office", building(**SCARCE))
-    tx, heard, run = tmp_path / "tx.csv", tmp_path / "heard.csv", tmp_path / "run"
-    tx.write_text("x,y,z\n1,2,1.3\n")
-    heard.write_text("rssi_hall,rssi_stairs,rssi_lab,rssi_attic,rssi_cellar\n-60,-70,-65,-80,\n")
+    run = tmp_path / "run"
+    heard = {"hall": "-60", "stairs": "-70", "lab": "-65", "attic": "-80", "cellar": ""}
     status, out, _ = call(["train", office, "--model", "idw", "--intervals", "--out", run], capsys)
     assert status == 0
     assert "receivers with few training rows (number): attic (2), cellar (0)" in out
-    for command in (
-        ["evaluate", run],
-        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
-        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
-        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
-        ["compare", run, "--out", tmp_path / "page"],
-        ["view", run, "--out", tmp_path / "view.html"],
-    ):
+    for command in strength_commands(run, tmp_path, heard):
         status, _, err = call(command, capsys)
         assert status == 0, (command, err)
     assert json.loads((run / "metrics.json").read_text())["receivers_with_few_rows"] == {"attic": 2, "cellar": 0}

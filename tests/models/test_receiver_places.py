@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import SMALL, call
+from calling import SMALL, call, strength_commands
 from made_building import TRAINED, UPRIGHT, building
 
 from wrf_mi.core import InputError, Receiver, Record
@@ -140,23 +140,13 @@ def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest
     (office / "receivers.csv").write_text("id,x,y,z\nhall,,,\nstairs,11.5,0.5,\nlab,,,2.5\n")
     heights = [receiver.position_m[2] for receiver in load(office).receivers]
     np.testing.assert_array_equal(heights, [np.nan, np.nan, 2.5])
-    tx, heard, run = tmp_path / "tx.csv", tmp_path / "heard.csv", tmp_path / "run"
-    tx.write_text("x,y,z\n1,2,1.3\n")
-    heard.write_text("rssi_hall,rssi_stairs,rssi_lab\n-60,-70,-65\n")
+    run, heard = tmp_path / "run", {"hall": "-60", "stairs": "-70", "lab": "-65"}
     asked: list[Any] = ["train", office, "--model", "kriging", "--out", run]
     status, out, _ = call(asked, capsys)
     assert status == 0
     assert "stairs estimated at x 11.5 +- 0.0 m, y 0.5 +- 0.0 m, z" in out
-    for command in (
-        ["data", "info", office],
-        ["data", "check", office],
-        ["evaluate", run],
-        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
-        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
-        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
-        ["compare", run, "--out", tmp_path / "page"],
-        ["view", run, "--out", tmp_path / "view.html"],
-    ):
+    of_data = [["data", "info", office], ["data", "check", office]]
+    for command in of_data + strength_commands(run, tmp_path, heard):
         status, _, err = call(command, capsys)
         assert status == 0, (command, err)
 

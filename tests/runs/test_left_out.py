@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import SMALL, call, stored
+from calling import SMALL, call, stored, strength_commands
 from made_building import PLACES_M, TRAINED, building, silent_in
 
 from wrf_mi.core import InputError, Split
@@ -163,19 +163,8 @@ def test_commands_take_a_run_without_them(office: Path, tmp_path: Path, capsys: 
     status, out, _ = call(asked, capsys)
     assert status == 0
     assert json.loads(out)["receivers_left_out"] == {"attic": 1, "cellar": 0}
-    tx = tmp_path / "tx.csv"
-    tx.write_text("x,y,z\n1,2,1.3\n")
-    heard = tmp_path / "heard.csv"
-    heard.write_text("rssi_hall,rssi_stairs,rssi_lab,rssi_attic,rssi_cellar\n-60,-70,-65,-80,\n")
-    for command in (
-        ["evaluate", run],
-        ["evaluate", run, "--split", "random"],
-        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
-        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
-        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
-        ["compare", run, "--out", tmp_path / "page"],
-        ["view", run, "--out", tmp_path / "view.html"],
-    ):
+    heard = {"hall": "-60", "stairs": "-70", "lab": "-65", "attic": "-80", "cellar": ""}
+    for command in [["evaluate", run, "--split", "random"], *strength_commands(run, tmp_path, heard)]:
         status, _, err = call(command, capsys)
         assert status == 0, (command, err)
     columns = (tmp_path / "powers.csv").read_text().splitlines()[0].split(",")

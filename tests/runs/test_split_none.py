@@ -6,11 +6,10 @@ import json
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from calling import call, refused, stored
+from calling import call, refused, stored, strength_commands
 from made_channels import channels
 
 from wrf_mi.core import InputError, Record
@@ -115,18 +114,8 @@ def test_ray_tracing_keeps_the_paths_of_each_part(room: Path, strengths: Record,
 
 
 def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    tx, heard = tmp_path / "tx.csv", tmp_path / "heard.csv"
-    tx.write_text("x,y,z,heading_rad\n1,2,1.3,0\n")
-    heard.write_text("rssi_1,rssi_2\n-60,-70\n")
-    commands: list[list[Any]] = [
-        ["evaluate", run],
-        ["predict", run, "--tx", tx, "--out", tmp_path / "powers.csv"],
-        ["map", run, "--step", "1", "--out", tmp_path / "map.nc"],
-        ["locate", run, "--step", "1", "--input", heard, "--out", tmp_path / "positions.csv"],
-        ["compare", run, "--out", tmp_path / "page"],
-        ["view", run, "--out", tmp_path / "view.html"],
-    ]
-    for command in commands:
+    tx = "x,y,z,heading_rad\n1,2,1.3,0\n"
+    for command in strength_commands(run, tmp_path, {"1": "-60", "2": "-70"}, tx):
         status, out, err = call(command, capsys)
         assert status == 0, (command, err)
         assert ("scores are cross-validated: each row" in out) == (command[0] == "evaluate")

@@ -48,9 +48,14 @@ def read_ids(table: CsvTable) -> list[str]:
 
 
 def read_positions(table: CsvTable, axes: str, may_be_empty: bool = False) -> FloatArray:
-    """Coordinates [rows, axes] in metres; empty fields are NaN if they are allowed."""
+    """Coordinates [rows, axes] in metres; empty fields are NaN if they are allowed, x and y together."""
     columns = [attempt(table.numbers, axis, may_be_empty) for axis in axes]
-    return np.stack([column.value for column in columns], axis=-1)
+    positions = np.stack([column.value for column in columns], axis=-1)
+    empty = np.isnan(positions[:, :2])
+    for row in np.flatnonzero(empty[:, 0] != empty[:, 1]):  # a height alone may be unpublished, half a place is a slip
+        text = f"{axes[int(np.argmax(empty[row]))]} is empty; give x and y, or neither where they are unknown"
+        refuse(DataFault(table.path, text, row=int(row) + 1))
+    return positions
 
 
 def read_transmitter(anchors: CsvTable) -> Antenna:

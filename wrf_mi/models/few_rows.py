@@ -137,14 +137,16 @@ class FittedWithFew(Fitted):
         self._place = {int(number): place for place, number in enumerate(numbers)}
         self.train_seconds, self.uses_heading = fitted.train_seconds, fitted.uses_heading
         self.carriers_hz = fitted.carriers_hz
+        self._states_std: bool | None = None
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations, [m]; those of receivers with few rows have standard deviations if the model states them."""
         if receiver in self._place:
             return self.fitted.predict(inputs, self._place[receiver])
         prediction = self.law(inputs, receiver)
-        states_std = self.fitted.predict(inputs.rows(slice(0, 1)), 0).std is not None
-        return prediction if states_std else Prediction(prediction.mean)
+        if self._states_std is None:  # the same for all inputs, and a prediction of some models is slow
+            self._states_std = self.fitted.predict(inputs.rows(slice(0, 1)), 0).std is not None
+        return prediction if self._states_std else Prediction(prediction.mean)
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`."""
