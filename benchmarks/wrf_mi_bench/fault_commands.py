@@ -20,7 +20,7 @@ from wrf_mi.datasets.registry import DATA_VARIABLE
 from wrf_mi.runs.folder import CONFIG, FITTED, METRICS, PREDICTIONS, SECONDS
 
 from .bench import FLAT
-from .table_plan import NAMED, Entry, Part, Row
+from .table_plan import NAMED, Entry, Row, TablePart
 
 FIELD = (
     *("initial.gaussians=8", "network.width=8", "network.layers=2", "steps=6", "checkpoint_every=2"),
@@ -181,7 +181,7 @@ def small_plan() -> list[Row]:
         "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", options=("--deterministic", *words)),
         "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED, ("--depth", "1")),
     }
-    part = Part("rssi", "rssi", FLAT, "official", entries, scene="open")
+    part = TablePart("rssi", "rssi", FLAT, "official", entries, scene="open")
     return [Row(part, name, 1.0, 0) for name in entries]
 
 

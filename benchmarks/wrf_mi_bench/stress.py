@@ -58,35 +58,35 @@ def curves() -> Curves:
     }
 
 
-def _needles(ratio: float, rng: fields.Rng) -> fields.Field:
+def _needles(ratio: float, rng: fields.Rng) -> fields.StressField:
     return fields.made(COUNT, rng, scale_m=np.tile([1.0, 1 / ratio, 1 / ratio], (COUNT, 1)))
 
 
-def _away(distance_m: float, rng: fields.Rng) -> fields.Field:
+def _away(distance_m: float, rng: fields.Rng) -> fields.StressField:
     azimuth, elevation = rng.uniform(0, 2 * np.pi, COUNT), rng.uniform(0, 1.5, COUNT)
     position_m = fields.placed(azimuth, elevation, rng, (0.5 * distance_m, 1.5 * distance_m))
     return fields.made(COUNT, rng, position_m=position_m, scale_m=0.1 * distance_m * rng.uniform(0.5, 2, (COUNT, 3)))
 
 
-def _layered(count: float, rng: fields.Rng) -> fields.Field:
+def _layered(count: float, rng: fields.Rng) -> fields.StressField:
     return fields.layers(rng, int(count), opacity=np.full(int(count), 3 / count))
 
 
-def _image(field: fields.Field, blending: str, seed: int) -> float:
+def _image(field: fields.StressField, blending: str, seed: int) -> float:
     size = fields.SIZE if len(field.signal) < 1000 else fields.SMALL
     truth, clear = fields.reference(field, blending, size)
     return relative((fields.image(field, blending, size) - truth)[clear], truth)
 
 
-def _derivative(field: fields.Field, blending: str, seed: int) -> float:
+def _derivative(field: fields.StressField, blending: str, seed: int) -> float:
     single, double = (fields.gradient(field, blending, kind, seed)["position"] for kind in (mi.Float, DOUBLE))
     return relative(single - double, double)
 
 
 def _medians(
     values: Sequence[float] | FloatArray,
-    family: Callable[[float, fields.Rng], fields.Field],
-    error: Callable[[fields.Field, str, int], float],
+    family: Callable[[float, fields.Rng], fields.StressField],
+    error: Callable[[fields.StressField, str, int], float],
 ) -> list[float]:
     families: list[Any] = [{"": lambda rng, x=x: family(float(x), rng)} for x in values]
     return [

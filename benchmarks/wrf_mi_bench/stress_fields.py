@@ -30,7 +30,7 @@ ComplexArray = NDArray[np.complex128]
 Size = tuple[int, int]
 BLENDINGS = ("alpha", "product")
 Rng = np.random.Generator
-Family = Callable[[Rng], "Field"]
+Family = Callable[[Rng], "StressField"]
 RECEIVER = Receiver(
     "receiver", np.array([5.0, 0.25, 0.125]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
 )
@@ -40,7 +40,7 @@ ON_THE_EDGE = 1e-3
 
 
 @dataclass(frozen=True)
-class Field:
+class StressField:
     """Positions and scales [n, 3] in m, quaternions (x, y, z, w) of any length [n, 4], complex signals [n], opacity of
     alpha blending [n] and complex attenuation of product blending [n] of n Gaussians."""
 
@@ -61,7 +61,7 @@ class Field:
         return {"position": self.position_m, "scale": self.scale_m, "rotation": self.rotation} | pairs
 
 
-def made(count: int, rng: Rng, **replaced: Any) -> Field:
+def made(count: int, rng: Rng, **replaced: Any) -> StressField:
     """Random field around `RECEIVER`; ``replaced`` arrays replace drawn ones."""
     values: dict[str, Any] = {
         "position_m": placed(rng.uniform(0, 2 * np.pi, count), np.arcsin(rng.uniform(-0.1, 1, count)), rng),
@@ -71,10 +71,10 @@ def made(count: int, rng: Rng, **replaced: Any) -> Field:
         "opacity": rng.uniform(0, 1, count),
         "attenuation": np.sqrt(rng.uniform(0, 1, count)) * np.exp(2j * np.pi * rng.uniform(0, 1, count)),
     }
-    return Field(**{name: _held_by_float32(value) for name, value in (values | replaced).items()})
+    return StressField(**{name: _held_by_float32(value) for name, value in (values | replaced).items()})
 
 
-def ordinary(rng: Rng) -> Field:
+def ordinary(rng: Rng) -> StressField:
     """Random field of 1 to 99 Gaussians."""
     return made(int(rng.integers(1, 100)), rng)
 
@@ -133,14 +133,14 @@ HARDEST = ("each axis of 1e-6 to 1e3 m", "needles, 1e6 to 1", "exact ties in dep
 """Families whose derivatives the quick form compares."""
 
 
-def layers(rng: Rng, count: int = 50_000, **replaced: Any) -> Field:
+def layers(rng: Rng, count: int = 50_000, **replaced: Any) -> StressField:
     """Gaussians behind each other, whose transmittance underflows in float32."""
     position_m = placed(rng.normal(1, 0.005, count), rng.normal(0.7, 0.005, count), rng)
     distance = np.linalg.norm(position_m - RECEIVER.position_m, axis=1)
     return made(count, rng, position_m=position_m, scale_m=np.tile(0.1 * distance[:, None], 3), **replaced)
 
 
-def image(field: Field, blending: str, size: Size) -> ComplexArray:
+def image(field: StressField, blending: str, size: Size) -> ComplexArray:
     """Image [height, width] splatted in float32."""
     plane = perception_plane(*size, mi.Float)
     re, im = splat(on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
@@ -153,7 +153,9 @@ def off_edges(squared: FloatArray, cosine: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(inside & (np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE))
 
 
-def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> tuple[ComplexArray, NDArray[np.bool_]]:
+def reference(
+    field: StressField, blending: str, size: Size, sphere: bool = False
+) -> tuple[ComplexArray, NDArray[np.bool_]]:
     """Image [height, width] by `field_oracle` in float64, and a mask of pixels off all footprints' edges.
 
     With ``sphere`` the lower hemisphere is appended: [2 * height, width].
@@ -171,12 +173,12 @@ def reference(field: Field, blending: str, size: Size, sphere: bool = False) -> 
 
 
 Report = Callable[[Gaussians, Pose], Sequence[Any]]  # differentiable real arrays computed from a field
-Slope = Callable[["Field", str, int], dict[str, FloatArray]]
+Slope = Callable[["StressField", str, int], dict[str, FloatArray]]
 """Derivatives by group of parameters for a field, a blending and a seed."""
 
 
 def gradient(
-    field: Field, blending: str, float_type: Any, seed: int, report: Report | None = None
+    field: StressField, blending: str, float_type: Any, seed: int, report: Report | None = None
 ) -> dict[str, FloatArray]:
     """Derivative [n, k] of a random linear functional of a report by each group of parameters.
 
@@ -196,7 +198,7 @@ def gradient(
     return {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], axis=1) for name, part in parts.items()}
 
 
-def felt_values(field: Field, blending: str) -> dict[str, FloatArray]:
+def felt_values(field: StressField, blending: str) -> dict[str, FloatArray]:
     """Factors of the derivatives by group: the parameters, with positions relative to the receiver."""
     values = field.groups(blending)
     return values | {"position": values["position"] - RECEIVER.position_m}
@@ -210,7 +212,7 @@ def pose(float_type: Any) -> Pose:
     )
 
 
-def on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
+def on_device(field: StressField, blending: str, float_type: Any) -> tuple[Gaussians, dict[str, list[Any]]]:
     """The field's Gaussians, and their arrays by group of parameters."""
     groups = field.groups(blending).items()
     parts = {name: [to_device(column, float_type) for column in values.T] for name, values in groups}
@@ -219,7 +221,7 @@ def on_device(field: Field, blending: str, float_type: Any) -> tuple[Gaussians, 
     return Gaussians(**geometry, opacity=opacity, attenuation=parts.get("attenuation"), batch=1), parts
 
 
-def cases(families: Mapping[str, Family], count: int) -> Iterator[tuple[str, Field, str, int]]:
+def cases(families: Mapping[str, Family], count: int) -> Iterator[tuple[str, StressField, str, int]]:
     """Family, field, blending and seed of each case: ``count`` fields of each family."""
     for name, family in families.items():
         for seed in range(count):
@@ -233,8 +235,8 @@ def image_row(
     families: Mapping[str, Family],
     count: int,
     size: Size = SIZE,
-    render: Callable[[Field, str, Size], ComplexArray] = image,
-    truth: Callable[[Field, str, Size], tuple[ComplexArray, NDArray[np.bool_]]] = reference,
+    render: Callable[[StressField, str, Size], ComplexArray] = image,
+    truth: Callable[[StressField, str, Size], tuple[ComplexArray, NDArray[np.bool_]]] = reference,
 ) -> Row:
     """Row of float32 images of ``count`` fields of each family, compared with float64 off the footprints' edges."""
     worst, edge, pixels, number = Worst(), 0, 0, 0
@@ -250,7 +252,7 @@ def image_row(
 
 def gradient_row(
     what: str,
-    tried: Iterable[tuple[str, Field, str, int]],
+    tried: Iterable[tuple[str, StressField, str, int]],
     report: Report | None = None,
     single: Slope | None = None,
     least: int = 1,

@@ -47,14 +47,16 @@ def plugin_row(what: str, families: Mapping[str, fields.Family], count: int, siz
     return fields.image_row(f"plugin: image, {what}", families, count, size, rendered, defined)
 
 
-def rendered(field: fields.Field, blending: str, size: fields.Size) -> fields.ComplexArray:
+def rendered(field: fields.StressField, blending: str, size: fields.Size) -> fields.ComplexArray:
     """Image [height, width] by ``mi.render``."""
     scene = scene_of(fields.on_device(field, blending, mi.Float)[0], fields.RECEIVER, *size)
     parts = np.asarray(mi.render(scene).numpy(), float)
     return np.asarray(parts[..., 0] + 1j * parts[..., 1])
 
 
-def defined(field: fields.Field, blending: str, size: fields.Size) -> tuple[fields.ComplexArray, NDArray[np.bool_]]:
+def defined(
+    field: fields.StressField, blending: str, size: fields.Size
+) -> tuple[fields.ComplexArray, NDArray[np.bool_]]:
     """Image [height, width] of each Gaussian's largest response on a ray, and a mask of rays off all edges."""
     offset = field.position_m - fields.RECEIVER.position_m
     depth = np.linalg.norm(offset, axis=1)
@@ -86,7 +88,7 @@ def plugin_gradients(of_each: int, names: Iterable[str] = tuple(fields.HARD)) ->
     }
     forward = Worst()
 
-    def single(field: fields.Field, blending: str, seed: int) -> dict[str, FloatArray]:
+    def single(field: fields.StressField, blending: str, seed: int) -> dict[str, FloatArray]:
         slopes, error = _through_render(field, blending, seed)
         forward.add(error)
         return slopes
@@ -107,7 +109,7 @@ def _summed(gaussians: Gaussians, pose: Pose) -> list[Any]:
     return list(parts)
 
 
-def _through_render(field: fields.Field, blending: str, seed: int) -> tuple[dict[str, FloatArray], float]:
+def _through_render(field: fields.StressField, blending: str, seed: int) -> tuple[dict[str, FloatArray], float]:
     """Derivatives by group of parameters, and the relative error of forward mode along a random step."""
     from wrf_mi_plugins.shape import shape_parameters
 

@@ -16,7 +16,7 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 
 from .comparison import Row, line
-from .table_plan import MADE_HERE, PARTS, SHARES, Part, plan
+from .table_plan import MADE_HERE, PARTS, SHARES, TablePart, plan
 
 
 def read_rows(place: Path) -> list[dict[str, Any]]:
@@ -82,7 +82,7 @@ Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
 """Stored rows by share of the training rows and method, in the order of their seeds."""
 
 
-def grouped(part: Part, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> Groups:
+def grouped(part: TablePart, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> Groups:
     groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
     for row in plan(quick):
         if row.part == part and row.name in stored:
@@ -90,7 +90,7 @@ def grouped(part: Part, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     return groups
 
 
-def is_former(part: Part, rows: Sequence[Mapping[str, Any]], newest: str | None) -> bool:
+def is_former(part: TablePart, rows: Sequence[Mapping[str, Any]], newest: str | None) -> bool:
     """Whether one of some rows was measured on other data than those of a digest; measured data do not change."""
     return part.dataset.startswith(MADE_HERE) and any(row.get("data") != newest for row in rows)
 
@@ -134,10 +134,10 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
 
 def _medians(
     name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool
-) -> tuple[dict[Part, dict[str, float]], set[tuple[Part, str]]]:
+) -> tuple[dict[TablePart, dict[str, float]], set[tuple[TablePart, str]]]:
     """Medians of each method by part of an overview, and those measured on former data."""
-    columns: dict[Part, dict[str, float]] = {}
-    former = set[tuple[Part, str]]()
+    columns: dict[TablePart, dict[str, float]] = {}
+    former = set[tuple[TablePart, str]]()
     for part in PARTS:
         groups = grouped(part, stored, quick) if part.table == name else {}
         newest = newest_data(groups) if groups else None
@@ -149,12 +149,12 @@ def _medians(
     return columns, former
 
 
-def title_of(part: Part) -> str:
+def title_of(part: TablePart) -> str:
     """Data set, and split where it is not the official one."""
     return part.dataset if part.split == "official" else f"{part.dataset}, {part.split}"
 
 
-def part_table(part: Part, groups: Groups) -> str:
+def part_table(part: TablePart, groups: Groups) -> str:
     """Markdown table of a data set and split: best median first, fewer rows below."""
     task = TASKS[part.task]
     sign = -1 if task.higher_is_better else 1
@@ -180,7 +180,7 @@ def part_table(part: Part, groups: Groups) -> str:
     return markdown_table([*head, "paper, other data"], [*lines, *_reference_rows(part, groups)])
 
 
-def _reference_rows(part: Part, groups: Groups) -> list[list[str]]:
+def _reference_rows(part: TablePart, groups: Groups) -> list[list[str]]:
     """Lines of the references that every run states, where the part has no row of interpolation."""
     if "idw" in part.entries:
         return []
@@ -202,7 +202,7 @@ LEAST = 1e-3  # smallest cost on the logarithmic axes
 Points = Mapping[str, Mapping[str, float]]  # score and costs of each method by name
 
 
-def points_of(part: Part, stored: Mapping[str, Mapping[str, Any]]) -> Points:
+def points_of(part: TablePart, stored: Mapping[str, Mapping[str, Any]]) -> Points:
     """Mean over seeds of the median score, and median costs, of each method of a part with all training rows."""
     groups = grouped(part, stored)
     return {
@@ -224,7 +224,7 @@ def front(points: Points, cost: str, higher_is_better: bool) -> list[str]:
     return optimal
 
 
-def fronts(by_part: Mapping[Part, Points]) -> list[Row]:
+def fronts(by_part: Mapping[TablePart, Points]) -> list[Row]:
     """Rows for the benchmark's table: the methods on each front with their scores and costs."""
     rows = []
     for part, points in by_part.items():
@@ -238,7 +238,7 @@ def fronts(by_part: Mapping[Part, Points]) -> list[Row]:
     return rows
 
 
-def pareto_figure(by_part: Mapping[Part, Points]) -> Figure:
+def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:
     """Picture of costs against scores: a row for each part, a colour for each method, the fronts as grey steps."""
     figure = Figure(figsize=(9, 2.3 * len(by_part) + 1), layout="constrained", facecolor="white")
     names = list(dict.fromkeys(name for points in by_part.values() for name in points))
@@ -260,7 +260,7 @@ def pareto_figure(by_part: Mapping[Part, Points]) -> Figure:
     return figure
 
 
-def read_points(place: Path = STORED) -> dict[Part, Points]:
+def read_points(place: Path = STORED) -> dict[TablePart, Points]:
     """Points of each part with stored rows; `InputError` where there are none."""
     stored = {row["row"]: row for row in read_rows(place)}
     if not stored:

@@ -118,7 +118,7 @@ FEW = ("wrf-gs+", "nerf2", "linear", "kriging", "idw", "ray-tracing")  # methods
 
 
 @dataclass(frozen=True)
-class Part:
+class TablePart:
     """A data set with a split."""
 
     task: str  # task of the data set
@@ -132,16 +132,16 @@ class Part:
 
 
 PARTS = (
-    Part("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
-    Part("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
-    Part("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="lidar", once=("wrf-gs+", "wrf-gs")),
-    Part("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
-    Part("spectrum", "carriers", "traced-room-bands", "frequency", NEW_CARRIERS, scene="lidar"),
-    Part("spectrum", "carriers", "traced-room-bands", "frequency-known", KNOWN_POSITIONS, scene="lidar"),
-    Part("rssi", "receivers", "traced-floor-receivers", "receiver", NEW_RECEIVERS, scene="lidar"),
-    Part("rssi", "receivers", "flat-ble", "receiver", NEW_RECEIVERS, scene="flat"),
-    Part("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
-    Part("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
+    TablePart("spectrum", "spectrum", "rfid-lab", "official", UNSEEN, True, "open", once=("wrf-gs", "nerf2")),
+    TablePart("spectrum", "spectrum", "rfid-lab", "blocked", UNSEEN, scene="open", once=("wrf-gs+", "nerf2", "vae")),
+    TablePart("spectrum", "spectrum", "traced-room", "official", FURNISHED, scene="lidar", once=("wrf-gs+", "wrf-gs")),
+    TablePart("rssi", "rssi", "flat-ble", "official", RSSI, True, "flat", once=("wrf-gs+-joint",)),
+    TablePart("spectrum", "carriers", "traced-room-bands", "frequency", NEW_CARRIERS, scene="lidar"),
+    TablePart("spectrum", "carriers", "traced-room-bands", "frequency-known", KNOWN_POSITIONS, scene="lidar"),
+    TablePart("rssi", "receivers", "traced-floor-receivers", "receiver", NEW_RECEIVERS, scene="lidar"),
+    TablePart("rssi", "receivers", "flat-ble", "receiver", NEW_RECEIVERS, scene="flat"),
+    TablePart("csi", "uplink", "traced-csi-flat", "official", UPLINK, True, "floor"),
+    TablePart("csi", "uplink", "traced-csi-office", "official", UPLINK, scene="floor", once=("wrf-gs+", "r2f2")),
 )
 QUICK_PARTS = tuple(part for part in PARTS if part.dataset in ("rfid-lab", "flat-ble", "traced-csi-flat") and part.few)
 BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
@@ -156,7 +156,7 @@ BLOCKED_SETTINGS: Mapping[tuple[str, str], tuple[str, ...]] = {
 class Row:
     """A run of the tables: part, method, share of the training rows, seed of subset and fit, and small version."""
 
-    part: Part
+    part: TablePart
     method: str
     share: float
     seed: int
@@ -207,6 +207,6 @@ def plan(quick: bool = False) -> list[Row]:
     return [*first, *few, *again]
 
 
-def available(part: Part) -> bool:
+def available(part: TablePart) -> bool:
     """Whether the data of a part are on this machine or can be made here."""
     return part.dataset.startswith(MADE_HERE) or locate(part.dataset) is not None

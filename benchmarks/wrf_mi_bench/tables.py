@@ -37,7 +37,7 @@ from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder, say
 from .sources import fit_key, modules_of_command, source_digests, source_files
 from .table_pages import read_rows, write_tables
-from .table_plan import CORRECTED, PARTS, Part, Row, available, plan
+from .table_plan import CORRECTED, PARTS, Row, TablePart, available, plan
 
 FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
 QUANTILES = 101  # number of equally spaced quantiles of a row's scores
@@ -46,7 +46,7 @@ FAR_M, PLATE_M = 100.0, 0.01  # distance and size of the only surface of the ope
 KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 
-def scene_of(part: Part, folder: Path) -> Path:
+def scene_of(part: TablePart, folder: Path) -> Path:
     """Scene of a part, which is made in ``folder`` where needed."""
     if part.scene == "open":
         place = folder / f"open-{fit_key(FAR_M, PLATE_M)}"

@@ -18,7 +18,7 @@ from wrf_mi.backend.vectors import Complex, Pose
 from wrf_mi.core import InputError
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.tiles import Plane
+from wrf_mi.gaussians.tiles import TiledPlane
 from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
 from wrf_mi.tracing.paths.scene_parameters import MaterialGrouping, slabs_of_faces
@@ -104,7 +104,7 @@ def _mesh(name: str, triangles: FloatArray, bsdf: Any) -> Any:
 class _FieldScene:
     """A scene of Gaussians and walls, with a perception plane for each view of the receiver."""
 
-    def __init__(self, gaussians: Gaussians, plane: Plane, views: int, walls: SceneWalls | None) -> None:
+    def __init__(self, gaussians: Gaussians, plane: TiledPlane, views: int, walls: SceneWalls | None) -> None:
         film = {"type": "hdrfilm", "width": plane.width, "height": plane.height, "rfilter": {"type": "box"}}
         sensor = {"type": "wrf_perception_plane", "film": film | {"pixel_format": "luminance"}}
         carrier = {} if walls is None else {"frequency_hz": walls.frequency_hz}
@@ -160,7 +160,7 @@ class Traced(Evaluation):
         self,
         gaussians: Gaussians,
         pose: Pose,
-        plane: Plane,
+        plane: TiledPlane,
         sphere: bool,
         params: Mapping[str, Any],
     ) -> Complex:
@@ -193,7 +193,7 @@ class Traced(Evaluation):
         for scene in self._scenes:
             scene.release()
 
-    def _scene(self, number: int, gaussians: Gaussians, plane: Plane, views: int) -> _FieldScene:
+    def _scene(self, number: int, gaussians: Gaussians, plane: TiledPlane, views: int) -> _FieldScene:
         form = gaussians.count, gaussians.opacity is None, plane.height, plane.width, views
         if form != self._form:
             self._form, self._scenes = form, []

@@ -16,7 +16,7 @@ from wrf_mi_scenes.random_rooms import random_room
 
 from wrf_mi.checking import check_scene
 from wrf_mi.checking.scene_findings import KINDS, LEVELS
-from wrf_mi.checking.scene_geometry import Part, scene_parts
+from wrf_mi.checking.scene_geometry import ShapePart, scene_parts
 from wrf_mi.checking.scene_xml_faults import SceneXml, read_xml
 from wrf_mi.checking.triangle_faults import FARTHEST_M
 from wrf_mi.core import InputError
@@ -108,7 +108,7 @@ def test_transforms_are_those_of_mitsuba(steps: str, tmp_path: Path) -> None:
     path = scene_file(tmp_path, "ply", f'<transform name="to_world">{steps}</transform>')
     scene = read_xml(path)
     assert isinstance(scene, SceneXml)
-    (part,) = [result for result in scene_parts(scene) if isinstance(result, Part)]
+    (part,) = [result for result in scene_parts(scene) if isinstance(result, ShapePart)]
     mesh = rt.load_scene(str(path), merge_shapes=False).objects["a"].mi_mesh
     vertices = mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
     expected = vertices[mesh.faces_buffer().numpy().reshape(-1, 3)]

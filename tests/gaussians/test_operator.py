@@ -20,7 +20,7 @@ from wrf_mi.gaussians import (
 )
 from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
-from wrf_mi.gaussians.tiles import Plane, perception_plane
+from wrf_mi.gaussians.tiles import TiledPlane, perception_plane
 from wrf_mi.training.step import device_pose
 
 SINGLE = 1e-5
@@ -61,7 +61,7 @@ def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Ga
     ), signal
 
 
-def operator_of(gaussians: Gaussians, pose: Pose, plane: Plane) -> PixelOperator:
+def operator_of(gaussians: Gaussians, pose: Pose, plane: TiledPlane) -> PixelOperator:
     return PixelOperator(pixel_weights(gaussians, pose, plane), plane.height, plane.width)
 
 

@@ -110,8 +110,8 @@ def test_table_has_a_row_for_each_receiver_and_position(mapped: xr.Dataset, tmp_
     table = pd.read_csv(write_map(mapped, tmp_path / "map.csv"))
     assert len(table) == mapped["power_dbm"].size
     row = table.iloc[57]
-    found = mapped["power_dbm"].sel(receiver=row["receiver"], x=row["x"], y=row["y"], method=None)
-    assert float(found) == pytest.approx(row["power_dbm"], rel=FLOAT32)
+    parts = mapped["power_dbm"].sel(receiver=row["receiver"], x=row["x"], y=row["y"], method=None)
+    assert float(parts) == pytest.approx(row["power_dbm"], rel=FLOAT32)
     assert set(table["best_receiver"]) == {"hall $_$", "kitchen"}
 
 
@@ -129,22 +129,22 @@ def test_surface_has_the_values_of_its_points(law: Run, tmp_path: Path) -> None:
     trimesh.creation.box((2.0, 1.0, 0.5), transform=trimesh.transformations.translation_matrix([3, 2, 1])).export(
         tmp_path / "box.ply"
     )
-    found = radio_map(law, surface=tmp_path / "box.ply", step_m=0.4)
-    assert found["power_dbm"].dims == ("receiver", "point")
-    points = np.stack([found[axis] for axis in "xyz"], axis=-1)
-    np.testing.assert_allclose(points, found["triangle"].mean("corner"), atol=FLOAT32)
-    np.testing.assert_allclose(found["power_dbm"][1], law.predict(points, 1).mean, rtol=FLOAT32)
+    parts = radio_map(law, surface=tmp_path / "box.ply", step_m=0.4)
+    assert parts["power_dbm"].dims == ("receiver", "point")
+    points = np.stack([parts[axis] for axis in "xyz"], axis=-1)
+    np.testing.assert_allclose(points, parts["triangle"].mean("corner"), atol=FLOAT32)
+    np.testing.assert_allclose(parts["power_dbm"][1], law.predict(points, 1).mean, rtol=FLOAT32)
 
 
 def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, tmp_path: Path) -> None:
     run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", intervals=True)
-    found = radio_map(run, step_m=1.5)
-    positions = grid_positions(found).reshape(-1, 3)
+    parts = radio_map(run, step_m=1.5)
+    positions = grid_positions(parts).reshape(-1, 3)
     each = [run.predict(positions, 0, np.full(len(positions), turn)) for turn in np.arange(8) * np.pi / 4]
     mean = np.mean([one.mean for one in each], axis=0)
     std = np.sqrt(np.mean([one.stated_std**2 for one in each], axis=0) + np.var([one.mean for one in each], axis=0))
-    np.testing.assert_allclose(found["power_dbm"][0].values.ravel(), mean, rtol=FLOAT32)
-    np.testing.assert_allclose(found["power_std_db"][0].values.ravel(), std, rtol=FLOAT32)
+    np.testing.assert_allclose(parts["power_dbm"][0].values.ravel(), mean, rtol=FLOAT32)
+    np.testing.assert_allclose(parts["power_std_db"][0].values.ravel(), std, rtol=FLOAT32)
     turned = radio_map(run, step_m=1.5, heading_deg=45.0)
     np.testing.assert_allclose(turned["power_dbm"][0].values.ravel(), each[1].mean, rtol=FLOAT32)
 
@@ -167,16 +167,16 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
 def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
     given: dict[str, Any] = {"scene": scene, "settings": ["depth=0", "rays=1024"]}
-    found = radio_map(wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given), step_m=0.4, height_m=1.3)
-    reached = ~np.isnan(found["k_factor_db"][0].values)
+    parts = radio_map(wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given), step_m=0.4, height_m=1.3)
+    reached = ~np.isnan(parts["k_factor_db"][0].values)
     # The line of sight alone: no spread, an infinite K-factor.
     assert reached.sum() > 20
-    assert (found["k_factor_db"][0].values[reached] == np.inf).all()
-    assert (found["delay_spread_s"][0].values[reached] == 0).all()
-    inside = found["power_dbm"][0].sel(x=3.0, y=2.0, method="nearest")
+    assert (parts["k_factor_db"][0].values[reached] == np.inf).all()
+    assert (parts["delay_spread_s"][0].values[reached] == 0).all()
+    inside = parts["power_dbm"][0].sel(x=3.0, y=2.0, method="nearest")
     assert np.isnan(inside)
-    assert found["best_receiver"].sel(x=3.0, y=2.0, method="nearest") == -1
-    assert "power_std_db" not in found
+    assert parts["best_receiver"].sel(x=3.0, y=2.0, method="nearest") == -1
+    assert "power_std_db" not in parts
 
 
 def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
@@ -231,16 +231,18 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
     fitted = {"paths": traced.fitted, "kriging": law.fitted}
     hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, None, {"sizes": "predicted"})
     positions = np.concatenate([record.tx_pos_m[:2], record.tx_pos_m[:2] + np.array([0.0, 0.0, 0.7])])
-    found = hybrid.decompose(Inputs(positions), 0)
-    np.testing.assert_array_equal(found.whole.mean, hybrid.predict(Inputs(positions), 0).mean)
-    assert found.traced is not None
-    assert found.learned is not None
+    parts = hybrid.decompose(Inputs(positions), 0)
+    np.testing.assert_array_equal(parts.prediction.mean, hybrid.predict(Inputs(positions), 0).mean)
+    assert parts.traced is not None
+    assert parts.learned is not None
     # Training rows are traced alone.
-    np.testing.assert_array_equal(np.isnan(found.learned), [True, True, False, False])
-    np.testing.assert_array_equal(found.traced[:2], found.whole.mean[:2])
+    np.testing.assert_array_equal(np.isnan(parts.learned), [True, True, False, False])
+    np.testing.assert_array_equal(parts.traced[:2], parts.prediction.mean[:2])
     share = hybrid.mixture(RowDistance.of_rows(record, np.arange(22))(positions, 0))[2:]
-    np.testing.assert_allclose(share[:, 0] * found.traced[2:] + share[:, 1] * found.learned[2:], found.whole.mean[2:])
-    assert found.paths is not None
+    np.testing.assert_allclose(
+        share[:, 0] * parts.traced[2:] + share[:, 1] * parts.learned[2:], parts.prediction.mean[2:]
+    )
+    assert parts.paths is not None
 
 
 def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], tmp_path: Path) -> None:
@@ -249,17 +251,17 @@ def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], 
     run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", scene=scene, settings=settings)
     run.field.predictor.reach = None  # Gaussians everywhere, whatever these few steps gained
     positions = record.tx_pos_m[:5]
-    found = run.fitted.decompose(Inputs(positions), 0)
-    np.testing.assert_allclose(found.whole.mean, run.predict(positions).mean, atol=FIT_DB)
-    assert found.traced is not None
-    assert found.learned is not None
-    whole, traced, learned = (10 ** (x / 20) for x in (found.whole.mean, found.traced, found.learned))
+    parts = run.fitted.decompose(Inputs(positions), 0)
+    np.testing.assert_allclose(parts.prediction.mean, run.predict(positions).mean, atol=FIT_DB)
+    assert parts.traced is not None
+    assert parts.learned is not None
+    whole, traced, learned = (10 ** (x / 20) for x in (parts.prediction.mean, parts.traced, parts.learned))
     assert (whole <= (traced + learned) * (1 + FIT_DB)).all()
     assert (whole >= np.abs(traced - learned) * (1 - FIT_DB)).all()
-    assert found.paths is not None
+    assert parts.paths is not None
     line_of_sight = free_space_db(positions, record.receivers[0])
     # The cabinet hides one of the positions.
-    assert np.median(np.abs(found.paths.path_gain_db - line_of_sight)) < REFLECTED_DB
+    assert np.median(np.abs(parts.paths.path_gain_db - line_of_sight)) < REFLECTED_DB
 
 
 def test_command_writes_map_and_picture(law: Run, strengths: Record, tmp_path: Path, capsys: Any) -> None:

@@ -12,7 +12,7 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ..scene.folder import plain_name
 from ..tracing.sionna.materials import BELOW_1_GHZ, in_itu_range
-from .scene_geometry import Part
+from .scene_geometry import ShapePart
 from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_itu, itu_type, short_name
 from .triangle_repair import label
 
@@ -50,7 +50,7 @@ class MaterialRepair:
     bsdfs: dict[str, Element] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
 
-    def of(self, part: Part) -> Element | None:
+    def of(self, part: ShapePart) -> Element | None:
         """BSDF that a part is to have; None where nothing says which material it is."""
         if part.name in self.of_shapes:
             return self._of_itu(part, self.of_shapes[part.name], "")
@@ -61,13 +61,13 @@ class MaterialRepair:
                 return self._add(identifier or part.name, radio)
         return self._by_name(part, [*stated, part.name or part.file.stem])
 
-    def _by_name(self, part: Part, names: Sequence[str]) -> Element | None:
+    def _by_name(self, part: ShapePart, names: Sequence[str]) -> Element | None:
         """Material that one of some names means, or the default."""
         guessed = next(filter(None, map(meant, names)), None)
         material = guessed or self.default
         return None if material is None else self._of_itu(part, material, " by its name" if guessed else "")
 
-    def _of_itu(self, part: Part, material: str, reason: str) -> Element:
+    def _of_itu(self, part: ShapePart, material: str, reason: str) -> Element:
         """Material of ITU-R P.2040 for a part; the same one for all parts of that material."""
         self.done.append(f"{label(part)}: material {material}{reason}")
         same = next((name for name in (f"mat-itu_{material}", f"itu_{material}") if name in self.bsdfs), None)

@@ -43,7 +43,7 @@ from ..tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ..tracing.sionna.scenes import REFUSALS, reason
 from .building import THICKEST_SOLID_M, in_solid
 from .scene_findings import Finding, SceneReport
-from .scene_geometry import Part, between_parts, mesh_file_parts, part_findings, scene_parts
+from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
 
 LIGHT_M_PER_S = 299_792_458.0
@@ -96,7 +96,7 @@ class Checked:
     source: Source
     report: SceneReport
     scene: SceneXml | None
-    parts: tuple[Part, ...]
+    parts: tuple[ShapePart, ...]
 
 
 def check_scene(
@@ -165,9 +165,9 @@ def _check_xml(where: Source, name: str, frame: Frame, record: Record | None, ca
     return Checked(where, report, scene, tuple(parts))
 
 
-def _placed(results: Iterator[Part | Finding], file: Path, frame: Frame) -> tuple[list[Finding], list[Part]]:
+def _placed(results: Iterator[ShapePart | Finding], file: Path, frame: Frame) -> tuple[list[Finding], list[ShapePart]]:
     """Findings, and parts in metres with z up."""
-    findings, parts = list[Finding](), list[Part]()
+    findings, parts = list[Finding](), list[ShapePart]()
     for result in results:
         if isinstance(result, Finding):
             findings.append(result)
@@ -177,7 +177,7 @@ def _placed(results: Iterator[Part | Finding], file: Path, frame: Frame) -> tupl
     return findings, parts
 
 
-def _faces(parts: Sequence[Part]) -> int:
+def _faces(parts: Sequence[ShapePart]) -> int:
     return sum(len(part.corners_m) for part in parts)
 
 
@@ -280,7 +280,7 @@ def _range(material: str, carriers_hz: Sequence[float]) -> tuple[str, float]:
 
 
 def _of_triangles(
-    parts: list[Part], path: Path, frame: Frame, record: Record | None, carriers_hz: Sequence[float]
+    parts: list[ShapePart], path: Path, frame: Frame, record: Record | None, carriers_hz: Sequence[float]
 ) -> Iterator[Finding]:
     """Findings about triangles, coordinates, and devices inside solids."""
     for part in parts:
@@ -292,7 +292,9 @@ def _of_triangles(
         yield from _devices(filled, path, record)
 
 
-def _coordinates(filled: Sequence[Part], path: Path, frame: Frame, carriers_hz: Sequence[float]) -> Iterator[Finding]:
+def _coordinates(
+    filled: Sequence[ShapePart], path: Path, frame: Frame, carriers_hz: Sequence[float]
+) -> Iterator[Finding]:
     """Findings about units, the axis that is up, and distances from the origin."""
     yield from _distances(filled, carriers_hz)
     corners = np.concatenate([part.corners_m for part in filled])
@@ -303,7 +305,7 @@ def _coordinates(filled: Sequence[Part], path: Path, frame: Frame, carriers_hz: 
     yield from wrong or ([] if frame.up else _up(sampled(corners), path))
 
 
-def _distances(parts: Sequence[Part], carriers_hz: Sequence[float]) -> Iterator[Finding]:
+def _distances(parts: Sequence[ShapePart], carriers_hz: Sequence[float]) -> Iterator[Finding]:
     """Parts whose coordinates single precision rounds too much."""
     shortest_m = LIGHT_M_PER_S / max(carriers_hz) if carriers_hz else np.inf
     for part in parts:
@@ -336,7 +338,7 @@ def _up(points: FloatArray, path: Path) -> Iterator[Finding]:
         yield Finding("up-axis", path, "", text, "state it by --up y, or --up z if that is right")
 
 
-def _devices(parts: Sequence[Part], path: Path, record: Record) -> Iterator[Finding]:
+def _devices(parts: Sequence[ShapePart], path: Path, record: Record) -> Iterator[Finding]:
     """Devices of a record inside closed bodies that are no rooms."""
     places = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
     solids = [(part.name, body) for part in parts for body in bodies(part.corners_m) if body.closed]

@@ -33,7 +33,7 @@ RESTORE = "export the mesh anew"
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ShapePart:
     """A shape of a scene, or a part of a mesh, with its triangles.
 
     Attributes:
@@ -51,11 +51,11 @@ class Part:
     shape: Element | None = None
 
 
-def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
+def scene_parts(scene: SceneXml) -> Iterator[ShapePart | Finding]:
     """Each shape of a scene as a part, and findings about its file, its polygons and its transform."""
     for name, shape in scene.shapes:
         materials = [identifier for identifier, _ in scene.materials(shape)]
-        part = Part(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
+        part = ShapePart(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
         plugin = shape.get("type", "")
         matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
@@ -67,7 +67,7 @@ def scene_parts(scene: SceneXml) -> Iterator[Part | Finding]:
             yield from _analytic(scene, shape, part)
 
 
-def _from_file(scene: SceneXml, shape: Element, part: Part, matrix: FloatArray) -> Iterator[Part | Finding]:
+def _from_file(scene: SceneXml, shape: Element, part: ShapePart, matrix: FloatArray) -> Iterator[ShapePart | Finding]:
     """A shape with a mesh file, or with one of the same name elsewhere in the folder, in the scene's frame."""
     plugin, stated = shape.get("type", ""), scene.file_of(shape) or ""
     try:
@@ -88,7 +88,7 @@ def _from_file(scene: SceneXml, shape: Element, part: Part, matrix: FloatArray) 
         yield Finding("moved", file, part.name, "to_world moves the mesh", "nothing to do; --repair applies it")
 
 
-def _analytic(scene: SceneXml, shape: Element, part: Part) -> Iterator[Part | Finding]:
+def _analytic(scene: SceneXml, shape: Element, part: ShapePart) -> Iterator[ShapePart | Finding]:
     """A shape without a file as triangles in the scene's frame."""
     try:
         mesh = placed_mesh(shape, scene.root.get("version", ""))
@@ -172,7 +172,7 @@ def _numbers(text: str, count: int | None = None) -> FloatArray:
     return np.array(values, float)
 
 
-def read_triangles(part: Part, plugin: str) -> Iterator[Part | Finding]:
+def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding]:
     """A part with the triangles of its PLY or OBJ file in the file's frame, and findings about its polygons."""
     file, name = part.file, part.name
     polygons = _polygons(file, name)
@@ -223,10 +223,10 @@ def _may_differ(polygons: Polygons, file: Path) -> bool:
         return b"format binary_" not in stream.read(100)
 
 
-def mesh_file_parts(file: Path) -> Iterator[Part | Finding]:
+def mesh_file_parts(file: Path) -> Iterator[ShapePart | Finding]:
     """Parts of a mesh file, and findings about it."""
     if (suffix := file.suffix.lower()) in POLYGON_READERS:
-        yield from read_triangles(Part("", "", file, np.empty((0, 3, 3))), suffix.removeprefix("."))
+        yield from read_triangles(ShapePart("", "", file, np.empty((0, 3, 3))), suffix.removeprefix("."))
         return
     yield Finding("format", file, "", f"plain Sionna RT opens no {suffix}", "wrf-mi does, and --repair writes PLY")
     try:
@@ -240,10 +240,10 @@ def mesh_file_parts(file: Path) -> Iterator[Part | Finding]:
         yield Finding("empty-mesh", file, "", "has no faces", "give a mesh with faces, or a scan as PLY")
     for index, mesh in enumerate(meshes, start=1):
         name = f"part {index}" if len(meshes) > 1 else ""
-        yield Part(name, "", file, np.asarray(mesh.vertices, float)[mesh.faces])
+        yield ShapePart(name, "", file, np.asarray(mesh.vertices, float)[mesh.faces])
 
 
-def part_findings(part: Part) -> Iterator[Finding]:
+def part_findings(part: ShapePart) -> Iterator[Finding]:
     """Findings about the triangles of a part."""
     empty = without_area(part.corners_m)
     corners = part.corners_m[~empty]
@@ -267,7 +267,7 @@ def part_findings(part: Part) -> Iterator[Finding]:
         yield Finding("open-solid", part.file, part.name, f"{count} of {len(solids)} bodies have a hole", "close it")
 
 
-def between_parts(parts: list[Part]) -> Iterator[Finding]:
+def between_parts(parts: list[ShapePart]) -> Iterator[Finding]:
     """Findings about faces of different parts, and of different bodies of a part: copies, and sheets too near."""
     if not parts:
         return
@@ -286,7 +286,7 @@ def between_parts(parts: list[Part]) -> Iterator[Finding]:
     yield from _near_sheets(parts, corners, owner)
 
 
-def _near_sheets(parts: list[Part], corners: FloatArray, owner: IntArray) -> Iterator[Finding]:
+def _near_sheets(parts: list[ShapePart], corners: FloatArray, owner: IntArray) -> Iterator[Finding]:
     """Pairs of parts with faces too near to each other, as sheets or as walls of two solids."""
     pairs = double_sheets(corners, materials_of(parts)[owner])
     involved = np.unique(owner[pairs])
@@ -301,12 +301,12 @@ def _near_sheets(parts: list[Part], corners: FloatArray, owner: IntArray) -> Ite
         yield Finding(kind, parts[j].file, parts[j].name, text, remedy)
 
 
-def materials_of(parts: Sequence[Part]) -> IntArray:
+def materials_of(parts: Sequence[ShapePart]) -> IntArray:
     """Number of each part's material [n]."""
     return np.unique([part.material for part in parts], return_inverse=True)[1].reshape(-1)
 
 
-def _in_sheets(part: Part) -> NDArray[np.bool_]:
+def _in_sheets(part: ShapePart) -> NDArray[np.bool_]:
     """Which triangles of a part belong to flat bodies."""
     flat = np.zeros(len(part.corners_m), bool)
     for body in bodies(part.corners_m):

@@ -22,7 +22,7 @@ from ..tracing.sionna.scenes import plain_ply
 from .material_repair import ODD, MaterialRepair, ascii_name
 from .scene_check import Checked, check_scene, checked, opened
 from .scene_findings import Finding, SceneReport, some_names
-from .scene_geometry import Part
+from .scene_geometry import ShapePart
 from .scene_xml_faults import ITU, MERGED, short_name
 from .triangle_repair import label, repaired_triangles
 
@@ -144,7 +144,9 @@ def repair_scene(
     return Repair(Path(out), tuple(done), tuple(after.of_level("fault")), after)
 
 
-def _write(folder: Path, names: Mapping[Part, str], bsdfs: Sequence[Element | None], facts: Mapping[str, Any]) -> None:
+def _write(
+    folder: Path, names: Mapping[ShapePart, str], bsdfs: Sequence[Element | None], facts: Mapping[str, Any]
+) -> None:
     """Write meshes, scene file and ``scene.yml`` into an empty folder."""
     (folder / "meshes").mkdir()
     for part, name in names.items():
@@ -164,7 +166,7 @@ def _shift(origin_m: FloatArray) -> list[str]:
     return [f"origin: {text} m subtracted; {remedy}"] if origin_m.any() else []
 
 
-def _renamed(names: Mapping[Part, str]) -> list[str]:
+def _renamed(names: Mapping[ShapePart, str]) -> list[str]:
     return [f"{label(part)}: named {name}" for part, name in names.items() if short_name(label(part)) != name]
 
 
@@ -195,7 +197,7 @@ def _known_material(name: str) -> str:
     return material
 
 
-def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) -> list[Finding]:
+def _left(parts: Sequence[ShapePart], bsdfs: Sequence[Element | None], path: Path) -> list[Finding]:
     """Repaired parts that still cannot be written."""
     left = list[Finding]()
     for part, bsdf in zip(parts, bsdfs, strict=True):
@@ -208,9 +210,9 @@ def _left(parts: Sequence[Part], bsdfs: Sequence[Element | None], path: Path) ->
     return left if parts else [Finding("no-shapes", path, "", "nothing has an area", "give a scene with surfaces")]
 
 
-def _names(parts: Sequence[Part], bsdfs: Sequence[Element | None]) -> dict[Part, str]:
+def _names(parts: Sequence[ShapePart], bsdfs: Sequence[Element | None]) -> dict[ShapePart, str]:
     """Safe names of parts that neither another one, nor a material, has: both are items of a scene of Sionna RT."""
-    names = dict[Part, str]()
+    names = dict[ShapePart, str]()
     materials = [short_name(bsdf.get("id", "")) for bsdf in bsdfs if bsdf is not None]
     for number, part in enumerate(parts, start=1):
         identifier = part.name if part.shape is None else part.shape.get("id", "")

@@ -12,14 +12,14 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..scene.coordinates import FARTHEST_M
 from ..scene.mesh.surfaces import bodies
-from .scene_geometry import Part, materials_of
+from .scene_geometry import ShapePart, materials_of
 from .triangle_faults import copies, double_sheets, is_flat, without_area, wound_both_ways, wound_one_way
 
 ORIGIN_STEP_M = 100.0  # origins are whole multiples, and axes near zero stay
 NEAR_ZERO_M = 1000.0
 
 
-def repaired_triangles(parts: Sequence[Part]) -> tuple[list[Part], FloatArray, list[str]]:
+def repaired_triangles(parts: Sequence[ShapePart]) -> tuple[list[ShapePart], FloatArray, list[str]]:
     """Repaired parts, the origin [3] that was subtracted in metres, and what was done to which part."""
     if not parts:
         return [], np.zeros(3), []
@@ -32,12 +32,12 @@ def repaired_triangles(parts: Sequence[Part]) -> tuple[list[Part], FloatArray, l
     return [part for part in stage if len(part.corners_m)], origin_m, done
 
 
-def label(part: Part) -> str:
+def label(part: ShapePart) -> str:
     """Name of a part, or of its file."""
     return part.name or part.file.name
 
 
-def _origin(parts: Sequence[Part]) -> FloatArray:
+def _origin(parts: Sequence[ShapePart]) -> FloatArray:
     """Origin [3] near which parts are that lie far from zero; else zero."""
     if all(np.abs(part.corners_m).max(initial=0) < FARTHEST_M for part in parts):
         return np.zeros(3)
@@ -45,7 +45,7 @@ def _origin(parts: Sequence[Part]) -> FloatArray:
     return np.where(np.abs(low) < NEAR_ZERO_M, 0, np.floor(low / ORIGIN_STEP_M) * ORIGIN_STEP_M)
 
 
-def _one_plane(parts: list[Part]) -> list[Part]:
+def _one_plane(parts: list[ShapePart]) -> list[ShapePart]:
     """Parts whose flat bodies are put into the planes of faces of the same material within millimetres."""
     corners = [part.corners_m.copy() for part in parts]
     owner = np.repeat(np.arange(len(parts)), [len(each) for each in corners])
@@ -82,22 +82,22 @@ def _sheet_numbers(corners_m: FloatArray) -> IntArray:
     return numbers
 
 
-def _with_area(parts: list[Part]) -> list[Part]:
+def _with_area(parts: list[ShapePart]) -> list[ShapePart]:
     return [_only(part, ~without_area(part.corners_m)) for part in parts]
 
 
-def _without_copies(parts: list[Part]) -> list[Part]:
+def _without_copies(parts: list[ShapePart]) -> list[ShapePart]:
     """Parts without triangles that an earlier part, or the part itself, has."""
     doubled = copies(np.concatenate([part.corners_m for part in parts]))
     ends = np.cumsum([len(part.corners_m) for part in parts])[:-1]
     return [_only(part, row) for part, row in zip(parts, np.split(~doubled, ends), strict=True)]
 
 
-def _only(part: Part, rows: NDArray[np.bool_]) -> Part:
+def _only(part: ShapePart, rows: NDArray[np.bool_]) -> ShapePart:
     return part if rows.all() else replace(part, corners_m=part.corners_m[rows])
 
 
-def _wound(parts: list[Part]) -> list[Part]:
+def _wound(parts: list[ShapePart]) -> list[ShapePart]:
     return [
         replace(part, corners_m=wound_one_way(part.corners_m))
         if any(map(wound_both_ways, bodies(part.corners_m)))
@@ -106,7 +106,7 @@ def _wound(parts: list[Part]) -> list[Part]:
     ]
 
 
-STAGES: tuple[tuple[Callable[[list[Part]], list[Part]], str], ...] = (
+STAGES: tuple[tuple[Callable[[list[ShapePart]], list[ShapePart]], str], ...] = (
     (_one_plane, "sheet moved by millimetres into the plane of another one"),
     (_with_area, "faces without an area left out"),
     (_without_copies, "copies of faces left out"),

@@ -228,7 +228,7 @@ def _read_table(path: Path, headers: tuple[str, ...]) -> CsvTable:
 
 
 @dataclass(frozen=True)
-class Positions:
+class PositionTable:
     """Content of `POSITIONS`: positions [n, 3], metres; carriers [n], Hz, and runs [n], None without the column."""
 
     positions_m: FloatArray
@@ -236,14 +236,14 @@ class Positions:
     runs: NDArray[np.str_] | None = None
 
 
-def read_positions(path: Path) -> Positions:
+def read_positions(path: Path) -> PositionTable:
     """Read a CSV file with the header ``x,y,z``, to which `FREQUENCY` and then `RUN` may be added."""
     optional = ("", f",{FREQUENCY}", f",{RUN}", f",{FREQUENCY},{RUN}")
     table = _read_table(path, tuple(AXES + columns for columns in optional))
     table = replace(table, header=[name.lower() for name in table.header])
     positions = np.stack([table.numbers(axis) for axis in AXES.split(",")], axis=-1)
     carriers = carriers_of(path, table.numbers(FREQUENCY)) if FREQUENCY in table.header else None
-    return Positions(positions, carriers, runs_of(table) if RUN in table.header else None)
+    return PositionTable(positions, carriers, runs_of(table) if RUN in table.header else None)
 
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
@@ -333,7 +333,7 @@ def write_lines(path: Path, lines: list[str]) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
 
 
-def write_positions(path: Path, stated: Positions) -> None:
+def write_positions(path: Path, stated: PositionTable) -> None:
     """Write positions and carriers to the last digit, and runs; `read_positions` reads them."""
     columns: dict[str, list[Any]] = dict(zip(AXES.split(","), stated.positions_m.astype(float).T.tolist(), strict=True))
     for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs)):

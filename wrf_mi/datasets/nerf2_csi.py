@@ -103,7 +103,7 @@ def write_nerf2_csi(
         text = yaml.safe_dump(_station_info(record, array_m), sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
-            files.write_positions(part / files.POSITIONS, files.Positions(record.tx_pos_m))
+            files.write_positions(part / files.POSITIONS, files.PositionTable(record.tx_pos_m))
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
         files.write_official(part, record.official, first=0)

@@ -108,7 +108,9 @@ def write_spectrum_folder(
                 Image.fromarray(image).save(images / f"{row:05d}.png")
         info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        files.write_positions(part / files.POSITIONS, files.Positions(record.tx_pos_m, record.carriers_hz, record.runs))
+        files.write_positions(
+            part / files.POSITIONS, files.PositionTable(record.tx_pos_m, record.carriers_hz, record.runs)
+        )
         files.write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
             files.write_lines(part / FOLDS, [str(fold) for fold in record.folds])

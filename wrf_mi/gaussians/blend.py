@@ -19,7 +19,7 @@ from ..backend.vectors import Complex, Pose
 from .footprint import CUTOFF, LOG2_E, MIN_COSINE, Footprints, depth_order, project
 from .parameters import Gaussians
 from .recurrence import ForwardState, ReverseState, accumulate, forward_step, reverse_start, reverse_step
-from .tiles import LANE_ROWS, Plane, TileLists, build_lists
+from .tiles import LANE_ROWS, TiledPlane, TileLists, build_lists
 
 RECORD = 16  # floats per Gaussian in the packed table, one cache line: n, a, b (3 each), opacity or delta, and signal
 
@@ -116,11 +116,11 @@ class Lanes:
 
 
 @dataclass
-class Layout:
+class BlendLayout:
     """Pixels and lists of ``batch`` transmitters with n Gaussians each, or with one geometry if ``shared``."""
 
     lists: TileLists
-    plane: Plane
+    plane: TiledPlane
     n: int
     batch: int
     shared: bool
@@ -128,7 +128,7 @@ class Layout:
     size: int  # transmitters whose sums a lane keeps
 
 
-def lanes_of(layout: Layout) -> Lanes:
+def lanes_of(layout: BlendLayout) -> Lanes:
     """The lanes of all groups of transmitters."""
     plane, lists, size = layout.plane, layout.lists, layout.size
     index_type = type(lists.index)
@@ -164,7 +164,7 @@ def _blend_one(
     return result
 
 
-def _read_both(table: Any, signals: Any, layout: Layout, i: Any, slot: Any) -> tuple[list[Any], list[Complex]]:
+def _read_both(table: Any, signals: Any, layout: BlendLayout, i: Any, slot: Any) -> tuple[list[Any], list[Complex]]:
     """Record of Gaussian i and its signals, from their ``slot`` if the geometry is shared, else those of the record."""
     if layout.shared:
         return read(table, i, layout.fields), _read_signals(signals, slot, layout.size)
@@ -173,7 +173,7 @@ def _read_both(table: Any, signals: Any, layout: Layout, i: Any, slot: Any) -> t
 
 
 @dr.syntax
-def _forward(table: Any, signals: Any, layout: Layout) -> tuple[Any, Any]:
+def _forward(table: Any, signals: Any, layout: BlendLayout) -> tuple[Any, Any]:
     """Real and imaginary part of all images. Each record holds its signal where ``signals`` is None."""
     lists, n, fields, size = layout.lists, layout.n, layout.fields, layout.size
     float_type, index_type = type(table), type(lists.index)
@@ -232,7 +232,7 @@ def _derivatives(
 def _backward(
     table: Any,  # [batch * n * RECORD], or [n * RECORD] of a shared geometry
     signals: Any,  # [2 * batch * n] of a shared geometry, else None
-    layout: Layout,
+    layout: BlendLayout,
     total: tuple[Any, Any],  # re, im, [batch * pixels] each
     gradient: tuple[Any, Any],  # re, im, [batch * pixels] each
 ) -> tuple[Any, Any]:
@@ -265,7 +265,7 @@ def _backward(
 
 
 class _Blend(dr.CustomOp):
-    def eval(self, layout: Layout, columns: list[Any], signal: list[Any]) -> Any:
+    def eval(self, layout: BlendLayout, columns: list[Any], signal: list[Any]) -> Any:
         self.layout = layout
         self.table = pack([*columns, *([] if layout.shared else signal)])
         self.signals = None
@@ -299,7 +299,7 @@ class _Blend(dr.CustomOp):
 
 
 def blend(
-    footprints: Footprints, signal: list[Any], lists: TileLists, plane: Plane, batch: int, blending: list[Any]
+    footprints: Footprints, signal: list[Any], lists: TileLists, plane: TiledPlane, batch: int, blending: list[Any]
 ) -> tuple[Any, Any]:
     """Received complex signal of each pixel: real and imaginary part, [batch * height * width], row-major.
 
@@ -311,12 +311,12 @@ def blend(
     n = dr.width(signal[0]) // batch
     columns = columns_of(footprints, blending)
     shared = batch > 1 and dr.width(footprints.radius) == n
-    layout = Layout(lists, plane, n, batch, shared, len(columns), group_size(batch) if shared else 1)
+    layout = BlendLayout(lists, plane, n, batch, shared, len(columns), group_size(batch) if shared else 1)
     result: tuple[Any, Any] = dr.custom(_Blend, layout, columns, signal)
     return result
 
 
-def splat(gaussians: Gaussians, pose: Pose, plane: Plane) -> tuple[Any, Any]:
+def splat(gaussians: Gaussians, pose: Pose, plane: TiledPlane) -> tuple[Any, Any]:
     """Complex signal (re, im) that a receiver gets from each pixel of a plane, [batch * height * width], row-major."""
     batch, signal = gaussians.batch, gaussians.signal
     if not gaussians.count:

@@ -32,7 +32,7 @@ from .footprint import Footprints, depth_order, project
 from .network import dense, linear
 from .parameters import Gaussians
 from .recurrence import forward_step
-from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, Plane, TileLists, build_lists
+from .tiles import LANE_ROWS, LANES, TILE_COLUMNS, TILE_ROWS, TiledPlane, TileLists, build_lists
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
@@ -43,7 +43,7 @@ PAIRS_PER_CHUNK = 1 << 15  # pairs of Gaussian and transmitter at once: 16 MB of
 Coefficients = Callable[[NDArray[np.float32]], NDArray[np.complex64]]  # of transmitters [m, 3], metres: [m, K or n]
 
 
-def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:
+def _strips(plane: TiledPlane) -> Iterator[tuple[TiledPlane, int, int]]:
     """The plane cut into rows of tiles, each as a plane with its first pixel and their number."""
     # Pixels keep their numbers in the whole. The memory beside the result therefore does not grow with the rows.
     across = -(-plane.width // TILE_COLUMNS)
@@ -70,7 +70,7 @@ def _strips(plane: Plane) -> Iterator[tuple[Plane, int, int]]:
         yield strip, row * plane.width, (min(row + TILE_ROWS, plane.height) - row) * plane.width
 
 
-def _footprints(record: list[Any], strip: Plane) -> list[Any]:
+def _footprints(record: list[Any], strip: TiledPlane) -> list[Any]:
     along = along_azimuth(record, strip.azimuth)
     return [footprint_at(along, elevation)[0] for elevation in strip.elevation]
 
@@ -80,7 +80,7 @@ def _counted(counts: list[Any], footprints: list[Any]) -> list[Any]:
 
 
 @dr.syntax
-def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
+def _count(table: Any, lists: TileLists, strip: TiledPlane, n: int) -> list[Any]:
     """Number of Gaussians that each pixel of a lane sees."""
     index_type = type(lists.index)
     j, start, end = index_type(0), lists.begin(strip.tile, n), dr.gather(index_type, lists.length, strip.tile)
@@ -93,7 +93,7 @@ def _count(table: Any, lists: TileLists, strip: Plane, n: int) -> list[Any]:
 
 
 def _store(
-    record: list[Any], i: Any, strip: Plane, slots: list[Any], t: list[Complex], out: tuple[Any, ...]
+    record: list[Any], i: Any, strip: TiledPlane, slots: list[Any], t: list[Complex], out: tuple[Any, ...]
 ) -> tuple[list[Any], list[Complex]]:
     """Write one Gaussian's weight at each pixel of a lane that sees it; next slots and T behind the Gaussian."""
     next_slots, behind = [], []
@@ -110,7 +110,7 @@ def _store(
 
 @dr.syntax
 def _fill(
-    table: Any, lists: TileLists, strip: Plane, n: int, fields: int, slots: list[Any], out: tuple[Any, ...]
+    table: Any, lists: TileLists, strip: TiledPlane, n: int, fields: int, slots: list[Any], out: tuple[Any, ...]
 ) -> None:
     """Fill ``out``: Gaussian of each entry and its weight; ``slots`` are the first entries of each pixel of a lane."""
     float_type, index_type = type(table), type(lists.index)
@@ -124,7 +124,7 @@ def _fill(
 
 
 def _weights(
-    table: Any, fields: int, footprints: Footprints, order: Any, strip: Plane, first: int, count: int
+    table: Any, fields: int, footprints: Footprints, order: Any, strip: TiledPlane, first: int, count: int
 ) -> csr_array:
     """Weights [count, n] of one row of tiles."""
     n = dr.width(order)
@@ -153,7 +153,7 @@ def _weights(
     return csr_array((values, out[0].numpy()[:total].astype(np.int32), start), shape=(count, n))
 
 
-def pixel_weights(gaussians: Gaussians, pose: Pose, plane: Plane, most_bytes: float = np.inf) -> csr_array:
+def pixel_weights(gaussians: Gaussians, pose: Pose, plane: TiledPlane, most_bytes: float = np.inf) -> csr_array:
     """The weights of Gaussians for one transmitter on the perception plane, one row of tiles after the other.
 
     Returns a matrix [pixels, n]: float32 or float64 under alpha blending, complex under product blending. Entries of a

@@ -29,7 +29,7 @@ RESERVED = 1 << 21  # most entries that are allocated without counting, 8 MB: co
 
 
 @dataclass
-class Plane:
+class TiledPlane:
     """The perception plane, in tile order, for one image size."""
 
     height: int  # rows, over elevations 0 to 90 degrees
@@ -80,14 +80,14 @@ def tiling(height: int, width: int, tile: tuple[int, int, int]) -> tuple[NDArray
 
 
 @lru_cache(maxsize=16)
-def perception_plane(height: int, width: int, float_type: type) -> Plane:
+def perception_plane(height: int, width: int, float_type: type) -> TiledPlane:
     """The perception plane of ``height`` x ``width`` pixels over the hemisphere, arrays of ``float_type``."""
     index_type: Any = dr.uint32_array_t(float_type)
     mask_type: Any = dr.mask_t(float_type)
     tiles, pixel, inside = tiling(height, width, (TILE_ROWS, TILE_COLUMNS, LANE_ROWS))
     azimuth, elevation = azimuth_rad(width)[pixel[0] % width], elevation_rad(height)
     first_row, first_column = np.divmod(tiles[:, 0], width)
-    result = Plane(
+    result = TiledPlane(
         height,
         width,
         tile=on_device(np.arange(pixel.shape[1]) // LANES, index_type),
@@ -132,7 +132,7 @@ def _boxes(footprints: Footprints, height: int, width: int) -> tuple[dr.ArrayBas
     return first_row, high * to_row + 1, (dr.atan2(y, x) - half) * to_column - 1, 2 * half * to_column + 2
 
 
-def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: Plane, batch: int) -> TileLists:
+def build_lists(footprints: Footprints, order: dr.ArrayBase, plane: TiledPlane, batch: int) -> TileLists:
     """List the Gaussians of each tile in depth order; `InputError` for more entries than 32 bits count.
 
     Where room for every Gaussian in every tile takes more than `RESERVED` entries, entries are counted first and only
@@ -167,7 +167,7 @@ def check_entries(entries: int) -> int:
     return entries
 
 
-def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> TileLists:
+def _counted(boxes: tuple[Any, ...], column: Any, plane: TiledPlane, batch: int) -> TileLists:
     """Lists without spare room: those of each row of tiles first, then of its tiles, counted and filled."""
     # Boxes are near to far for each transmitter, and ``column`` holds their numbers ``b * n + i``, [batch * n].
     index_type: Any = type(column)
@@ -202,7 +202,7 @@ def _counted(boxes: tuple[Any, ...], column: Any, plane: Plane, batch: int) -> T
 def _list_tiles(
     boxes: tuple[dr.ArrayBase, ...],  # 4 arrays [batch * n], near to far
     column: dr.ArrayBase,  # [batch * n]
-    plane: Plane,
+    plane: TiledPlane,
     members: dr.ArrayBase | None,  # [entries of all rows]
     bounds: tuple[dr.ArrayBase, dr.ArrayBase],  # begin and end, [batch * tiles] each
     index: dr.ArrayBase | None,  # [entries of all tiles]

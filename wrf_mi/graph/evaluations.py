@@ -14,7 +14,7 @@ import drjit as dr
 from ..backend.vectors import Complex, Pose
 from ..gaussians import Gaussians
 from ..gaussians.blend import splat
-from ..gaussians.tiles import Plane
+from ..gaussians.tiles import TiledPlane
 from .settings import SPLATTED, TRACED, TracedConfig
 
 EVALUATIONS: Mapping[str, str] = {
@@ -37,7 +37,7 @@ class Evaluation:
         pass
 
     def __call__(
-        self, gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool, params: Mapping[str, Any]
+        self, gaussians: Gaussians, pose: Pose, plane: TiledPlane, sphere: bool, params: Mapping[str, Any]
     ) -> Complex:
         """Real and imaginary part [batch * directions], see `learned_field`.
 
@@ -49,7 +49,7 @@ class Evaluation:
         """Drop the references that the last call kept for its reverse pass."""
 
 
-def learned_field(gaussians: Gaussians, pose: Pose, plane: Plane, sphere: bool = False) -> Complex:
+def learned_field(gaussians: Gaussians, pose: Pose, plane: TiledPlane, sphere: bool = False) -> Complex:
     """Complex signal on the upper hemisphere or the full sphere. Differentiable in Gaussians and pose.
 
     Gaussians are those of one field for a batch of transmitters, ``plane`` has the pixels of a hemisphere. With

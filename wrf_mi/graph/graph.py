@@ -34,7 +34,7 @@ from ..core.antenna import ANTENNA
 from ..core.registry import resolve
 from ..gaussians import Factorised, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
-from ..gaussians.tiles import Plane
+from ..gaussians.tiles import TiledPlane
 from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
@@ -61,7 +61,7 @@ class Batch:
     slots: Any  # rows of the traced side [batch]
     receiver: Any  # number of the receiver, from 0
     pose: Pose  # pose of the receiver
-    plane: Plane  # directions of the learned signal
+    plane: TiledPlane  # directions of the learned signal
     weight: Any | None = None  # factor of the learned signal [batch], 0 to 1; None: 1
     carrier: Any | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
     signal: Complex | None = None  # learned signal without its unit (`Graph.learned`); None: it is evaluated

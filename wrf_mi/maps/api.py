@@ -227,7 +227,7 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
     def of_headings(values: Any) -> FloatArray:
         return np.asarray(values, float).reshape(count, -1)
 
-    level = task.level(parts.whole)
+    level = task.level(parts.prediction)
     means = of_headings(level.mean)
     variables: dict[str, Any] = {"power_dbm": means.mean(axis=1) + added}
     if level.std is not None:

@@ -28,7 +28,7 @@ from .locate_likelihood import region_of
 
 
 @dataclass(frozen=True)
-class Positions:
+class LocatedPositions:
     """Positions of m transmitters.
 
     Attributes:
@@ -101,7 +101,7 @@ def locate(
     offset_db: float | None = None,
     on_progress: OnProgress = quiet,
     stop: Callable[[], bool] = lambda: False,
-) -> Positions:
+) -> LocatedPositions:
     """Positions of transmitters from the signal strengths that the receivers of a run received.
 
     The first call for a run fits its model to parts of the training rows, up to five times, to choose the form of the
@@ -174,7 +174,7 @@ def locate(
         session.report("locating", (number + 1) / m)
     area, near = inside.sum(axis=1) * candidates.cell_m2, calibration.neighbours
     near_m = None if near is None else near.locate(record, load_rows(run.folder, record).all_train, observed)
-    return Positions(estimate, radius, area, probability, inside, near_m, level, candidates, calibration)
+    return LocatedPositions(estimate, radius, area, probability, inside, near_m, level, candidates, calibration)
 
 
 def _check(run: Run, observed_dbm: FloatArray, level: float, offset_db: float | None) -> None:

@@ -22,7 +22,7 @@ from ..datasets.folder_files import CsvTable, read_csv
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..tasks.scores import summary
-from .locate import Positions
+from .locate import LocatedPositions
 from .picture import scene_cuts
 
 DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
@@ -96,7 +96,7 @@ def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
     return np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float)
 
 
-def write_positions_file(out: Path, located: Positions, true_m: FloatArray | None = None) -> Path:
+def write_positions_file(out: Path, located: LocatedPositions, true_m: FloatArray | None = None) -> Path:
     """Write positions as a CSV file, a row for each observation in their order.
 
     Columns: ``x``, ``y``, ``z``, estimate in metres; ``radius_m`` and ``area_m2``, circle around it and region that
@@ -114,7 +114,7 @@ def write_positions_file(out: Path, located: Positions, true_m: FloatArray | Non
     return write_csv(out, columns, zip(*rounded, strict=True))
 
 
-def posterior_arrays(located: Positions) -> dict[str, Any]:
+def posterior_arrays(located: LocatedPositions) -> dict[str, Any]:
     """Probabilities over the grid: ``x_m`` [nx], ``y_m`` [ny], ``height_m``, ``probability`` [m, ny, nx]."""
     grid = located.candidates.grid
     spread = np.zeros((len(located), len(grid.x_m) * len(grid.y_m)), np.float32)
@@ -123,7 +123,7 @@ def posterior_arrays(located: Positions) -> dict[str, Any]:
     return {"x_m": grid.x_m, "y_m": grid.y_m, "height_m": grid.height_m, "probability": spread.reshape(shape)}
 
 
-def figures_of(located: Positions, true_m: FloatArray | None = None) -> dict[str, Any]:
+def figures_of(located: LocatedPositions, true_m: FloatArray | None = None) -> dict[str, Any]:
     """Figures of positions: likelihood, held-out rows, regions, and errors where true positions are known."""
     chosen = located.calibration
     figures: dict[str, Any] = {"n": len(located), "level": located.level, "likelihood": asdict(chosen.likelihood)}
@@ -139,7 +139,7 @@ def figures_of(located: Positions, true_m: FloatArray | None = None) -> dict[str
     return figures
 
 
-def draw_positions(run: Run, located: Positions, true_m: FloatArray | None = None) -> Figure:
+def draw_positions(run: Run, located: LocatedPositions, true_m: FloatArray | None = None) -> Figure:
     """Rows at equal spacing: probability, region, estimate, nearest neighbours and, if known, true positions [m, 2]."""
     rows = np.unique(np.linspace(0, len(located) - 1, min(SHOWN, len(located))).round().astype(int))
     columns = min(COLUMNS, len(rows))
@@ -180,7 +180,9 @@ def draw_positions(run: Run, located: Positions, true_m: FloatArray | None = Non
     return figure
 
 
-def _draw_row(axes: Axes, arrays: dict[str, Any], located: Positions, row: int, true_m: FloatArray | None) -> None:
+def _draw_row(
+    axes: Axes, arrays: dict[str, Any], located: LocatedPositions, row: int, true_m: FloatArray | None
+) -> None:
     grid = located.candidates.grid
     drawn = arrays["probability"][row]
     axes.pcolormesh(grid.x_m, grid.y_m, np.where(drawn > 0, drawn, np.nan), shading="nearest", cmap="Greens")

@@ -58,7 +58,7 @@ class FittedWithIntervals(Fitted):
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Decomposition of the model's prediction, with calibrated standard deviations."""
         decomposed = self.fitted.decompose(inputs, receiver, std)
-        return replace(decomposed, whole=self._stated(decomposed.whole, inputs.tx_pos_m, receiver))
+        return replace(decomposed, prediction=self._stated(decomposed.prediction, inputs.tx_pos_m, receiver))
 
     @property
     def depends_on_heading(self) -> bool:

@@ -105,7 +105,7 @@ class Session(FitSession):
 class Decomposition:
     """A prediction for m transmitters and what it is made of."""
 
-    whole: Prediction  #: the prediction
+    prediction: Prediction  #: the prediction
     #: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as magnitudes in a
     #: common unit of both sides; NaN where they are not used. None: the model has one side
     traced: NDArray[Any] | None = None

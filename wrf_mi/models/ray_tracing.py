@@ -117,7 +117,7 @@ class FittedTracing(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predictions of a receiver (InputError: inside a solid); all receivers are traced together."""
-        return self.decompose(inputs, receiver).whole
+        return self.decompose(inputs, receiver).prediction
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Predictions of a receiver with statistics of its paths (`predict`)."""

@@ -65,7 +65,7 @@ from ..tasks import TASKS
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.fit_plan import check_rows
 from ..training.session import Interrupted, OnProgress, quiet
-from .evaluate import Part, score_other, score_part, score_run
+from .evaluate import FittedPart, score_other, score_part, score_run
 from .folder import (
     FITTED,
     GIVEN,
@@ -337,7 +337,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
-        parts.append(Part(part, rows, *load_fitted(config, problem, part)))
+        parts.append(FittedPart(part, rows, *load_fitted(config, problem, part)))
         if len(rows.test):
             scores.append(score_part(folder, config, problem, parts[-1]))
     score_run(folder, config, parts, scores)
@@ -362,7 +362,7 @@ def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = 
     config, problem, folders = run.config, run.problem, run_parts(run.folder)
     if split is not None and folders != [run.folder]:
         raise InputError(f"{run.folder}: every row is held out in one of its folds; omit --split")
-    parts = [Part(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
+    parts = [FittedPart(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
     if split is not None:
         return score_other(config, problem, parts[0], split)
     scores = [score_part(run.folder, config, problem, part) for part in parts if len(part.split.test)]

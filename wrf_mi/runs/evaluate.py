@@ -53,7 +53,7 @@ MOST_OF_STAGES = 400  # test rows by which the stages of a fit are scored
 TIMED_S = 2.0  # time after which no further single prediction is begun: some models optimise for each sample
 
 
-class Part(NamedTuple):
+class FittedPart(NamedTuple):
     """Folder, split, fitted model and training time of a run or of a fold."""
 
     folder: Path
@@ -191,7 +191,7 @@ def pool(parts: Sequence[Scores]) -> Scores:
     return metrics, arrays
 
 
-def score_part(run: Path, config: RunConfig, problem: Problem, part: Part) -> Scores:
+def score_part(run: Path, config: RunConfig, problem: Problem, part: FittedPart) -> Scores:
     """Scores of a run's part; those of a fold are written to its folder."""
     metrics, arrays = _evaluate_part(problem, part)
     if part.folder != run:
@@ -200,7 +200,7 @@ def score_part(run: Path, config: RunConfig, problem: Problem, part: Part) -> Sc
     return metrics, arrays
 
 
-def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Sequence[Scores]) -> dict[str, Any]:
+def score_run(run: Path, config: RunConfig, parts: Sequence[FittedPart], scores: Sequence[Scores]) -> dict[str, Any]:
     """Write ``metrics.json`` and ``predictions.npz`` of a run from the scores of its parts that have test rows.
 
     Returns:
@@ -218,7 +218,7 @@ def score_run(run: Path, config: RunConfig, parts: Sequence[Part], scores: Seque
     return merged
 
 
-def score_other(config: RunConfig, problem: Problem, part: Part, split: str) -> dict[str, Any]:
+def score_other(config: RunConfig, problem: Problem, part: FittedPart, split: str) -> dict[str, Any]:
     """Metrics on the test rows of another split that were not used in training; `InputError` if there are none."""
     asked = np.unique(np.concatenate([s.test for s in make_splits(problem.record, split, config.seed)]))
     unseen = np.setdiff1d(asked, part.split.all_train)
@@ -229,7 +229,7 @@ def score_other(config: RunConfig, problem: Problem, part: Part, split: str) -> 
     return _header(part.folder, named, [part]) | metrics
 
 
-def _evaluate_part(problem: Problem, part: Part) -> Scores:
+def _evaluate_part(problem: Problem, part: FittedPart) -> Scores:
     record, fitted = problem.record, part.fitted
 
     def single(rows: IntArray, receiver: int) -> Prediction:
@@ -243,7 +243,7 @@ def _evaluate_part(problem: Problem, part: Part) -> Scores:
     return metrics | ({PLACES: places} if places else {}) | _stage_scores(record, part, metrics, arrays), arrays
 
 
-def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
+def _stage_scores(record: Record, part: FittedPart, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
     """``stages`` of a fit in stages with ``test`` and ``ms`` of those that were kept.
 
     They are the mean score of test rows and the milliseconds of a prediction by the stages up to each; of many test
@@ -274,7 +274,7 @@ def _stage_scores(record: Record, part: Part, metrics: dict[str, Any], arrays: d
     return {"stages": reports}
 
 
-def _header(folder: Path, config: RunConfig, parts: Sequence[Part]) -> dict[str, Any]:
+def _header(folder: Path, config: RunConfig, parts: Sequence[FittedPart]) -> dict[str, Any]:
     known: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
     known |= {} if config.scene is None else {"scene": config.scene}
     known |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}

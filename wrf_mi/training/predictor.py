@@ -183,7 +183,7 @@ class Predictor:
         for rows, predictor, port, side in self._sides(tx_pos_m, receiver, headings, carriers_hz):
             assert side is not None, "a graph without a scene has one side"
             positions = tx_pos_m[rows]
-            reports.append({"whole": predictor._reported(positions, port, side)})
+            reports.append({"prediction": predictor._reported(positions, port, side)})
             if self.graph.field is not None:
                 reports[-1] |= {name: predictor._of_one_side(positions, port, side, name) for name in get_args(Alone)}
             statistics.append(side.statistics(self.evaluate.params))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..backend.device import Recorded, on_device, to_float, to_tensor
 from ..backend.vectors import Complex, Pose
 from ..core import Receiver
-from ..gaussians.tiles import Plane, perception_plane
+from ..gaussians.tiles import TiledPlane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
 from ..tracing.paths.traced_field import TracedField
@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     receiver: int  # number of the receiver
     pose: Pose  # its pose
-    plane: Plane  # directions of the learned signal
+    plane: TiledPlane  # directions of the learned signal
     log_carrier: float | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
 
     def batch(self, condition: Any, slots: Any, weight: Any = None, signal: Complex | None = None) -> Batch:

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.datasets import load
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.interpolation.strength_fit import Part, PooledProcess, scales
+from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, scales
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Poses
 from wrf_mi.models.interpolation.strengths import StrengthSettings, fit_strengths
 from wrf_mi.models.model import default_settings, inputs_of
@@ -67,7 +67,7 @@ def test_cost_is_that_of_the_dense_likelihood() -> None:
     costs, dense_costs = [], []
     for shadow_m in (0.5, 2.0):
         kernel = Hyperparameters(3.0, shadow_m, 0.0, 1.0, 1.0, 0.0, 0.0)
-        parts = [Part(*each) for each in zip(places, bases, values, noise, strict=True)]
+        parts = [ReceiverObservations(*each) for each in zip(places, bases, values, noise, strict=True)]
         costs.append(PooledProcess(parts, kernel.covariance, prior, kernel.variance(False)).cost)
         dense = np.concatenate(bases) @ np.diag(prior**2) @ np.concatenate(bases).T + np.diag(np.concatenate(noise))
         dense[:7, :7] += kernel.covariance(places[0], places[0])

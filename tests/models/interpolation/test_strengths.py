@@ -11,7 +11,7 @@ import trimesh
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.models.interpolation import strengths
-from wrf_mi.models.interpolation.strength_fit import Part, PooledProcess, folds, shift_of, widening
+from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, folds, shift_of, widening
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import Inputs
@@ -83,7 +83,7 @@ def test_posterior_equals_dense_gaussian_conditioning() -> None:
     bases = [rng.normal(size=(len(p), 2)) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
-    parts = [Part(*one) for one in zip(places, bases, values, noise, strict=True)]
+    parts = [ReceiverObservations(*one) for one in zip(places, bases, values, noise, strict=True)]
     process = PooledProcess(parts, kernel.covariance, prior, kernel.variance(True))
 
     asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
@@ -104,7 +104,7 @@ def test_posterior_equals_dense_gaussian_conditioning() -> None:
 def test_reweighting_is_robust_to_outliers() -> None:
     places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
-    part = Part(places, np.ones((21, 1)), value, np.ones(21))
+    part = ReceiverObservations(places, np.ones((21, 1)), value, np.ones(21))
     kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
     plain, robust = (
         PooledProcess([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]

@@ -16,10 +16,10 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.models.model import field_arrays, from_field_arrays
 from wrf_mi.models.networks.dcgan import (
     NORM_FLOOR,
+    BatchShape,
     Convolution,
     DcganSettings,
     Generator,
-    Grid,
     InstanceNorm,
     coarser,
     finer,
@@ -92,7 +92,7 @@ def test_convolution_equals_its_sum_over_neighbours(side: int):
     layer = Convolution(c, side, out, rng).with_state(
         {"hidden": doubles(kernel.reshape(out, -1)), "bias": doubles(np.array(bias))}
     )
-    found = layer(doubles(images.reshape(c, -1)), Grid(b, h, w))
+    found = layer(doubles(images.reshape(c, -1)), BatchShape(b, h, w))
     np.testing.assert_allclose(found.numpy(), expected.reshape(out, -1) + bias, atol=EXACT)
 
 
@@ -100,14 +100,14 @@ def test_convolution_equals_its_sum_over_neighbours(side: int):
 @pytest.mark.parametrize("side", [2, 3])
 def test_gradients_of_patches(side: int):
     rng = np.random.default_rng(1)
-    grid = Grid(2, 3, 4)
+    grid = BatchShape(2, 3, 4)
     images, weights = rng.standard_normal((2, grid.columns)), rng.standard_normal((side * side * 2, grid.columns))
     assert_gradients(lambda x: weighted(patches(x[0], grid, side), weights), [images], rng)
 
 
 def test_finer_and_coarser_undo_each_other():
     rng = np.random.default_rng(2)
-    grid = Grid(2, 3, 4)
+    grid = BatchShape(2, 3, 4)
     x = rng.standard_normal((8, grid.columns))
     fine, fine_grid = finer(doubles(x), grid)
     assert (fine_grid.height, fine_grid.width) == (6, 8)
@@ -122,7 +122,7 @@ def test_finer_and_coarser_undo_each_other():
 @pytest.mark.gradcheck
 def test_gradients_of_layouts_and_normalisation():
     rng = np.random.default_rng(3)
-    grid = Grid(2, 2, 4)
+    grid = BatchShape(2, 2, 4)
     x, scale, bias = (rng.standard_normal(shape) for shape in ((4, grid.columns), (4, 1), (4, 1)))
     weights = rng.standard_normal((1, 2 * 3 * 5))
 
@@ -142,7 +142,7 @@ def test_gradients_of_layouts_and_normalisation():
 
 
 def test_resized_fills_with_zeros():
-    found, grid = resized(doubles(np.ones((1, 4))), Grid(1, 2, 2), 3, 3)
+    found, grid = resized(doubles(np.ones((1, 4))), BatchShape(1, 2, 2), 3, 3)
     np.testing.assert_array_equal(found.numpy().reshape(3, 3), [[1, 1, 0], [1, 1, 0], [0, 0, 0]])
     assert grid.pixels == 9
 

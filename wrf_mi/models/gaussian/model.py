@@ -136,7 +136,7 @@ class FittedField(Fitted):
             return super().decompose(inputs, receiver, std)
         heading = inputs.tx_heading_rad if self.uses_heading else None
         reports, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
-        return Decomposition(Prediction(reports["whole"]), reports.get("traced"), reports.get("learned"), paths)
+        return Decomposition(Prediction(reports["prediction"]), reports.get("traced"), reports.get("learned"), paths)
 
     def arrays(self) -> Arrays:
         """Parameters, form of the observations, antennas, receivers and reach."""

@@ -111,11 +111,11 @@ class FittedHybrid(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
-        return self._of_inputs(inputs, receiver, Fitted.decompose).whole
+        return self._of_inputs(inputs, receiver, Fitted.decompose).prediction
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`, by parts that save time without standard deviations."""
-        return self._of_inputs(inputs, receiver, Fitted.decompose, std=False).whole.mean
+        return self._of_inputs(inputs, receiver, Fitted.decompose, std=False).prediction.mean
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions of rows of the record; parts use what they have stored."""
@@ -124,7 +124,7 @@ class FittedHybrid(Fitted):
             record.tx_pos_m[rows],
             receiver,
             lambda part, places: Decomposition(predicted_rows(part, record, rows[places], receiver)),
-        ).whole
+        ).prediction
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths."""
@@ -171,10 +171,10 @@ class FittedHybrid(Fitted):
                 continue
             by_part = predict(part, rows)
             side = int(name in TRACED)
-            sides[side, rows] += _spread(share[rows], shape) * by_part.whole.mean
+            sides[side, rows] += _spread(share[rows], shape) * by_part.prediction.mean
             totals[side, rows] += share[rows]
-            if by_part.whole.std is not None:
-                size[rows] += _spread(share[rows], shape) * by_part.whole.std
+            if by_part.prediction.std is not None:
+                size[rows] += _spread(share[rows], shape) * by_part.prediction.std
             paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)

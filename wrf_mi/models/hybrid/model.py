@@ -35,7 +35,7 @@ from ..few_rows import with_few_rows
 from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
-from .scene_side import FIELD, RESIDUAL, STAGES, InScene, Paths, SceneSide, StageReport, inside, stated_reports
+from .scene_side import FIELD, RESIDUAL, STAGES, InScene, SceneSide, StageReport, TracedStages, inside, stated_reports
 from .strengths import StrengthsInScene, TracedStrengths
 
 logger = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ def scene_side(record: Record) -> tuple[Model, Model]:
     """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
     if task_of(record).in_decibel and record.frequencies_hz is not None:
         return TracedStrengths(), StrengthsInScene()
-    return Paths(), InScene()
+    return TracedStages(), InScene()
 
 
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:

@@ -243,7 +243,7 @@ class InScene(Model):
             WRF_GS_PLUS.check(replace(problem, settings=config), [split])
 
 
-class Paths(InScene):
+class TracedStages(InScene):
     """Stages 1 to 5: the scene's side for spectra and channels."""
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedPaths:

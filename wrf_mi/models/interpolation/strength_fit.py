@@ -66,7 +66,7 @@ def _of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> 
 
 
 @dataclass(frozen=True)
-class Part:
+class ReceiverObservations:
     """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
 
     inputs: Any
@@ -87,17 +87,22 @@ class PooledProcess:
     """
 
     def __init__(
-        self, parts: Sequence[Part], kernel: Kernel, prior_sd: FloatArray, point_variance: float, rounds: int = 0
+        self,
+        parts: Sequence[ReceiverObservations],
+        kernel: Kernel,
+        prior_sd: FloatArray,
+        point_variance: float,
+        rounds: int = 0,
     ) -> None:
         self._kernel, self._prior_sd, self._point_variance = kernel, prior_sd, point_variance
         self._solve(parts)
         for _ in range(rounds):
             self._solve(self._reweighted([part.variance for part in parts]))
 
-    def _solve(self, parts: Sequence[Part]) -> None:
+    def _solve(self, parts: Sequence[ReceiverObservations]) -> None:
         kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
 
-        def system(p: Part) -> KrigingSystem:
+        def system(p: ReceiverObservations) -> KrigingSystem:
             return KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis)
 
         self._systems = _of_each(system, parts, sum(len(p.value) for p in parts))
@@ -127,14 +132,14 @@ class PooledProcess:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
         return self._parts[receiver].inputs, self._weights[receiver]
 
-    def _reweighted(self, variance: Sequence[FloatArray]) -> list[Part]:
+    def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
         """Parts with the noise variances that their residuals imply for Student-t noise.
 
         The expected squared residual, posterior variance of the field included, is compared with the squared scale
         ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
         """
 
-        def reweighted(receiver: int) -> Part:
+        def reweighted(receiver: int) -> ReceiverObservations:
             part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
             scale = variance[receiver]
             # y - f = V K^-1 (y - B beta); the field's posterior variance is the diagonal of V - V K^-1 V.
@@ -174,7 +179,7 @@ class PriorMean:
         return self.transmit_dbm + power, *basis(poses, receiver, self.receivers_m, level, self.sd, self.rx_sd_db)
 
 
-class Field:
+class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
     ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
@@ -192,7 +197,7 @@ class Field:
             expected, columns, sd = prior.columns(poses, receiver)
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
-            parts.append(Part(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
+            parts.append(ReceiverObservations(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
         self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
 
     @property
@@ -240,7 +245,7 @@ def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tup
         return replace(prior, rx_sd_db=rx_sd_db), field
 
     def cost(logarithms: FloatArray) -> float:
-        fit = Field(*at(logarithms, few), ratio, stops)
+        fit = StrengthPosterior(*at(logarithms, few), ratio, stops)
         return fit.cost + float(np.square((logarithms - middle) / deviation).sum())
 
     simplex = np.vstack([middle, middle + np.diag(deviation)])
@@ -294,7 +299,9 @@ class Fit:
         for number, (stops, out) in enumerate(self._folds[:2] if unheard else self._folds):
             hidden = (np.arange(len(mean)) % 2 == number) & unheard
             value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
-            field = Field(self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds)
+            field = StrengthPosterior(
+                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds
+            )
             predicts = hidden | (not unheard)
             measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
             received = [out[np.isfinite(values[out])] for values in measured_dbm]
@@ -302,7 +309,7 @@ class Fit:
                 self._prior.traced.traced_dbm(self._measured.poses.take(out).position_m)  # traced here, not on threads
 
             def predicted(
-                receiver: int, field: Field = field, received: list[IntArray] = received
+                receiver: int, field: StrengthPosterior = field, received: list[IntArray] = received
             ) -> tuple[FloatArray, FloatArray]:
                 return field.predict(self._measured.poses.take(received[receiver]), receiver)
 

@@ -24,7 +24,7 @@ from ...training.session import OnProgress, quiet
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
-from .strength_fit import AREA_M, Field, Fit, PriorMean, by_likelihood, scales, shift_of, widening
+from .strength_fit import AREA_M, Fit, PriorMean, StrengthPosterior, by_likelihood, scales, shift_of, widening
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
 class Strengths(Fitted):
     """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report."""
 
-    field: Field
+    field: StrengthPosterior
     shift_db: float
     widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
     fit_facts: dict[str, float]  # numbers of the fit for `facts`
@@ -168,7 +168,7 @@ class Strengths(Fitted):
         poses = from_field_arrays(Poses, arrays, "stop.")
         stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        field = Field(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
 
@@ -254,7 +254,7 @@ def fit_strengths(
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = Field(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
+    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
 

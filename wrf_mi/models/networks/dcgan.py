@@ -37,7 +37,7 @@ from ...core.types import IntArray
 from ...gaussians.parameters import logistic
 from ...training.config import AdamConfig
 from .layers import GAIN, Linear, Module, columns, feature_count, relu
-from .spectrum_networks import ReceiverRows, SpectrumNetwork
+from .spectrum_networks import NetworkRows, SpectrumNetwork
 from .training import Network, NetworkSettings, network_adam, opaque_rows
 
 NORM_FLOOR = 1e-5  # added to variances: an image may be flat
@@ -66,7 +66,7 @@ class DcganSettings(NetworkSettings):
 
 
 @dataclass(frozen=True)
-class Grid:
+class BatchShape:
     """Number, height and width of the images of a batch."""
 
     batch: int
@@ -101,7 +101,7 @@ class Grid:
 class _Patches(dr.CustomOp):
     """Neighbours of every pixel; the reverse pass gathers too, so that no sum is atomic."""
 
-    def eval(self, x: Any, channels: int, grid: Grid, side: int) -> Any:
+    def eval(self, x: Any, channels: int, grid: BatchShape, side: int) -> Any:
         self.sizes = channels, grid, side
         per_tap = channels * grid.columns
         slot = dr.arange(dr.uint32_array_t(type(x)), side * side * per_tap)
@@ -132,7 +132,7 @@ class _Patches(dr.CustomOp):
         return "patches"
 
 
-def patches(x: Any, grid: Grid, side: int) -> Any:
+def patches(x: Any, grid: BatchShape, side: int) -> Any:
     """Neighbours of every pixel of images [channels, columns], [side * side * channels, columns].
 
     Taps row by row, the channels of each. Side 3: the pixel and its eight neighbours; 2: the pixel and its neighbours
@@ -150,7 +150,7 @@ class Convolution(Linear):
         super().__init__(inputs * side * side, outputs, rng, gain)
         self.side = side
 
-    def __call__(self, x: Any, grid: Grid) -> Any:
+    def __call__(self, x: Any, grid: BatchShape) -> Any:
         """Outputs of images [inputs, columns]."""
         return super().__call__(patches(x, grid, self.side))
 
@@ -165,7 +165,7 @@ class InstanceNorm(Module):
         self.scale: Any = np.ones((channels, 1), np.float32)
         self.bias: Any = np.zeros((channels, 1), np.float32)
 
-    def __call__(self, x: Any, grid: Grid) -> Any:
+    def __call__(self, x: Any, grid: BatchShape) -> Any:
         """Scaled images [channels, columns]."""
         channels = x.shape[0]
         images: Any = dr.reshape(x, (channels * grid.batch, grid.pixels))
@@ -176,9 +176,9 @@ class InstanceNorm(Module):
         return scaled * self.scale + self.bias
 
 
-def finer(x: Any, grid: Grid) -> tuple[Any, Grid]:
+def finer(x: Any, grid: BatchShape) -> tuple[Any, BatchShape]:
     """Four times the channels, [4 c, columns], laid out as twice the rows and columns, [c, 4 columns]."""
-    fine = Grid(grid.batch, 2 * grid.height, 2 * grid.width)
+    fine = BatchShape(grid.batch, 2 * grid.height, 2 * grid.width)
     channels = x.shape[0] // 4
     image, row, column = fine.at(dr.arange(dr.uint32_array_t(type(x.array)), channels * fine.columns))
     part = 2 * (row % 2) + column % 2
@@ -186,9 +186,9 @@ def finer(x: Any, grid: Grid) -> tuple[Any, Grid]:
     return type(x)(_permuted(x.array, index), (channels, fine.columns)), fine
 
 
-def coarser(x: Any, grid: Grid) -> tuple[Any, Grid]:
+def coarser(x: Any, grid: BatchShape) -> tuple[Any, BatchShape]:
     """The reverse of `finer`: each block of 2 x 2 pixels becomes a pixel of four times the channels."""
-    coarse = Grid(grid.batch, grid.height // 2, grid.width // 2)
+    coarse = BatchShape(grid.batch, grid.height // 2, grid.width // 2)
     channels = x.shape[0]
     image, row, column = coarse.at(dr.arange(dr.uint32_array_t(type(x.array)), 4 * channels * coarse.columns))
     part = image // (channels * grid.batch)
@@ -196,9 +196,9 @@ def coarser(x: Any, grid: Grid) -> tuple[Any, Grid]:
     return type(x)(_permuted(x.array, index), (4 * channels, coarse.columns)), coarse
 
 
-def resized(x: Any, grid: Grid, height: int, width: int) -> tuple[Any, Grid]:
+def resized(x: Any, grid: BatchShape, height: int, width: int) -> tuple[Any, BatchShape]:
     """Rows and columns cut off at the end, or filled up with zeros."""
-    new = Grid(grid.batch, height, width)
+    new = BatchShape(grid.batch, height, width)
     image, row, column = new.at(dr.arange(dr.uint32_array_t(type(x.array)), x.shape[0] * new.columns))
     inside = (row < grid.height) & (column < grid.width)
     return type(x)(_permuted(x.array, grid.index(image, row, column), inside), (x.shape[0], new.columns)), new
@@ -210,9 +210,9 @@ def _permuted(x: Any, index: Any, active: Any = True) -> Any:
     return dr.gather(type(x), x, index, active, mode=dr.ReduceMode.NoConflicts)
 
 
-def coarse_grid(shape: tuple[int, int], batch: int) -> Grid:
+def coarse_grid(shape: tuple[int, int], batch: int) -> BatchShape:
     """Coarsest grid of both networks: an eighth of a spectrum's sides, rounded up."""
-    return Grid(batch, -(-shape[0] // 2**LEVELS), -(-shape[1] // 2**LEVELS))
+    return BatchShape(batch, -(-shape[0] // 2**LEVELS), -(-shape[1] // 2**LEVELS))
 
 
 class Generator(Module):
@@ -260,7 +260,7 @@ class Discriminator(Module):
         """Logits of spectra [1, batch * height * width] at features of positions [features, batch]."""
         batch = where.shape[1]
         coarse = coarse_grid(shape, batch)
-        x, grid = resized(spectra, Grid(batch, *shape), coarse.height * 2**LEVELS, coarse.width * 2**LEVELS)
+        x, grid = resized(spectra, BatchShape(batch, *shape), coarse.height * 2**LEVELS, coarse.width * 2**LEVELS)
         for norm, layer in zip(self.norm, self.layers, strict=True):
             x, grid = coarser(x, grid)
             x = layer(x, grid)
@@ -318,7 +318,7 @@ class DcganModel(SpectrumNetwork):
     )
     generator_class, generator, at_once = Generator, "g", 16
 
-    def network(self, rows: ReceiverRows, settings: DcganSettings, rng: np.random.Generator) -> Network:
+    def network(self, rows: NetworkRows, settings: DcganSettings, rng: np.random.Generator) -> Network:
         """Generator and discriminator of a receiver, to be trained together."""
         data = {"where": rows.where, "truth": to_float(rows.spectra)}
         dr.make_opaque(data)

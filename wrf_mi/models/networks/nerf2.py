@@ -102,7 +102,7 @@ def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, in
     return dr.moveaxis(both, 0, 1)
 
 
-class Field(Fitted):
+class Nerf2Field(Fitted):
     """A fitted field, evaluated in two steps that are recorded once.
 
     Rays go through the pixels of spectra (`wrf_mi.core.angles`), or cover the full sphere, and end at ``far_m`` metres;
@@ -216,7 +216,7 @@ class Field(Fitted):
         return where, float(self.scales[receiver])
 
 
-def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str, Any], field: Field) -> Any:
+def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str, Any], field: Nerf2Field) -> Any:
     """Mean squared error of a batch of transmitters at one receiver, over the rays of the step.
 
     ``data`` has that of the field, ``condition`` [features, n] and ``truth`` [n_rx * n, values]; ``drawn`` has indices:
@@ -246,7 +246,7 @@ FAR_M = 10.0  # length of rays if positions are not known: the size of a large r
 
 
 def _fit_group(
-    record: Record, split: Split, field: Field, seed: int, session: FitSession, members: tuple[int, ...]
+    record: Record, split: Split, field: Nerf2Field, seed: int, session: FitSession, members: tuple[int, ...]
 ) -> Nerf2Network:
     s, outputs = field.settings, field.outputs
     known = split.all_train
@@ -306,7 +306,7 @@ class Nerf2Model(Model):
     tasks = ("spectrum", "rssi", "csi")
     uplink, headings = "optional", True
 
-    def fit(self, problem: Problem, split: Split, session: FitSession) -> Field:
+    def fit(self, problem: Problem, split: Split, session: FitSession) -> Nerf2Field:
         """Fit the networks (InputError: unknown positions or poses, or a receiver without training rows)."""
         record, known = problem.record, split.all_train
         outputs, settings = conditions.outputs_of(record), problem.settings
@@ -318,15 +318,15 @@ class Nerf2Model(Model):
         else:
             where, farthest = rx, FAR_M
         scales = conditions.channel_scales(record, known)
-        field = Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
+        field = Nerf2Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
         field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
         return field
 
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Field:
-        """The fields that `Field.arrays` described."""
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Nerf2Field:
+        """The fields that `Nerf2Field.arrays` described."""
         settings = model.stored_settings(Nerf2Settings, arrays, "nerf2")
         coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
-        field = Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
+        field = Nerf2Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
         field.networks = [field.network.on_device(arrays, f"group{g}/") for g in range(len(field.groups))]
         return field
 

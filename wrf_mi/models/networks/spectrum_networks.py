@@ -25,7 +25,7 @@ SPECTRUM = TASKS["spectrum"]
 
 
 @dataclass(frozen=True)
-class ReceiverRows:
+class NetworkRows:
     """Rows that a receiver's network learns from, and after them those that choose the number of steps."""
 
     receiver: str
@@ -46,10 +46,10 @@ class SpectrumNetwork(Model):
     at_once: int  # spectra that are predicted together, which bounds the memory
 
     @abstractmethod
-    def network(self, rows: ReceiverRows, settings: Any, rng: np.random.Generator) -> Network:
+    def network(self, rows: NetworkRows, settings: Any, rng: np.random.Generator) -> Network:
         """Training of a network on a receiver's rows; ``settings`` have ``octaves`` and ``scale_m``."""
 
-    def trained_on(self, rows: ReceiverRows, module: Any, loss: Any, data: Any, draw: Any) -> Network:
+    def trained_on(self, rows: NetworkRows, module: Any, loss: Any, data: Any, draw: Any) -> Network:
         """Training of a network on rows, scored by the median structural similarity of those that choose."""
         count = len(rows.spectra) - rows.train
 
@@ -72,7 +72,7 @@ class SpectrumNetwork(Model):
             train, validation = received_rows(record, split, r, self.name)
             known = np.concatenate([train, validation])
             where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
-            rows = ReceiverRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
+            rows = NetworkRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
             network = self.network(rows, settings, np.random.default_rng([seed, r]))
             generators.append(getattr(train_network(network, settings, (seed, r), session)[0], self.generator))
         height, width = record.observation.shape[-2:]

@@ -27,7 +27,7 @@ from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...gaussians.parameters import logistic
 from .layers import Linear, Mlp, Module, columns, feature_count
-from .spectrum_networks import ReceiverRows, SpectrumNetwork
+from .spectrum_networks import NetworkRows, SpectrumNetwork
 from .training import Network, NetworkSettings, opaque_rows
 
 POOL = 6  # largest side of the blocks of pixels whose means the encoder sees
@@ -119,7 +119,7 @@ class VaeModel(SpectrumNetwork):
     source = "Kingma and Welling, 'Auto-encoding variational Bayes' (2014), conditioned as by Sohn, Lee and Yan (2015)"
     generator_class, generator, at_once = Decoder, "p", 64
 
-    def network(self, rows: ReceiverRows, settings: VaeSettings, rng: np.random.Generator) -> Network:
+    def network(self, rows: NetworkRows, settings: VaeSettings, rng: np.random.Generator) -> Network:
         """Encoder and decoder of a receiver, to be trained."""
         cells, flat = pooled(rows.spectra, POOL), rows.spectra.reshape(len(rows.spectra), -1)
         data = {"cells": to_tensor(cells.T), "where": rows.where, "pixels": to_tensor(flat.T)}

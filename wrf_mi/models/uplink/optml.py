@@ -39,7 +39,7 @@ from ..model import Arrays, Inputs, Problem, slices
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 from .r2f2 import R2F2, PathSettings, choose
-from .uplink_paths import ROWS, Paths, in_parts, refine, refine_paths
+from .uplink_paths import ROWS, UplinkPaths, in_parts, refine, refine_paths
 from .uplink_waves import ArrayWaves, Bands, Complex, Mask, UplinkModel, Waves, waves_of
 
 FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
@@ -202,7 +202,7 @@ class OptML(R2F2):
         self.settings: OptMLSettings = settings
         self.network = network
 
-    def paths(self, h: Complex, inputs: Inputs) -> Paths:
+    def paths(self, h: Complex, inputs: Inputs) -> UplinkPaths:
         """Paths of uplinks [m, antennas, f]."""
         s, waves, residual = self.settings, self.waves, h
         theta: FloatArray = np.zeros((len(h), 0, 1 + waves.cosines.shape[1]))

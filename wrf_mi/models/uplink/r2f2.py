@@ -40,7 +40,7 @@ from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
-from .uplink_paths import Paths, Start, expected_gains, find_paths, in_parts
+from .uplink_paths import Start, UplinkPaths, expected_gains, find_paths, in_parts
 from .uplink_waves import Bands, Complex, UplinkModel, Waves, bands_of, principal_axes, relative_error, waves_of
 
 CHUNK_SIZE = 256  # positions that are traced together
@@ -217,7 +217,7 @@ class R2F2(Fitted):
         downlink = self.waves.evaluate(paths.theta, paths.gains, self.bands.downlink_hz)
         return Prediction(downlink.astype(np.complex64))
 
-    def paths(self, h: Complex, inputs: Inputs) -> Paths:
+    def paths(self, h: Complex, inputs: Inputs) -> UplinkPaths:
         """Paths of uplinks [m, antennas, f] from the positions of ``inputs``."""
         s, known = self.settings, None
         if self.scene is not None:

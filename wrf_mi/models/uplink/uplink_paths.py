@@ -35,7 +35,7 @@ CONVERGED = 1e-9  # relative fall of the residual's energy below which a refinem
 
 
 @dataclass
-class Paths:
+class UplinkPaths:
     """Paths of n rows."""
 
     theta: FloatArray  # parameters [n, k, p], see `Waves`
@@ -70,7 +70,9 @@ class Start:
         return np.asarray((self.precision * np.square(theta - self.theta)).sum(axis=(1, 2)))
 
 
-def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: int, start: Start | None = None) -> Paths:
+def find_paths(
+    waves: Waves, h: Complex, max_paths: int, between: int, final: int, start: Start | None = None
+) -> UplinkPaths:
     """Paths of uplinks [n, antennas, f], ``max_paths`` a row at most beside those of ``start``.
 
     All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last; those of the
@@ -80,7 +82,7 @@ def find_paths(waves: Waves, h: Complex, max_paths: int, between: int, final: in
     return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final, known[rows]), len(h)))
 
 
-def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> Paths:
+def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> UplinkPaths:
     """Paths of uplinks [n, antennas, f] from a start: parameters [n, k, p], which of them to use [n, k]."""
     return join_paths(in_parts(lambda rows: _finish(waves, h[rows], theta[rows], present[rows], steps), len(h)))
 
@@ -90,21 +92,23 @@ def in_parts(work: Callable[[slice], T], count: int) -> list[T]:
     return on_threads(work, slices(count, ROWS))
 
 
-def join_paths(parts: list[Paths]) -> Paths:
+def join_paths(parts: list[UplinkPaths]) -> UplinkPaths:
     """Paths of all rows, as many a row as the longest part has."""
     most = max(part.present.shape[1] for part in parts)
 
-    def padded(part: Paths, name: str) -> np.ndarray:
+    def padded(part: UplinkPaths, name: str) -> np.ndarray:
         values = getattr(part, name)
         missing = most - values.shape[1]
         # Parameters of an absent path repeat another's, so that they are defined.
         filler = values[:, :1] if name == "theta" else np.zeros_like(values[:, :1])
         return np.concatenate([values, np.repeat(filler, missing, axis=1)], axis=1)
 
-    return Paths(*(np.concatenate([padded(part, name) for part in parts]) for name in ("theta", "present", "gains")))
+    return UplinkPaths(
+        *(np.concatenate([padded(part, name) for part in parts]) for name in ("theta", "present", "gains"))
+    )
 
 
-def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, known: Start) -> Paths:
+def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, known: Start) -> UplinkPaths:
     count = h.shape[1] * h.shape[2]
     energy = np.square(np.abs(h)).sum(axis=(1, 2))
     # An uplink of zeros has no paths; its row is predicted as zero.
@@ -143,9 +147,9 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, kn
 
 def _finish(
     waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, known: Start | None = None
-) -> Paths:
+) -> UplinkPaths:
     theta, solved = refine(waves, h, theta, present, steps, known)
-    return Paths(theta, present, expected_gains(waves, h, present, solved)[0])
+    return UplinkPaths(theta, present, expected_gains(waves, h, present, solved)[0])
 
 
 def expected_gains(waves: Waves, h: Complex, present: Mask, solved: Solved) -> tuple[Complex, FloatArray]:

@@ -32,7 +32,7 @@ ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
-class Run:
+class WallRun:
     """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1)."""
 
     axis: int
@@ -102,13 +102,13 @@ def rotation_2d(angle: float) -> FloatArray:
     return np.array([[c, -s], [s, c]])
 
 
-def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
+def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[WallRun]:
     """Axis-parallel runs of occupied cells of a turned grid, the best supported first."""
     step = grid.resolution_m
     half, rim, hole = (max(0, round(m / step)) for m in (HALF_WIDTH_M, CLEARED_M, LARGEST_HOLE_M))
     left = np.pad(grid.occupied, half)
     low = grid.origin_m - half * step
-    runs: list[Run] = []
+    runs: list[WallRun] = []
     while True:
         best = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate((left, left.T))]
         (score, row, begin, end), axis = max(best, key=lambda run: run[0][0])
@@ -124,7 +124,7 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[Run]:
             continue
         middle = float(np.median(across)) + first
         offset = low[1 - axis] + (middle + 0.5) * step
-        runs.append(Run(axis, offset, low[axis] + begin * step, low[axis] + end * step))
+        runs.append(WallRun(axis, offset, low[axis] + begin * step, low[axis] + end * step))
         image[max(0, int(middle) - rim) : int(np.ceil(middle)) + rim + 1, max(0, begin - 1) : end + 1] = False
 
 

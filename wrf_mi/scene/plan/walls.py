@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from .lines import CLEARED_M, HALF_WIDTH_M, Run, dominant_direction, find_runs, rotation_2d, turned, without_specks
+from .lines import CLEARED_M, HALF_WIDTH_M, WallRun, dominant_direction, find_runs, rotation_2d, turned, without_specks
 from .sources import Mask, PlanGrid
 
 REACH_M = 0.35  # largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open
@@ -146,12 +146,12 @@ class _Strips:
         band = image[rows, max(0, round(begin)) : max(0, round(end))]
         return float(band.any(axis=0).mean()) if band.size else 0.0
 
-    def free_beside(self, run: Run) -> float:
+    def free_beside(self, run: WallRun) -> float:
         """Share of a run with free cells at its sides."""
         sides = run.offset - BESIDE_M, run.offset + BESIDE_M
         return self.share(self.grid.free, run.axis, sides, (run.start, run.end))
 
-    def free_between(self, a: Run, b: Run, along: tuple[float, float]) -> float:
+    def free_between(self, a: WallRun, b: WallRun, along: tuple[float, float]) -> float:
         """Share of a stretch where free cells lie between two parallel runs, without their smears."""
         low, high = sorted((a.offset, b.offset))
         margin = min(HALF_WIDTH_M, (high - low) / 2)
@@ -163,7 +163,7 @@ class _Strips:
         return self.share(mask, axis, (offset - half, offset + half), along)
 
 
-def _tidy(runs: Sequence[Run], grid: PlanGrid) -> list[Run]:
+def _tidy(runs: Sequence[WallRun], grid: PlanGrid) -> list[WallRun]:
     """Walls from runs of the same turned grid."""
     strips = _Strips(grid)
     if not strips.knows_free:
@@ -177,9 +177,9 @@ def _tidy(runs: Sequence[Run], grid: PlanGrid) -> list[Run]:
     return walls
 
 
-def _merged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+def _merged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Parallel runs of the same smear merged, at the offset of the longest."""
-    walls: list[Run] = []
+    walls: list[WallRun] = []
     for run in sorted(runs, key=lambda r: -r.length):
         for i, wall in enumerate(walls):
             apart = abs(wall.offset - run.offset)
@@ -195,7 +195,7 @@ def _merged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     return walls
 
 
-def _bridged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+def _bridged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Collinear runs merged where the gap between them is no opening."""
     walls = sorted(runs, key=lambda r: -r.length)
     i = 0
@@ -206,13 +206,13 @@ def _bridged(runs: Sequence[Run], strips: _Strips) -> list[Run]:
             continue
         a = walls[i]
         offset = (a.offset * a.length + partner.offset * partner.length) / (a.length + partner.length)
-        walls[i] = Run(a.axis, offset, min(a.start, partner.start), max(a.end, partner.end))
+        walls[i] = WallRun(a.axis, offset, min(a.start, partner.start), max(a.end, partner.end))
         walls.remove(partner)
         i = 0
     return walls
 
 
-def _same_wall(a: Run, b: Run, strips: _Strips) -> bool:
+def _same_wall(a: WallRun, b: WallRun, strips: _Strips) -> bool:
     if a.axis != b.axis or abs(a.offset - b.offset) > SAME_LINE_M:
         return False
     begin, end = min(a.end, b.end), max(a.start, b.start)
@@ -225,7 +225,7 @@ def _same_wall(a: Run, b: Run, strips: _Strips) -> bool:
     return gap <= min(HIDDEN_GAP_M, a.length + b.length) and free <= FREE_SHARE
 
 
-def _without_fronts(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+def _without_fronts(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Runs without those that stand before a longer parallel run with nothing free between them."""
     walls = sorted(runs, key=lambda run: run.length)
     for run in tuple(walls):
@@ -243,7 +243,7 @@ def _without_fronts(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     return walls
 
 
-def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
+def _extended(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Runs extended behind the things that hide their ends, to the nearest wall across."""
     walls = []
     for run in runs:
@@ -261,7 +261,7 @@ def _extended(runs: Sequence[Run], strips: _Strips) -> list[Run]:
     return walls
 
 
-def _hidden_corner(run: Run, sign: int, end: float, across: Sequence[Run]) -> float | None:
+def _hidden_corner(run: WallRun, sign: int, end: float, across: Sequence[WallRun]) -> float | None:
     """Where a run would meet the nearest wall across beyond an end; None: it meets one there, or there is none."""
     for wall in across:
         spans = wall.start - SAME_WALL_M <= run.offset <= wall.end + SAME_WALL_M

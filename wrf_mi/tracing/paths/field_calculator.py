@@ -106,12 +106,12 @@ def evaluate_paths(
         directions.insert(0, _mirrored(directions[0], level, 0))
 
     float_type = type(length)
-    zero, one = float_type(0), float_type(1)
+    zero, unit = float_type(0), float_type(1)
     # What the transmitter's antenna sends, in its frame that is turned by the heading about z.
     cosine, sine = chains.heading
     x, y, z = directions[0]
     departure = [cosine * x + sine * y, cosine * y - sine * x, z]
-    sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, one]]
+    sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, unit]]
     real = antenna_field(tx_antenna, directions[0], sent)
     imaginary = [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
     # The field after each interaction, as real and imaginary vectors.
@@ -119,7 +119,7 @@ def evaluate_paths(
         real, imaginary = _interact(level, before, after, (real, imaginary), tables, frequency_hz)
 
     # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity.
-    world = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
+    world = [[unit, zero, zero], [zero, unit, zero], [zero, zero, unit]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
     x, y, z = map(list, zip(*pose.to_world, strict=True))
     received = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else [z, x, y])
