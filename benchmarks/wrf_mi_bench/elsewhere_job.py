@@ -43,7 +43,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     rows, gaussians, steps = (8, 20, 5) if few else (40, 200, 200)
     arrays: dict[str, Any] = {"image": np.abs(splatted(*random_field(0, "alpha", gaussians)))}
     ordered = np.arange(rows)
-    traced = tracer(TraceOptions())(transmitter_path(rows)).astype(np.float32)
+    traced = tracer(TraceOptions(transmission=False))(transmitter_path(rows)).astype(np.float32)
     arrays["traced"] = traced
     spectra = replace(record(rows, official=(ordered[: -rows // 4], ordered[-rows // 4 :])), observation=traced)
     config = with_settings(TrainConfig(), [f"initial.gaussians={gaussians}", f"steps={steps}"])

@@ -18,8 +18,8 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 HZ = 2.44e9
-DIFFRACTED = TraceOptions(line_of_sight=False, reflection=False, diffraction=True, depth=1)
-REFLECTED = TraceOptions(line_of_sight=False, depth=1)
+DIFFRACTED = TraceOptions(transmission=False, line_of_sight=False, reflection=False, diffraction=True, depth=1)
+REFLECTED = TraceOptions(transmission=False, line_of_sight=False, depth=1)
 BEFORE, BEHIND = (-3.0, 0.0, -1.5), (3.0, 0.0, -1.5)
 """Ends on both sides of a screen at x = 0 whose upper edge lies at z = 0."""
 CUBE = """<scene version="2.1.0">

@@ -47,7 +47,7 @@ from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, trac
 FILE = "quick.json"
 WORSE = 2.0  # allowed ratio of a measured to a stored ratio; machines and their load change ratios by less
 REPEATS, MOST_S = 15, 5.0  # rounds of a pair, and seconds after which no further round begins
-OPTIONS = TraceOptions(rays=1 << 14)
+OPTIONS = TraceOptions(transmission=False, rays=1 << 14)
 ONLY_STEPS = ("log_every=100000", "validate_every=100000", "density.every=0", "holdout_steps_fraction=0")
 """Settings of a fit of nothing but steps."""
 

@@ -39,7 +39,7 @@ CALL_S = 100.0  # expected seconds of a call, at growth as n^1.1, beyond which a
 SLOW_MS, FEW = 4000.0, 2  # milliseconds of a slow call, and timed calls of a slow one, without warm-up
 GAUSSIANS, ELEMENTS = 1000, 16  # numbers where another size grows
 SMALL = 90  # Gaussians of the field that predicts for thousands of transmitters
-OPTIONS = TraceOptions(depth=2, rays=1 << 14)
+OPTIONS = TraceOptions(transmission=False, depth=2, rays=1 << 14)
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
         memory = peak_memory_mb()
         other = open_scene(measured.folder, frequency_hz)
         end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
-        options = TraceOptions(depth=2, rays=1 << 20, seed=seed)
+        options = TraceOptions(transmission=False, depth=2, rays=1 << 20, seed=seed)
         truth, ours = (trace_paths(scene, chosen, end, options).paths for scene in (original, other))
     matched = match(truth, ours)
     shares = {

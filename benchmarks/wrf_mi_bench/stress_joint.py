@@ -74,7 +74,7 @@ NEAR_M = np.array([[1.9, 1.8, 1.3], [2.1, 1.7, 1.2]])  # two transmitters
 
 COPLANAR, CANCELLING = "coplanar planes", f"T + L that cancel to {LEFT:.0%}"
 
-TWO_BOUNCES = TraceOptions(depth=2, rays=1 << 13)
+TWO_BOUNCES = TraceOptions(transmission=False, depth=2, rays=1 << 13)
 Parts = dict[str, tuple[str, Mesh]]
 
 
@@ -121,7 +121,10 @@ CASES: Mapping[str, Case] = {
 def joint(many: int = MANY, names: Iterable[str] | None = None, models: Iterable[str] = tuple(MODELS)) -> list[Row]:
     """Values and derivatives of `CASES` and of ``many`` transmitters, the worst of the receiver models."""
     tx_pos_m = np.random.default_rng(5).uniform(0.15, 0.85, (many, 3)) * ROOM
-    cases = {**CASES, "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(depth=3, rays=1 << 15))}
+    cases = {
+        **CASES,
+        "many paths": Case(tx_pos_m=tx_pos_m, options=TraceOptions(transmission=False, depth=3, rays=1 << 15)),
+    }
     rows = []
     for name in cases if names is None else names:
         with tempfile.TemporaryDirectory() as work:
@@ -272,7 +275,7 @@ def _phases(frequency_hz: float, size_m: tuple[float, float, float], count: int)
     with tempfile.TemporaryDirectory() as work:
         parts = {name: ("itu_metal", wall) for name, wall in box_sheets(size_m).items()}
         scene = open_scene(write_scene(Path(work), parts, "Hall of metal"), frequency_hz)
-        options = TraceOptions(depth=2, rays=1 << 14)
+        options = TraceOptions(transmission=False, depth=2, rays=1 << 14)
         paths = trace_paths(scene, tx, replace(RECEIVER, position_m=rx), options).paths
         delays_s = _sionna_delays(scene, tx, rx)
     worst, single, delay = Worst(), Worst(), Worst()

@@ -48,7 +48,7 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
     scene = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     access_point = Receiver("access-point", data["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0]))
     start = time.perf_counter()
-    options = TraceOptions(depth=2, rays=rays, seed=1)
+    options = TraceOptions(transmission=False, depth=2, rays=rays, seed=1)
     # The moving end is the transmitter, by reciprocity, so MATLAB's last point is the first one here.
     trace = trace_paths(scene, data["rx_pos"], access_point, options)
     seconds = time.perf_counter() - start

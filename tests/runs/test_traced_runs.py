@@ -31,7 +31,7 @@ from wrf_mi.tracing.paths import solve
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer, fit_offsets
 
-DIRECT = TraceOptions(reflection=False, depth=0)
+DIRECT = TraceOptions(reflection=False, transmission=False, depth=0)
 CALIBRATED = TracingSettings(reflection=False, depth=0, calibration="gain,patterns", steps=60)
 FLOAT32_DB = 1e-4
 """Predictions are stored as float32; gains come from float32 amplitudes."""
@@ -82,7 +82,7 @@ def test_stored_paths_belong_to_the_record(flat_folder: Path, run: Path) -> None
     record = load(flat_folder)
     np.testing.assert_array_equal(stored.tx_pos_m, record.tx_pos_m)
     assert stored.paths.n_rx == len(record.receivers)
-    assert stored.options == TraceOptions(reflection=False, depth=0)
+    assert stored.options == DIRECT
 
 
 @pytest.fixture(scope="module")

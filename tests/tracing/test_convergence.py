@@ -23,7 +23,7 @@ from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.convergence import choose_options, remainder
 
 RX = receiver([3.1, 2.2, 1.5])
-PLAIN = TraceOptions()
+PLAIN = TraceOptions(transmission=False)
 FINE = replace(PLAIN, depth=6, rays=1 << 16)
 """Three interactions more than for a target of 1.5 dB; each adds a third of the previous change."""
 

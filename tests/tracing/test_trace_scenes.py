@@ -132,7 +132,7 @@ def test_antenna_behind_its_wall_is_traced_from_before_it(tmp_path: Path, caplog
     """Mounted on a wall that the mesh has too far inside."""
     surfaces = in_a_room(tmp_path, sheet(2, 0.7, (2.0, 3.0), (2.0, 3.0)))
     scene = open_scene(tmp_path / "scene.xml", FREQUENCY_HZ)
-    tx, options = [[1.0, 2, 1]], TraceOptions(depth=2)
+    tx, options = [[1.0, 2, 1]], TraceOptions(transmission=False, depth=2)
     on, behind, far = (
         trace_paths(scene, tx, receiver([x, 2.5, 1.3]), options).paths.length_m.tolist() for x in (0.0, -2e-3, -0.02)
     )

@@ -42,7 +42,7 @@ OFF_SURFACE = 2e-3
 """Of the largest gain; Sionna RT's points are some 1e-4 m off the surfaces."""
 EDGE_OF_TWO = 0.05
 """Of the largest gain; the face of an edge that diffracts depends on the first ray."""
-UPRIGHT = TraceOptions()
+UPRIGHT = TraceOptions(transmission=False)
 
 
 @pytest.fixture(scope="module")
@@ -353,3 +353,10 @@ def test_wrong_arguments_are_refused(empty: Any):
         with pytest.raises(InputError, match=next(iter(setting))):
             TraceOptions(**setting)
     assert THICKNESS_M["itu_brick"] == 0.1
+
+
+def test_direct_path_of_depth_0_passes_no_wall(divided: Any):
+    """Whether or not transmission is on: it is an interaction."""
+    tx, rx = np.array([[1.3, 2.0, 1.0]]), receiver([4.4, 3.1, 1.7])
+    for transmission in (False, True):
+        assert not len(trace_paths(divided, tx, rx, replace(UPRIGHT, transmission=transmission, depth=0)).paths)

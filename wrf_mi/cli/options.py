@@ -75,7 +75,7 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
     kinds = "line-of-sight,reflection,transmission,diffraction,scattering"
-    add("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first two)")
+    add("--paths", metavar="LIST", help=f"kinds of path, from {kinds} (default: the first three)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections among these (default: all)")
     text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/scenes.md; default: 0)"

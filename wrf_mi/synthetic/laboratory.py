@@ -26,7 +26,7 @@ NAME = "laboratory"
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
 POSITIONS = 200
-OPTIONS = TraceOptions(depth=3, seed=1)
+OPTIONS = TraceOptions(transmission=False, depth=3, seed=1)
 SCANNER_M = ((2.0, 2.5, 1.5), (3.0, 5.0, 1.5), (5.5, 3.5, 1.5), (7.0, 1.8, 1.5), (7.6, 6.0, 1.6), (5.8, 1.0, 1.2))
 """Positions of the LiDAR, metres: five in the room and one in the inner room."""
 FORMAT = 5  # version of the files, to be raised when they change for equal parameters

@@ -48,8 +48,8 @@ class SpecularOptions:
 class TraceOptions(SpecularOptions):
     """Settings of `wrf_mi.tracing.trace_paths`; kinds of path that are off cost no time.
 
-    >>> options = TraceOptions(transmission=True, depth=4, reflections=1)
-    >>> options.reflection, options.diffraction
+    >>> options = TraceOptions(depth=4, reflections=1)
+    >>> options.transmission, options.diffraction
     (True, False)
 
     Attributes:
@@ -71,8 +71,6 @@ class TraceOptions(SpecularOptions):
 
     line_of_sight: bool = True
     reflection: bool = True
-    # The published figures of ``wrf-mi trace`` are those of paths that pass no wall.
-    transmission: bool = False
     diffraction: bool = False
     scattering: bool = False
     reflections: int | None = None
@@ -115,7 +113,7 @@ class TraceOptions(SpecularOptions):
 
 DEFAULTS = TraceOptions()
 
-FURTHER = ("transmission", "diffraction", "scattering")  # kinds of path that are traced only where they are asked for
+FURTHER = ("diffraction", "scattering")  # kinds of path that are traced only where they are asked for
 
 KINDS = ("line-of-sight", "reflection", "transmission", "diffraction", "scattering")  # kinds of path, for the command
 
@@ -130,7 +128,7 @@ def stated_kinds(text: str) -> dict[str, bool]:
 
 def without_effect(options: TraceOptions) -> dict[str, str]:
     """Names of settings that differ from their defaults and change no path, with the reason."""
-    interacts = any(getattr(options, kind) for kind in ("reflection", *FURTHER))
+    interacts = any(getattr(options, kind) for kind in ("reflection", "transmission", *FURTHER))
     without_rays = not max(options.most_reflections, options.sampled)
     needs_rays = without_rays, "no reflection, diffraction or scattering is traced"
     most, limit = (options.depth, f"depth is {options.depth}") if options.reflection else (0, "no reflection is traced")

@@ -88,7 +88,7 @@ def specular_paths(
         vertices, meets = _vertices(surfaces, plane, *(ends + surfaces.centre_m for ends in near))
         meets &= ~_mounted(surfaces, plane, sources_m[source], targets_m[target])
         row = np.flatnonzero(meets)
-        met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission)
+        met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission and options.depth > 0)
         is_path = row[met.candidate]
         exhaustive = np.ones(met.face.shape, np.float32)
         single = Legs(source[is_path], target[is_path], met.interactions, met.face, met.points_m, exhaustive, {})
