@@ -1,0 +1,205 @@
+"""What a person waits for: fits, corrections, single predictions, maps, first calls, processes side by side.
+
+Every row runs commands as a user does, each in a process of its own, and states scores beside times, since a fit that
+is fast and worse is not fast. Rows are kept by the content of the packages' files; a stopped call goes on.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from wrf_mi_scenes.divided import cluttered_room
+
+from wrf_mi.core.files import write_atomically
+from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.runs.folder import METRICS
+from wrf_mi.synthetic import load_record
+from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
+from wrf_mi.synthetic.stored import SCAN
+from wrf_mi.tasks import TASKS, instrument_of
+from wrf_mi.tracing import TraceOptions
+from wrf_mi.tracing.tracer import RayTracer
+
+from .bench import RFID, BenchFailed
+from .comparison import Row, data_folder, kept_work, line
+from .sources import fit_key, source_files
+from .workloads import record
+
+RUNS = Path("runs/bench/waits")
+SEEDS = (0, 1, 2)
+CALLS = 3  # timed first calls, whose median is stated
+CAD_TRIANGLES, CAD_ROWS = 100_000, 24
+MAP_POSITIONS = 100_000
+SIDE_STEPS = 600  # steps of a fit beside another one
+Figures = dict[str, Any]
+Measure = Callable[[Path], Figures]
+
+
+def command(*arguments: str | Path, beside: Sequence[Sequence[str | Path]] = ()) -> float:
+    """Seconds of a command, with others that start at the same time; `BenchFailed` unless all end well."""
+    calls = [[sys.executable, "-m", "wrf_mi.cli", *map(str, each)] for each in (arguments, *beside)]
+    start = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as errors:
+        started = [subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors) for call in calls]
+        status = [process.wait() for process in started]
+        seconds = time.perf_counter() - start
+        errors.seek(0)
+        if any(status):
+            raise BenchFailed(f"bench waits: `{' '.join(calls[0][2:])}`: {errors.read().strip().splitlines()[-1:]}")
+    return seconds
+
+
+def scored(folder: Path, task: str = "spectrum") -> Figures:
+    """Median score, time of training and of a single prediction, and memory of a run."""
+    metrics = json.loads((folder / METRICS).read_text())
+    names = ("train_seconds", "ms_per_sample", "peak_memory_mb")
+    return {"score": metrics[TASKS[task].block]["median"], **{name: metrics[name] for name in names}}
+
+
+def field(preset: str, folder: Path) -> Figures:
+    """WRF-GS+ on measured spectra by a preset, three seeds."""
+    fits = []
+    for seed in SEEDS:
+        run = folder / str(seed)
+        command("train", RFID, "--model", "wrf-gs+", "--preset", preset, "--seed", str(seed), "--out", run)
+        fits.append(scored(run))
+    return {"fits": fits}
+
+
+def _scan_scene(name: str, folder: Path) -> Path:
+    """Scene of a data set's scan."""
+    scan = Path(load_record(name).source) / SCAN
+    command("mesh", scan, "--out", folder / "scene")
+    return folder / "scene"
+
+
+def joint(folder: Path) -> Figures:
+    """Paths and Gaussians on the spectra of a room with its scan."""
+    scene, run = _scan_scene("laboratory", folder), folder / "joint"
+    seconds = command("train", "laboratory", "--model", "wrf-gs+", "--scene", scene, "--out", run)
+    return {"seconds": seconds, **scored(run)}
+
+
+def cad(folder: Path) -> Figures:
+    """Single joint predictions in a cluttered room of many triangles."""
+    folder.mkdir(parents=True)
+    places = transmitter_path(CAD_ROWS)
+    mesh = folder / "room.ply"
+    cluttered_room(CAD_TRIANGLES, np.concatenate([places[:1], RECEIVER.position_m[None]])).export(mesh)
+    rows = replace(record(CAD_ROWS), tx_pos_m=places)
+    tracer = RayTracer(mesh, instrument_of(rows), TraceOptions(depth=2), "concrete")
+    spectra = np.asarray(tracer(places), np.float32)
+    test = np.arange(0, CAD_ROWS, 4)
+    rows = replace(rows, observation=spectra, official=(np.setdiff1d(np.arange(CAD_ROWS), test), test))
+    write_spectrum_folder(folder / "data", rows, bits=16)
+    options = ("--scene", mesh, "--material", "concrete", "--depth", "2", "--set", "steps=100")
+    command("train", folder / "data", "--model", "wrf-gs+", *options, "--out", folder / "joint")
+    return scored(folder / "joint")
+
+
+def correction(folder: Path) -> Figures:
+    """A scanned, furnished room corrected by 400 spectra."""
+    scene = _scan_scene("traced-room", folder)
+    seconds = command("correct", scene, "traced-room", "--n-train", "400", "--out", folder / "corrected")
+    page = json.loads((folder / "corrected" / "correction.json").read_text())
+    return {"seconds": seconds, "kept": page["kept"]}
+
+
+def memory(folder: Path) -> Figures:
+    """Paths and Gaussians on 1,600 spectra."""
+    scene, run = _scan_scene("traced-room", folder), folder / "joint"
+    seconds = command("train", "traced-room", "--model", "wrf-gs+", "--scene", scene, "--out", run)
+    return {"seconds": seconds, **scored(run)}
+
+
+def strength_map(folder: Path) -> Figures:
+    """A map of a hybrid of signal strengths in the walls of a flat's plan."""
+    flat = data_folder("flat-ble")
+    command("mesh", flat / "layout.csv", "--height", "2.7", "--out", folder / "scene")
+    command("train", "flat-ble", "--scene", folder / "scene", "--n-train", "400", "--out", folder / "hybrid")
+    places = load_record("flat-ble").tx_pos_m
+    area = float(np.prod(np.ptp(places[:, :2], axis=0)))
+    step = f"{np.sqrt(area / MAP_POSITIONS):.4f}"
+    seconds = command("map", folder / "hybrid", "--step", step, "--receiver", "anchor1", "--out", folder / "map.nc")
+    return {"seconds": seconds, "step_m": float(step)}
+
+
+def first_calls(folder: Path) -> Figures:
+    """Commands in fresh processes, kernels cached on disk by the call before."""
+    train = ("train", "laboratory", "--model", "wrf-gs+", "--set", "steps=50", "--out")
+    command(*train, folder / "run")
+    write_atomically(folder / "places.csv", "x,y,z\n2.2,3.0,1.7\n")
+    predict = ("predict", folder / "run", "--tx", folder / "places.csv", "--out")
+
+    def median_s(call: Callable[[int], Sequence[str | Path]]) -> float:
+        return float(np.median([command(*call(k)) for k in range(CALLS)]))
+
+    return {
+        "--help": median_s(lambda _: ("--help",)),
+        "train of 50 steps": median_s(lambda k: (*train, folder / f"run-{k}")),
+        "predict of one row": median_s(lambda k: (*predict, folder / f"predicted-{k}.npz")),
+    }
+
+
+def side_by_side(folder: Path) -> Figures:
+    """A fit alone, and two at once, each in a process."""
+
+    def fit(name: str) -> tuple[str | Path, ...]:
+        steps = ("--set", f"steps={SIDE_STEPS}", "--set", "density.every=0")
+        return "train", "laboratory", "--model", "wrf-gs+", *steps, "--out", folder / name
+
+    alone = command(*fit("alone"))
+    return {"alone_s": alone, "two_s": command(*fit("first"), beside=[fit("second")])}
+
+
+def demo(folder: Path) -> Figures:
+    """The demonstration, without set-up."""
+    return {"seconds": command("demo", "--out", folder / "demo"), **scored(folder / "demo")}
+
+
+def _median(fits: Sequence[Figures], name: str) -> float:
+    return float(np.median([fit[name] for fit in fits]))
+
+
+def _field_row(preset: str, asked: str, of: Figures) -> Row:
+    times = ", ".join(f"{fit['train_seconds']:.0f} s to {fit['score']:.4f}" for fit in of["fits"])
+    return line(f"WRF-GS+, rfid-lab, {preset} preset, seeds 0 to 2: time to median SSIM", times, asked)
+
+
+def main() -> dict[str, Any]:
+    """Measure all rows; each states what is asked on two idle cores."""
+    place = RUNS / fit_key(source_files())
+
+    def of(name: str, measure: Measure) -> Figures:
+        return dict(kept_work(place, name, measure))
+
+    rows = [
+        _field_row(preset, asked, of(f"field-{preset}", partial(field, preset)))
+        for preset, asked in (("fast", "45 s to 0.965"), ("default", "90 s to 0.970"))
+    ]
+    fit = of("joint", joint)
+    rows.append(line("joint fit, 160 spectra of a scan", f"{fit['train_seconds']:.0f} s to {fit['score']:.4f}", "60 s"))
+    rows.append(line("single joint prediction in a scan", f"{fit['ms_per_sample']:.1f} ms", "7 ms"))
+    ms = of("cad", cad)["ms_per_sample"]
+    rows.append(line(f"single joint prediction, {CAD_TRIANGLES:,} triangles", f"{ms:.1f} ms", "50 ms"))
+    rows.append(line("correct, 400 spectra", f"{of('correction', correction)['seconds']:.0f} s", "100 s"))
+    fit = of("memory", memory)
+    text = f"{fit['peak_memory_mb'] / 1000:.1f} GB, {fit['seconds']:.0f} s to {fit['score']:.4f}"
+    rows.append(line("joint fit, 1,600 spectra: memory", text, "2.5 GB"))
+    text = f"{of('map', strength_map)['seconds']:.0f} s"
+    rows.append(line(f"map of about {MAP_POSITIONS:,} strengths, hybrid with a scene", text, "30 s"))
+    rows += [line(f"first call: {name}", f"{s:.2f} s") for name, s in of("first-calls", first_calls).items()]
+    times = of("side-by-side", side_by_side)
+    text = f"{times['two_s'] / times['alone_s']:.2f} times as long"
+    rows.append(line("two fits side by side", text, "2.2 times"))
+    text = f"{of('demo', demo)['seconds']:.0f} s"
+    rows.append(line("demo, without set-up", text, "150 s"))
+    return {"rows": rows}
