@@ -26,13 +26,17 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Choose the backend before a test imports Dr.Jit: a GPU for ``-m gpu`` alone.
+    """Choose the backend before a test imports Dr.Jit: a GPU for ``-m gpu`` and ``WRF_MI_TEST_BACKEND=cuda`` alone.
 
-    All other tests compute on the CPU, where bounds of float64 and equal bits hold, and so do their child processes.
+    All other tests compute on the CPU, where bounds of float64 and equal bits hold, and so do their child processes:
+    each on its share of the cores, as processes with more threads than cores wait for each other.
     """
     chosen = str(config.option.markexpr)
-    if "gpu" not in chosen or "not gpu" in chosen:
+    on_gpu = ("gpu" in chosen and "not gpu" not in chosen) or os.environ.get("WRF_MI_TEST_BACKEND") == "cuda"
+    if not on_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+        os.environ.setdefault("OMP_NUM_THREADS", str(max(1, CORES // workers)))
     init()
 
 

@@ -30,8 +30,11 @@ __all__ = [
     "find_llvm",
     "init",
     "set_threads",
+    "stated_threads",
 ]
 
+THREADS = "OMP_NUM_THREADS"
+"""Environment variable with the number of threads, as of OpenMP; schedulers such as Dask and Slurm set it."""
 _TOO_EARLY = "Dr.Jit was imported before wrf_mi.backend.init() and"
 
 
@@ -63,7 +66,8 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
 
     Args:
         backend: ``"auto"`` (CUDA if it works, else LLVM), ``"llvm"`` or ``"cuda"``.
-        threads: number of threads for LLVM kernels; None: Dr.Jit's default, all cores.
+        threads: number of threads for LLVM kernels; None: that of the environment variable ``OMP_NUM_THREADS``, or else
+            all cores.
 
     Raises:
         BackendError: no usable library, or another backend is already in use: one line with the remedy.
@@ -74,6 +78,7 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
     with _lock:
         if _active is None:
             _active = _start(backend)
+            threads = stated_threads() if threads is None else threads
         elif backend not in ("auto", _active.name):
             raise BackendError(f"this process already computes with {_active.name}: start another for {backend}")
         import mitsuba as mi
@@ -92,6 +97,12 @@ def init(backend: str = "auto", threads: int | None = None) -> Backend:
         if threads is not None:
             set_threads(threads)
         return _active
+
+
+def stated_threads() -> int | None:
+    """Number of threads that the environment variable `THREADS` states; None: none."""
+    text = os.environ.get(THREADS, "").strip()
+    return int(text) if text.isdecimal() and int(text) else None
 
 
 def set_threads(threads: int) -> None:

@@ -20,13 +20,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from ..backend import choose, init
+from ..backend import choose, init, stated_threads
 from ..backend.probe import installed_version
 from ..core import InputError
 
 VARIABLES = "WRF_MI_"  # environment variables with this beginning are set in workers as they are in the client
-THREADS = "OMP_NUM_THREADS"
-"""Number of threads of Dr.Jit in a worker. Dask sets it to 1 unless it is set where the worker is started."""
 POLL_S = 0.5
 GRACE_S = 30.0  # time for a child that is stopped to finish its step and write a checkpoint
 PACKAGES = ("wrf-mi", "drjit", "mitsuba", "sionna-rt", "numpy")
@@ -107,17 +105,12 @@ def _enter(environment: WorkerEnvironment) -> None:
         text = f"{worker}: cannot enter {environment.folder} ({error.strerror})"
         raise InputError(f"{text}; run the command in a folder that workers see under the same name") from None
     os.environ.update(environment.variables)
-    init(environment.backend, threads=_threads())
-
-
-def _threads() -> int:
-    text = os.environ.get(THREADS, "").strip()
-    return max(1, int(text)) if text.isdecimal() else 1
+    init(environment.backend, threads=stated_threads() or 1)
 
 
 def worker_threads() -> int | None:
     """Threads that a part in a worker may use; None in any other process, which may use all cores."""
-    return _threads() if getattr(_in_worker, "active", False) else None
+    return (stated_threads() or 1) if getattr(_in_worker, "active", False) else None
 
 
 def given_up() -> bool:
